@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import zstandard
 
-from benchmarks import SIZES as USUAL
+from benchmarks import SIZES as BASE_SIZES
 from benchmarks import Row, Timing, at_least, at_most, peak_bytes, timed
 from benchmarks._frames import UHD, compensation_frames
 from controller.bundle import format as fmt
@@ -21,7 +21,7 @@ from controller.bundle.reader import Bundle
 from controller.bundle.writer import NewAppearance, Packing, write_bundle
 from controller.core.arrays import ByteImage
 
-SIZES = (*USUAL, UHD)
+SIZES = (*BASE_SIZES, UHD)
 APPEARANCES = 2
 GOAL_MS = {1: 14.0, 2: 7.0}
 GOAL_RATIO = 4.0

@@ -18,7 +18,7 @@ from benchmarks._stage import FIRST_SEED, CalibratedStage, calibrated_stage, ove
 from benchmarks._truth import Truth
 from controller.artefacts.calibration import read_calibration, read_captures
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import PlanUsed
+from controller.artefacts.pattern_plans import PlanUsed
 from controller.artefacts.photographs import Developed
 from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.correspondence.decode import decode

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import SIZES as USUAL
+from benchmarks import SIZES as BASE_SIZES
 from benchmarks import Row, at_least, at_most
 from benchmarks._frames import UHD, compensation_frames
 from benchmarks._watch import digest
@@ -31,7 +31,7 @@ from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from plugins.display.player import DRIVER, PlayerDisplay
 
-SIZES = (*USUAL, UHD)
+SIZES = (*BASE_SIZES, UHD)
 RESIDENT = 3
 """So few are decoded once and stay."""
 BEYOND_CACHE = 4

@@ -205,7 +205,7 @@ def host_and_port(address: str, default_port: int) -> tuple[str, int]:
     return host, int(port)
 
 
-def taken(name: str) -> DeviceBusy:
+def port_taken(name: str) -> DeviceBusy:
     """The error of a link that another program holds."""
     return DeviceBusy(
         "port-taken",

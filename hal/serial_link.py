@@ -12,7 +12,7 @@ import serial
 
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
-from hal.links import BufferedLink, taken
+from hal.links import BufferedLink, port_taken
 from hal.pty_links import leads_to_its_owner
 from hal.transcript import Transcript
 
@@ -75,7 +75,7 @@ class SerialLink(BufferedLink):
     def _not_opened(self, error: BaseException | None) -> DeviceError:
         number = getattr(error, "errno", None)
         if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "exclusively lock" in str(error):
-            return taken(self.name)
+            return port_taken(self.name)
         if number in (errno.EACCES, errno.EPERM):
             return DeviceRefused(
                 "port-forbidden",

@@ -53,7 +53,7 @@ def _places(host: str, port: int, deadline: Deadline) -> _Places:
 def _begun(host: str, port: int) -> Future[_Places]:
     """The lookup of a name; only one at a time for each name, even if callers give up."""
 
-    def look() -> None:
+    def resolve() -> None:
         try:
             found.set_result(list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
         except OSError as error:
@@ -66,7 +66,7 @@ def _begun(host: str, port: int) -> Future[_Places]:
         if (host, port) in _looked_up:
             return _looked_up[host, port]
         found = _looked_up[host, port] = Future()
-    threading.Thread(target=look, name="names", daemon=True).start()
+    threading.Thread(target=resolve, name="names", daemon=True).start()
     return found
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
-from plugins.library_process import CRASHED, LibraryProcess
+from plugins.library_process import CRASHED, LibraryProcess, shot_lost
 
 _MOST_NOTES: Final = 1000
 _MARGIN_S: Final = 1.0
@@ -74,11 +74,7 @@ class LibraryCamera:
         except DeviceGone as error:
             if error.code != CRASHED:
                 raise
-            raise DeviceGone(
-                "camera-shot-lost",
-                what=f"The connection to the camera was lost during a picture: {error.what}",
-                remedy="Check cable and power, then take this picture again. It was not taken twice.",
-            ) from error
+            raise shot_lost(error) from error
         return files
 
     def close(self) -> None:

@@ -48,6 +48,15 @@ class Failed:
 Answer = Failed | tuple[Any, str, float]
 
 
+def shot_lost(error: DeviceError) -> DeviceGone:
+    """The error of a picture during which the camera was lost by ``error``."""
+    return DeviceGone(
+        "camera-shot-lost",
+        what=f"The connection to the camera was lost during a picture: {error.what}",
+        remedy="Check cable and power, then take this picture again. It was not taken twice.",
+    )
+
+
 class LibraryProcess:
     """Starts the process when it is needed, and again after it ended or was killed. One caller at a time.
 
@@ -83,10 +92,9 @@ class LibraryProcess:
         """
         with turn(self._turn, deadline, partial(self._still_time, deadline)):
             answer = self._answer(name, arguments, deadline)
-            if isinstance(answer, Failed) and answer.lost:
+            if isinstance(answer, Failed) and answer.lost and repeatable:
                 self._note(answer.code, answer.what)
-                if repeatable:
-                    answer = self._answer(name, arguments, deadline)
+                answer = self._answer(name, arguments, deadline)
             if isinstance(answer, Failed):
                 raise answer.error()
             result, self._serial, self.took_s = answer

@@ -33,15 +33,18 @@ class DeviceWorker(ABC, Generic[Device]):
     def _found(self) -> Device:
         """The device, just opened."""
 
-    @abstractmethod
     def _prepare(self, device: Device) -> None:
         """Make an opened device ready for requests; it is closed if this raises."""
+
+    def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
+        """The result of a request. Raises DeviceError: a library's own errors are translated here."""
+        return getattr(self, name)(*arguments)
 
     def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer:
         """Do a request. A lost device is closed, so that the next request opens it again."""
         began_s = time.monotonic()
         try:
-            result = getattr(self, name)(*arguments)
+            result = self._do(name, arguments)
         except DeviceError as error:
             lost = isinstance(error, DeviceGone | DeviceTimeout) and self._device is not None
             if lost:

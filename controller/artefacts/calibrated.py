@@ -78,7 +78,7 @@ class Calibrated:
         room = beside(self.calibration.projectors[n], frame, self.transport.object_mask)
         return self.indirect.forward(direct, room)
 
-    def seen(self, frames: Sequence[FloatImage]) -> FloatImage:
+    def predicted_light(self, frames: Sequence[FloatImage]) -> FloatImage:
         """What the camera sees of linear frames (rows, columns, 3), one a projector, without the black image."""
         direct = self.transport.forward(frames)
         return direct if self.indirect is None else direct + self.indirect.forward(direct)

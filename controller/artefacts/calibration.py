@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.artefacts.geometry import known_points_m, read_geometry_figures
-from controller.artefacts.modes import mode_of, read_metapixels
 from controller.artefacts.photographs import BLACK, Taken, codes_of, light_of
-from controller.artefacts.projectors import Light, Pixels, read_indirect
+from controller.artefacts.projectors import Light, Pixels, mode_of, read_indirect, read_metapixels
 from controller.calibrate.geometry.background import room_pixels
 from controller.calibrate.values import (
     Calibration,

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from controller.artefacts.geometry import projectors_of
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import mode_of
 from controller.artefacts.names import json_path, npz_path, read_json, write_json
+from controller.artefacts.projectors import mode_of
 from controller.calibrate.metapixels.depth_edges import EdgeShares
 from controller.core.arrays import load_arrays, save_arrays
 from controller.transport import LightTransport

@@ -278,3 +278,21 @@ def read_indirect(run: Path, projectors: Sequence[str]) -> list[Indirect] | None
     if any(one is None for one in figures) or not any(one is not None and one.matters for one in figures):
         return None
     return [Indirect.read(run, name) for name in projectors]
+
+
+def write_mode(run: Path, mode: Mapping[str, str]) -> Path:
+    """``mode.json``: how the metapixels of a run are measured (``steps.modes``)."""
+    return write_json(json_path(run, StepKind.MODE), mode)
+
+
+def mode_of(folder: Path) -> str:
+    """The mode of a run; "fast" if it is not stored."""
+    path = json_path(folder, StepKind.MODE)
+    return str(read_json(path)["mode"]) if path.exists() else "fast"
+
+
+def read_metapixels(folder: Path, projector: str) -> Metapixels:
+    """The metapixels that a run uses: from dots in the paper's mode, else from the sinusoids."""
+    if mode_of(folder) == "paper":
+        return DotMetapixels.read(folder, projector).metapixels
+    return Pixels.read(folder, projector).metapixels

@@ -41,7 +41,7 @@ class _File:
         self._seen = self._signature()
         self.cues = self._read()
 
-    def look(self) -> None:
+    def reload_if_changed(self) -> None:
         """Read the file again if it has changed."""
         seen = self._signature()
         if seen == self._seen:
@@ -70,7 +70,7 @@ async def serve(options: CueOptions, verbs: Verbs) -> None:
     last_s = time.time()
     while True:
         await asyncio.sleep(STEP_S)
-        await asyncio.to_thread(file.look)
+        await asyncio.to_thread(file.reload_if_changed)
         now_s = time.time()
         if now_s - last_s <= -BACK_S:
             last_s = now_s

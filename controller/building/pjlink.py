@@ -119,7 +119,7 @@ class _Session:
         return command if hmac.compare_digest(given, right.lower()) else None
 
     def _answer(self, line: bytes) -> bytes:
-        command = lines.asked(line)
+        command = lines.parse_command(line)
         if command is None:
             return b"%1ERR1\r"
         try:
@@ -128,7 +128,7 @@ class _Session:
             _LOG.exception("A PJLink command failed.")
             return command.answer("ERR4")
 
-    def _done(self, command: lines.Asked) -> str:
+    def _done(self, command: lines.Command) -> str:
         names: Sequence[str] = ()
         try:
             names = self._verbs.appearances()

@@ -28,7 +28,7 @@ _MAKER: Final = "Velatura"
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class Command:
     """A command: its class "1" or "2", its name in capitals, and its parameter ("?" asks)."""
 
     pj_class: str
@@ -47,13 +47,13 @@ class Wanted:
     values: dict[str, Any]
 
 
-def asked(line: bytes) -> Asked | None:
+def parse_command(line: bytes) -> Command | None:
     """The command in a line; None for what is no command."""
     match = _COMMAND.fullmatch(line) if len(line) <= LONGEST_LINE else None
     if match is None:
         return None
     name = match[2].decode("ascii").upper()
-    return Asked(match[1].decode("ascii"), name, match[3].decode("utf-8", "replace").strip())
+    return Command(match[1].decode("ascii"), name, match[3].decode("utf-8", "replace").strip())
 
 
 def inputs(names: Sequence[str]) -> dict[str, str]:
@@ -61,7 +61,7 @@ def inputs(names: Sequence[str]) -> dict[str, str]:
     return dict(zip(INPUTS, names, strict=False))
 
 
-def meant(command: Asked, names: Sequence[str]) -> Wanted | str:
+def meant(command: Command, names: Sequence[str]) -> Wanted | str:
     """What a command that changes something means, or the error code of the specification (2.2)."""
     value = command.parameter
     shown = {code: Wanted("play", {"name": name}) for code, name in inputs(names).items()}
@@ -80,7 +80,7 @@ def meant(command: Asked, names: Sequence[str]) -> Wanted | str:
     return "ERR2" if command.name in ("POWR", "INPT", "AVMT", "FREZ") else "ERR1"
 
 
-def answer(command: Asked, now: KioskState, names: Sequence[str], version: str) -> str:
+def answer(command: Command, now: KioskState, names: Sequence[str], version: str) -> str:
     """What a question is answered, or the error code of the specification."""
     if not _known(command):
         return "ERR1"
@@ -106,11 +106,11 @@ def answer(command: Asked, now: KioskState, names: Sequence[str], version: str) 
     return answers.get(command.name, "ERR1")
 
 
-def is_question(command: Asked) -> bool:
+def is_question(command: Command) -> bool:
     return command.parameter == "?" or (command.name == "INNM" and command.parameter.startswith("?"))
 
 
-def _known(command: Asked) -> bool:
+def _known(command: Command) -> bool:
     return command.pj_class == "2" or command.name not in _CLASS_2
 
 

@@ -71,13 +71,13 @@ def changes(verbs: Verbs) -> Iterator[asyncio.Event]:
     """An event of the running loop that is set after every change of the kiosk's state, and at the beginning."""
     loop, changed = asyncio.get_running_loop(), asyncio.Event()
 
-    def tell() -> None:
+    def notify() -> None:
         # A kiosk may change while the loop ends.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(changed.set)
 
     changed.set()
-    leave = verbs.subscribe(tell)
+    leave = verbs.subscribe(notify)
     try:
         yield changed
     finally:

@@ -28,6 +28,7 @@ __all__ = [
     "BLUR_FREQUENCIES",
     "CELL_PX",
     "PERIOD_PX",
+    "TILE_MARGIN",
     "TILE_PATTERNS",
     "Code",
     "Pattern",
@@ -54,6 +55,8 @@ FEW_CELLS = 1000
 """With fewer Gray cells on the whole frame, one more set of colour tiles is shown."""
 MOST_TILES = 4000
 """With more Gray cells than this, a colour tile covers 2x2 of them: wider, so that defocus affects less of each."""
+TILE_MARGIN: Final = 0.28
+"""Share of a colour tile's side, on each side of it, that may contain a neighbour's light."""
 
 
 PARTS_ACROSS: Final = 8
@@ -88,9 +91,9 @@ class Pattern:
     ``colour`` (FLAT) fraction of full light per channel; ``axis`` (GRAY) 0 for x, 1 for y; ``bit`` (GRAY) 0 is the
     coarsest of ``bits``; ``coloured_bits`` (COLOUR_GRAY) axis, bit and bits in red, green and blue, None for a channel
     that shows nothing; ``opposite`` (SINUSOID) the picture that shows the light that this one lacks: then this one is
-    not shown; ``tile_cells`` (MOSAIC) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
-    cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (MOSAIC, RANDOM); ``coarse`` (RANDOM) with
-    large bright and dark parts, too, which throw light on each other.
+    not shown; ``tile_cells`` (COLOUR_TILES) Gray cells along a tile's side; ``frequency`` (SINUSOID) x and y in
+    cycles per projector pixel; ``phase_rad`` (SINUSOID) its step; ``seed`` (COLOUR_TILES, RANDOM); ``coarse`` (RANDOM)
+    with large bright and dark parts, too, which throw light on each other.
     """
 
     name: str

@@ -38,10 +38,10 @@ class Place:
 
     def wrong_value(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
         """``problem`` goes on after the value ("is not ..."); ``allowed`` says what the key may be."""
-        return self._error("key-value", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-value", key, f"'{key}' = {quoted(value)} {problem}", f"'{key}' is {allowed}.")
 
     def wrong_type(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
-        return self._error("key-type", key, f"'{key}' = {shown(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-type", key, f"'{key}' = {quoted(value)} {problem}", f"'{key}' is {allowed}.")
 
     def missing(self, key: str, allowed: str, written: Collection[str] = ()) -> UsageError:
         """``written`` are the keys that the table has; one of them may be the missing one, misspelt."""
@@ -86,7 +86,7 @@ def table_name(path: KeyPath) -> str:
     return f"[[{names}]] number {numbers[-1] + 1}" if isinstance(path[-1], int) else f"[{names}]"
 
 
-def shown(value: Any) -> str:
+def quoted(value: Any) -> str:
     """A value as an error repeats it: short, and without control characters."""
     text = toml_value(value)
     return printable(text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 1] + "…")

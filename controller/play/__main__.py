@@ -17,7 +17,7 @@ from controller.bundle.install import CURRENT
 from controller.bundle.signing import Trust, load_public_key
 from controller.core.errors import UsageError, VelaturaError
 from controller.play.control.commands import Commands
-from controller.play.control.notify import tell
+from controller.play.control.notify import log
 from controller.play.control.protocol import MAX_RATE_HZ, Suggested
 from controller.play.control.resume import SUFFIX, SavedRequest
 from controller.play.control.server import Server
@@ -111,7 +111,7 @@ def _counted_start(bundle: Path | None) -> CountedStart | None:
     """The start's count where ``bundle`` is the link to a stage's installed bundle; None for any other file."""
     if bundle is None or bundle.name != CURRENT or not bundle.is_symlink():
         return None
-    return CountedStart(bundle.parent, tell)
+    return CountedStart(bundle.parent, log)
 
 
 def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> Output:

@@ -13,7 +13,7 @@ from controller.bundle.signing import Trust, unsigned_warning
 from controller.core.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.control import protocol
-from controller.play.control.notify import Notifier, tell
+from controller.play.control.notify import Notifier, log
 from controller.play.display.mixing import dimmed
 from controller.play.display.outputs import Output
 from controller.play.frames import FrameSet, OutputSize
@@ -168,7 +168,7 @@ class Player:
         self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
         self._warning = unsigned_warning(bundle.signed_by, self._trust)
         if self._warning is not None:
-            tell(f"WARNING: {self._warning.what} {self._warning.remedy}")
+            log(f"WARNING: {self._warning.what} {self._warning.remedy}")
 
     def _busy_with_bundle(self) -> bool:
         coming = self._coming is not None and self._coming.appearance is not None

@@ -25,7 +25,7 @@ from controller.artefacts.grade import (
     read_error_maps,
     read_grade_figures,
 )
-from controller.artefacts.modes import patterns_figures, told
+from controller.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.bundle.export import png
 from controller.calibrate.values import Calibration
@@ -79,7 +79,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     page = Page(
         title=f"{asked.stage}: calibration of {when(run.name)}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work. "
-        f"By projector: {told(run, asked.projectors)}.",
+        f"By projector: {photographs_sentence(run, asked.projectors)}.",
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),

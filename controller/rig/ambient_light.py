@@ -55,11 +55,11 @@ class LightWatch:
     Parameters
     ----------
     most_lux : warn above this much room light
-    looks : so many readings in a row, so that a visitor's torch causes no warning
+    readings : so many readings in a row, so that a visitor's torch causes no warning
     """
 
-    def __init__(self, most_lux: float, *, looks: int = 2) -> None:
-        self._most_lux, self._looks = most_lux, looks
+    def __init__(self, most_lux: float, *, readings: int = 2) -> None:
+        self._most_lux, self._readings = most_lux, readings
         self._least: dict[str, float] = {}
         self._in_a_row = 0
         self._bright = False
@@ -74,7 +74,7 @@ class LightWatch:
         room = lux - own
         # The warning ends only below half the limit, so that light around the limit causes one warning.
         self._in_a_row = self._in_a_row + 1 if room > self._most_lux else 0
-        self._bright = self._in_a_row >= self._looks or (self._bright and room > self._most_lux / 2)
+        self._bright = self._in_a_row >= self._readings or (self._bright and room > self._most_lux / 2)
         if not self._bright:
             return None
         return f"The room is not dark: {room:.1f} lux at the object do not come from the projectors."
@@ -85,12 +85,12 @@ def dark_before(darkness: Darkness | None) -> list[Step]:
     if darkness is None:
         return []
 
-    def look(context: Context) -> Sequence[Path]:
+    def check(context: Context) -> Sequence[Path]:
         lux = darkness.require(deadline=context.deadline)
         context.reporter.say(f"The room is dark: {lux:.2f} lux at the object.")
         return ()
 
-    return [Step(StepId("dark-before"), look, title="Checking that the room is dark", weight=0.1, always=True)]
+    return [Step(StepId("dark-before"), check, title="Checking that the room is dark", weight=0.1, always=True)]
 
 
 def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
@@ -98,10 +98,10 @@ def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
     if darkness is None:
         return []
 
-    def look(context: Context) -> Sequence[Path]:
+    def check(context: Context) -> Sequence[Path]:
         display.show({}, deadline=context.deadline.within(ANSWER_S))
         if (warning := darkness.warning(deadline=context.deadline)) is not None:
             context.reporter.say(warning, Level.WARNING)
         return ()
 
-    return [Step(StepId("dark-after"), look, title="Checking that the room stayed dark", weight=0.1)]
+    return [Step(StepId("dark-after"), check, title="Checking that the room stayed dark", weight=0.1)]

@@ -33,7 +33,7 @@ class CameraWatch:
         self._clock = clock
         self._next_s = clock()
 
-    def look(self, context: Context) -> None:
+    def check(self, context: Context) -> None:
         """After a photograph: journal corrected faults; once a minute, ask for the camera's state."""
         if self._camera is None:
             return

@@ -10,7 +10,7 @@ from typing import Any
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.grade import is_graded, passes
-from controller.artefacts.modes import DotOptions, PhotographOptions, dot_options, photographs_named, told
+from controller.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
 from controller.core.errors import UsageError
@@ -51,6 +51,7 @@ from controller.steps.calibrate.grade import (
     verify_step,
 )
 from controller.steps.capture.device_checks import device_checks
+from controller.steps.modes import DotOptions, dot_options
 from hal.deadline import in_seconds
 
 
@@ -66,7 +67,7 @@ def calibrate(
 ) -> Mapping[str, Any]:
     """Calibrate the stage, or continue an unfinished calibration; returns where the results are.
 
-    ``mode``, ``dot_spacing`` and their errors: see ``artefacts.modes.dot_options``. ``photographs``: which set, instead
+    ``mode``, ``dot_spacing`` and their errors: see ``steps.modes.dot_options``. ``photographs``: which set, instead
     of stage.toml's; its error: see ``photographs_named``.
     """
     options = dot_options(mode, dot_spacing)
@@ -85,7 +86,7 @@ def calibrate(
         before=lambda rig: device_checks(rig, prior),
     )
     tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
-    return {"run": str(run), **grade_figures(run), "photographs": told(run, checked.names)}
+    return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
 
 
 def calibrating(

@@ -155,7 +155,7 @@ def _show(
     display = bundle_display(rig)
     status: LiveStatus | None = None
 
-    def tell(figures: LiveFigures) -> None:
+    def report(figures: LiveFigures) -> None:
         nonlocal status
         status = display.playing(deadline=context.deadline.within(20)).live or status
         made_hz = figures.made / max(figures.seconds, 1e-3)
@@ -166,10 +166,10 @@ def _show(
 
     try:
         with way_to_light(rig, context, ready) as way:
-            figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+            figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, report=report)
             # the last one is shown at the next tick of the player's clock
             context.deadline.sleep(LAST_S)
-            tell(figures)
+            report(figures)
     finally:
         # The lamps stay lit for a while: show black. A player that ended shows black when it restarts.
         with contextlib.suppress(DeviceError):
@@ -284,11 +284,11 @@ def feed(
         maker = TargetMaker(ready.maps.target_px) if targets else FrameMaker(Interactive(ready.maps), ready.brightness)
         write = _target_writer(file) if targets else _writer(file, outputs, ready.maps)
 
-        def tell(figures: LiveFigures) -> None:
+        def report(figures: LiveFigures) -> None:
             if cancel.is_set():
                 raise Cancelled
 
-        figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, tell=tell)
+        figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, report=report)
     return {"white": ready.brightness, **figures.as_json()}
 
 

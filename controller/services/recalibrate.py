@@ -12,7 +12,8 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.drift import read_drift_figures
 from controller.artefacts.grade import passes
 from controller.artefacts.kinds import CALIBRATED, StepKind
-from controller.artefacts.modes import MODES, CalibrationMode, DotOptions, PhotographOptions, mode_of, photographs_named
+from controller.artefacts.pattern_plans import PhotographOptions, photographs_named
+from controller.artefacts.projectors import mode_of
 from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
@@ -31,6 +32,7 @@ from controller.steps.calibrate.full import calibration_steps
 from controller.steps.calibrate.grade import accept, below_grade, compare_with_last, grade_figures
 from controller.steps.calibrate.quick import quick_steps
 from controller.steps.calibrate.single_projector import one_projector_steps
+from controller.steps.modes import MODES, CalibrationMode, DotOptions
 
 CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
 """The photographs of the previous check and of the grade."""

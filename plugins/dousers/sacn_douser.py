@@ -74,14 +74,14 @@ _ALLOWED: Final = {
     "universe": (1, 63_999), "channel": (1, 512), "open_level": (0, 255), "closed_level": (0, 255),
     "priority": (1, 200), "travel_s": (0, 3),
 }  # fmt: skip
-_USUAL: Final = {"open_level": 255, "closed_level": 0, "priority": 100, "travel_s": 1.0}
+_DEFAULTS: Final = {"open_level": 255, "closed_level": 0, "priority": 100, "travel_s": 1.0}
 
 
 def _read(settings: Mapping[str, Any]) -> tuple[Target, dict[str, Any]]:
     numbers: dict[str, Any] = {}
     for key, (low, high) in _ALLOWED.items():
         kinds = (int, float) if key == "travel_s" else int
-        numbers[key] = setting(settings, key, kinds, _USUAL.get(key))
+        numbers[key] = setting(settings, key, kinds, _DEFAULTS.get(key))
         if not low <= numbers[key] <= high:
             raise _wrong(key, f"is {numbers[key]}, not {low} to {high}")
     if numbers["open_level"] == numbers["closed_level"]:

@@ -40,7 +40,7 @@ from plugins.emulated.optics.staging import (
 )
 from plugins.emulated.optics.stands import SETTINGS, Stands, read_engine, read_room, read_stands
 from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.projectors.boards import USUAL, board_named
+from plugins.emulated.projectors.boards import DEFAULT_BOARD, board_named
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
@@ -85,7 +85,7 @@ class EmulatedBench:
             for folder in (FOLDER, "run"):
                 (stage / folder).mkdir(parents=True, exist_ok=True)
             shape.save(stage / OBJECT_FILE)
-            _write_fast_profile(stage, USUAL)
+            _write_fast_profile(stage, DEFAULT_BOARD)
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
         return device_tables(truth, shape)
@@ -250,7 +250,7 @@ def _timing(lamp: LampTruth) -> LampTiming:
 
 def _write_fast_profile(stage: Path, family: str) -> None:
     """Write the profile with the times of emulated lamps, unless the stage has it: somebody may have changed it."""
-    path = stage / (FAST_PROFILE if family == USUAL else f"{FOLDER}/{family}-fast.toml")
+    path = stage / (FAST_PROFILE if family == DEFAULT_BOARD else f"{FOLDER}/{family}-fast.toml")
     if not path.exists():
         times = LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s)
         path.write_text(quick_profile(times, base=family, stable_s=FAST_LAMP.stable_s), encoding="utf-8")

@@ -131,7 +131,7 @@ class VisibleFrames:
         with contextlib.suppress(RuntimeError):  # never started
             self._thread.join(timeout=1.0)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Read the memory output now."""
         with self._lock:
             found = self._reader.latest()
@@ -142,7 +142,7 @@ class VisibleFrames:
 
     def during(self, start_s: float, end_s: float) -> list[tuple[float, VisibleFrameSet | None]]:
         """The sets that were visible between two times, with their shares of that time (sum 1); None is no picture."""
-        self.look()
+        self.update()
         with self._lock:
             history = list(self._history)
         if end_s <= start_s:
@@ -159,4 +159,4 @@ class VisibleFrames:
 
     def _poll(self) -> None:
         while not self._stopped.wait(POLL_S):
-            self.look()
+            self.update()

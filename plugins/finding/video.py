@@ -8,7 +8,7 @@ from typing import Final
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone
 from hal.finding import Finder, Found, Problem, Wanted
-from plugins.v4l2.nodes import asked, paths
+from plugins.v4l2.nodes import identify_path, paths
 
 
 def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
@@ -19,7 +19,7 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
             "doctor-too-slow", what="The search took too long.", remedy="Unplug devices that are not needed."
         )
         try:
-            node = asked(path)
+            node = identify_path(path)
         except DeviceGone:
             continue  # it was just unplugged
         except DeviceError as error:

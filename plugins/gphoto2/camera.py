@@ -7,23 +7,18 @@ never takes a picture twice, but reports that it was lost. The library runs in a
 from __future__ import annotations
 
 import importlib.util
-from collections import deque
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 from hal.deadline import Deadline
-from hal.errors import DeviceGone, DeviceRefused
+from hal.errors import DeviceRefused
 from hal.registry import Driver, OpenContext
-from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
-from plugins.gphoto2.errors import shot_lost
+from hal.values import CameraStatus
 from plugins.gphoto2.library import load_library
-from plugins.library_process import CRASHED, LibraryProcess
-
-_MOST_NOTES: Final = 1000
+from plugins.library_camera import LibraryCamera
 
 
-class Gphoto2Camera:
+class Gphoto2Camera(LibraryCamera):
     """A camera through libgphoto2 (``hal.interfaces.Camera``, ``WatchedCamera``, ``LiveViewCamera``).
 
     ``port``: ``usb:001,004``, ``ptpip:host`` or "" for the first camera that is found; ``serial``: the number it must
@@ -31,48 +26,11 @@ class Gphoto2Camera:
     """
 
     def __init__(self, *, port: str, serial: str, deadline: Deadline) -> None:
-        self._troubles: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
-        self.process = LibraryProcess(
-            "plugins.gphoto2.worker",
-            "libgphoto2",
-            start=(port,),
-            serial=serial,
-            note=lambda code, what: self._troubles.append((code, what)),
-        )
-        try:
-            self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def capabilities(self) -> CameraCapabilities:
-        return self._capabilities
-
-    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        identity: DeviceIdentity = self.process.request("identity", deadline=deadline)
-        return identity
-
-    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
-        confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
-        return confirmed
-
-    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
-        """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the connection broke."""
-        try:
-            files: list[CapturedFile] = self.process.request(
-                "capture", destination.absolute(), deadline.left_s(), deadline=deadline, repeatable=False
-            )
-        except DeviceGone as error:
-            raise (shot_lost(error) if error.code == CRASHED else error) from error
-        return files
+        super().__init__("plugins.gphoto2.worker", "libgphoto2", start=(port,), serial=serial, deadline=deadline)
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
         status: CameraStatus = self.process.request("status", deadline=deadline)
         return status
-
-    def troubles(self) -> list[tuple[str, str]]:
-        return [self._troubles.popleft() for _ in range(len(self._troubles))]
 
     def live_view(self, *, deadline: Deadline) -> bytes:
         if not self._capabilities.live_view:
@@ -87,9 +45,6 @@ class Gphoto2Camera:
     def end_live_view(self, *, deadline: Deadline) -> None:
         if self._capabilities.live_view:
             self.process.request("end_live_view", deadline=deadline)
-
-    def close(self) -> None:
-        self.process.close()
 
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> Gphoto2Camera:

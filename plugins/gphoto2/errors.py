@@ -34,11 +34,3 @@ def translated(library: Any, error: Exception) -> DeviceError:
         what=f"The camera refused a command of libgphoto2 ({said}).",
         remedy="Check the mode dial (M), the lens switch (manual focus) and the card, then try again.",
     )
-
-
-def shot_lost(error: DeviceError) -> DeviceError:
-    return DeviceGone(
-        "camera-shot-lost",
-        what=f"The connection to the camera was lost during a picture: {error.what}",
-        remedy="Check cable and battery, then take this picture again. It was not taken twice.",
-    )

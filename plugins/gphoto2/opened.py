@@ -33,6 +33,10 @@ class Opened:
         except self.library.GPhoto2Error:
             return ""
 
+    def close(self) -> None:
+        with contextlib.suppress(self.library.GPhoto2Error):
+            self.camera.exit()
+
     def choices(self, kind: str) -> list[str]:
         if kind not in self.names:
             return []

@@ -15,10 +15,11 @@ from typing import Any, Final
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.gphoto2 import opened as device
-from plugins.gphoto2.errors import shot_lost, translated
+from plugins.gphoto2.errors import translated
 from plugins.gphoto2.library import load_library
 from plugins.gphoto2.opened import Opened
-from plugins.library_process import Answer, Failed, served
+from plugins.library_process import served, shot_lost
+from plugins.library_worker import DeviceWorker
 
 _LISTEN_MS: Final = 50
 _MOST_FILES: Final = 8
@@ -27,14 +28,13 @@ _NETWORK_MODEL: Final = "PTP/IP Camera"
 """libgphoto2 can't ask the network for a camera's model, and needs this entry of its list."""
 
 
-class Worker:
-    """The camera; its public methods are the requests. Opened at the first of them, and again when it was lost."""
+class Worker(DeviceWorker[Opened]):
+    """The camera."""
 
     def __init__(self, library: Any, port: str, serial: str) -> None:
+        super().__init__(serial)
         self._library = library
         self._port = port
-        self._serial = serial
-        self._opened: Opened | None = None
 
     def capabilities(self) -> CameraCapabilities:
         return device.capabilities(self._open())
@@ -75,32 +75,13 @@ class Worker:
                 opened.camera.file_delete(folder, name)
         return captured
 
-    def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer:
-        """Do a request. A lost camera is closed, so that the next request opens it again."""
-        began_s = time.monotonic()
+    def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
         try:
-            result = getattr(self, name)(*arguments)
+            return super()._do(name, arguments)
         except self._library.GPhoto2Error as error:
-            meant = translated(self._library, error)
-            lost = isinstance(meant, DeviceGone | DeviceTimeout)
-            if lost:
-                self.close()
-                if name == "capture":
-                    meant, lost = shot_lost(meant), False
-            return Failed.of(meant, lost=lost)
-        except DeviceError as error:
-            return Failed.of(error)
-        return result, self._serial, time.monotonic() - began_s
-
-    def close(self) -> None:
-        opened, self._opened = self._opened, None
-        if opened is not None:
-            self._let_go(opened.camera)
-
-    def _open(self) -> Opened:
-        if self._opened is None:
-            self._opened = self._found()
-        return self._opened
+            translation = translated(self._library, error)
+            lost = name == "capture" and isinstance(translation, DeviceGone | DeviceTimeout)
+            raise (shot_lost(translation) if lost else translation) from error
 
     def _found(self) -> Opened:
         failure: DeviceError = DeviceGone(
@@ -121,7 +102,7 @@ class Worker:
             if not self._serial or serial == self._serial:
                 self._serial = serial
                 return opened
-            self._let_go(camera)
+            opened.close()
             failure = DeviceRefused(
                 "camera-other",
                 what=f"The connected camera has the serial number {serial or '(none)'}, not {self._serial}.",
@@ -139,10 +120,6 @@ class Worker:
             known = self._library.CameraAbilitiesList()
             known.load()
             camera.set_abilities(known[known.lookup_model(_NETWORK_MODEL)])
-
-    def _let_go(self, camera: Any) -> None:
-        with contextlib.suppress(self._library.GPhoto2Error):
-            camera.exit()
 
     def _ports(self) -> list[str]:
         """Where to search: at the given port, then, once the serial number is known, everywhere."""

@@ -14,7 +14,7 @@ from typing import Final
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout
 from plugins.v4l2 import kernel
 from plugins.v4l2.formats import COMPRESSED, VideoFormat, code_of, number_of, whole_jpeg
-from plugins.v4l2.nodes import VideoNode, who
+from plugins.v4l2.nodes import VideoNode, identify
 
 _BUFFERS: Final = 4
 _MOST: Final = 4096
@@ -34,7 +34,7 @@ class VideoDevice:
         except OSError as error:
             raise kernel.meant(error) from error
         try:
-            found = who(path, self._handle)
+            found = identify(path, self._handle)
             if found is None:
                 raise DeviceRefused(
                     "camera-no-capture",

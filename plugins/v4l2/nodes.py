@@ -52,17 +52,17 @@ def paths() -> list[Path]:
     return [found[number] for number in sorted(found)]
 
 
-def asked(path: Path) -> VideoNode | None:
+def identify_path(path: Path) -> VideoNode | None:
     """Who the device is; None for one that takes no pictures, such as a camera's second one, for its own data.
 
     Raises DeviceGone or DeviceRefused.
     """
     with opened(path) as handle:
-        return who(path, handle)
+        return identify(path, handle)
 
 
-def who(path: Path, handle: int) -> VideoNode | None:
-    """As ``asked``, of an open device."""
+def identify(path: Path, handle: int) -> VideoNode | None:
+    """As ``identify_path``, of an open device."""
     told = kernel.Capability()
     if not kernel.answered(handle, kernel.QUERYCAP, told):
         return None
@@ -84,7 +84,7 @@ def chosen(address: str, serial: str, bus: str) -> VideoNode:
     others: list[str] = []
     for path in [Path(address)] if address else paths():
         try:
-            node = asked(path)
+            node = identify_path(path)
         except DeviceGone:
             continue
         except DeviceRefused as error:

@@ -335,7 +335,7 @@ def _levels() -> tuple[bytes, ...]:
 
 
 def _pjlink_asked(data: bytes) -> None:
-    if (command := pjlink_lines.asked(data)) is not None:
+    if (command := pjlink_lines.parse_command(data)) is not None:
         pjlink_lines.meant(command, ("marble", "warm wood"))
 
 

@@ -25,7 +25,7 @@ from controller.study.experiments.live import live_pictures
 from controller.study.experiments.residual import BRIGHT, residual
 from controller.study.lab.measuring import SET_COLUMNS
 from controller.study.lab.subject import Dots, Subject
-from controller.study.lab.trial import trial
+from controller.study.lab.trial import run_trial
 from controller.study.values import Result, column
 from plugins.emulated.optics.sensor import REFERENCE_APERTURE_F
 from tests.end_to_end.conftest import FinishedDemo
@@ -90,7 +90,7 @@ def fresh(subject: Subject) -> Subject:
 def test_a_photograph_of_the_optics_is_one_that_the_demo_took(fresh: Subject, finished_demo: FinishedDemo) -> None:
     (told,) = (one for one in json.loads((finished_demo.out / "report.json").read_text())["appearances"]
                if one["name"] == "photograph")  # fmt: skip
-    found = trial(fresh, "photograph")
+    found = run_trial(fresh, "photograph")
     assert found.quality.delta_e == pytest.approx(told["delta_e00_median"], rel=0.5)
     assert found.quality.pixels["in_reach"].left_out_share > 0.04
 

@@ -14,7 +14,7 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS, USUAL, login_of
+from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, login_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.network.gates import GATES
 from plugins.emulated.projectors.network.server import EmulatedNetworkProjector
@@ -123,7 +123,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         board = kwargs.pop("board", None) or BOARDS.get(profile)
         if board is None:
             raise LookupError(f"no emulated board for {profile}: add it to plugins/emulated/projectors/boards.py")
-        if board is not BOARDS[USUAL]:  # the emulator makes that one itself, with its number and quirks
+        if board is not BOARDS[DEFAULT_BOARD]:  # the emulator makes that one itself, with its number and quirks
             kwargs["board"] = board(lamp)
         (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
         table_read = load_profile(f"{name}.toml", tmp_path).serial

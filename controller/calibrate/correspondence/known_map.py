@@ -15,12 +15,10 @@ import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import CELL_PX, PatternKind, PatternPlan, tile_levels
+from controller.capture.patterns import CELL_PX, TILE_MARGIN, PatternKind, PatternPlan, tile_levels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import finite
 
-BORDER_SHARE: Final = 0.28
-"""Of a tile's side, on each side of it, that may show a neighbour's light."""
 WORST_OFF: Final = 0.15
 """Of white: a camera pixel that is farther from what it should see, in any channel, sees another tile."""
 LEAST_AGREEING: Final = 0.97
@@ -78,7 +76,7 @@ def check_map(
         side = pattern.tile_cells * CELL_PX
         at = np.nan_to_num(known_px) + np.float32(0.5)
         within = np.abs(at % side - np.float32(side / 2)).max(axis=2)
-        use = lit & known & (within < (0.5 - BORDER_SHARE) * side)
+        use = lit & known & (within < (0.5 - TILE_MARGIN) * side)
         levels = tile_levels(pattern, plan.size_px)
         row, column = (
             np.clip((at[..., axis] / CELL_PX).astype(np.int64), 0, levels.shape[1 - axis] - 1) for axis in (1, 0)

@@ -15,7 +15,7 @@ FOCAL_WIDTHS = (0.5, 8.0)
 """Focal lengths of projectors, in widths of their image (throw ratios), beyond which the search ends."""
 SHIFT_HEIGHTS = (-0.8, 1.8)
 """Principal point's row in image heights: 0.5 without lens shift, 1.05 for a projector on a table."""
-_USUAL = tuple((throw, shift) for throw in (1.0, 1.8, 3.5) for shift in (-0.05, 0.5, 1.05))
+_COMMON_LENSES = tuple((throw, shift) for throw in (1.0, 1.8, 3.5) for shift in (-0.05, 0.5, 1.05))
 _THRESHOLD_PX = 1.5
 _FEWEST = 30
 _SEEDS = 8
@@ -102,8 +102,8 @@ def candidates(
     lowest = np.flatnonzero(ndimage.minimum_filter(table, size=5, mode="nearest").ravel() == imbalance)
     lowest = lowest[np.argsort(imbalance[lowest])][:most]
     # with little depth noise moves the minima anywhere, so usual projectors are tried as well
-    f = np.concatenate([f[lowest], [throw * width for throw, _ in _USUAL]])
-    cy = np.concatenate([cy[lowest], [share * height for _, share in _USUAL]])
+    f = np.concatenate([f[lowest], [throw * width for throw, _ in _COMMON_LENSES]])
+    cy = np.concatenate([cy[lowest], [share * height for _, share in _COMMON_LENSES]])
     starts: list[PairStart] = []
     for essential, own_f, own_cy in zip(_essential(matrix, camera_matrix, f, cy, width), f, cy, strict=True):
         principal = ((width - 1) / 2, float(own_cy))

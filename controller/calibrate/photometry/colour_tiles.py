@@ -12,12 +12,10 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.correspondence.codes import read_code
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import PatternKind, PatternPlan, cells_of_frame, tile_levels
+from controller.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame, tile_levels
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
 
-BORDER_SHARE = 0.28
-"""Of a tile's side, on each side of it, that may contain a neighbour's light."""
 FEWEST_PIXELS = 4
 NOISE = 1e-4
 """Variance of a photograph's value at the white of the brightest pixels, relative; shot noise falls with the light."""
@@ -142,7 +140,7 @@ def _interior(tile: npt.NDArray[np.int32], between: Mask, lit: Mask) -> Mask:
     if not sizes.size:
         return np.zeros_like(lit)
     side_px = float(np.sqrt(np.percentile(sizes, 75)))
-    reach = max(1, round(BORDER_SHARE * side_px))
+    reach = max(1, round(TILE_MARGIN * side_px))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     value = tile.astype(np.float32)  # exact up to 16 million tiles
     least = cv2.erode(np.where(between, np.float32(np.inf), value), kernel)

@@ -62,10 +62,10 @@ class BuildingControl:
         """Run until cancelled. A missing broker only causes retries."""
         loop = asyncio.get_running_loop()
 
-        def tell() -> None:
+        def notify() -> None:
             loop.call_soon_threadsafe(self._changed.set)
 
-        unsubscribe = self._kiosk.subscribe(tell)
+        unsubscribe = self._kiosk.subscribe(notify)
         pause_s = self._first_pause_s
         try:
             while True:

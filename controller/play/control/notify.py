@@ -9,7 +9,7 @@ import sys
 import time
 
 
-def tell(sentence: str) -> None:
+def log(sentence: str) -> None:
     """Write a sentence for the log. A log that is full must not stop the picture."""
     with contextlib.suppress(OSError):
         print(sentence, file=sys.stderr, flush=True)  # noqa: T201

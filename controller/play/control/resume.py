@@ -8,7 +8,7 @@ from typing import Final
 
 from controller.core.errors import VelaturaError
 from controller.core.storage import write_atomically
-from controller.play.control.notify import tell
+from controller.play.control.notify import log
 from controller.play.control.protocol import MAX_LINE_BYTES, Play, Request, Sequence, Stop, Suggested, parse_request
 
 SUFFIX: Final = ".playing"
@@ -35,7 +35,7 @@ class SavedRequest:
             self._line = kept
         except (VelaturaError, OSError) as error:
             self._line = None
-            tell(f"The current request could not be saved: {error}")
+            log(f"The current request could not be saved: {error}")
 
     def request(self) -> Request | None:
         """What is kept, or None where nothing is, or nothing that can be played."""

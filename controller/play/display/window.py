@@ -18,7 +18,7 @@ from pyglet import gl  # noqa: E402
 
 from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.core.errors import WorkError  # noqa: E402
-from controller.play.control.notify import tell  # noqa: E402
+from controller.play.control.notify import log  # noqa: E402
 from controller.play.display.drawing import Canvas  # noqa: E402
 from controller.play.display.output_mapping import check_rates, find_connectors, fits, unfit  # noqa: E402
 from controller.play.display.x11 import Connector, XServer  # noqa: E402
@@ -79,7 +79,7 @@ class WindowOutput:
         if len(wrong) == len(self._sizes):
             raise next(iter(wrong.values()))
         for problem in wrong.values():
-            tell(f"{problem.what} {problem.remedy}")
+            log(f"{problem.what} {problem.remedy}")
         check_rates({name: connector for name, connector in found.items() if name not in wrong})
         return tuple(wrong)
 

@@ -148,18 +148,18 @@ def run_live(
     *,
     rate_hz: float,
     seconds: float | None = None,
-    tell: Callable[[LiveFigures], None] = lambda figures: None,
+    report: Callable[[LiveFigures], None] = lambda figures: None,
 ) -> LiveFigures:
-    """Show the pictures of ``source``, made by ``maker``, until it ends, ``seconds`` have passed or ``tell`` raises.
+    """Show the pictures of ``source``, made by ``maker``, until it ends, ``seconds`` have passed or ``report`` raises.
 
     Parameters
     ----------
     show : called with the finished frames; their buffer may be overwritten after that
     rate_hz : maximum rate of pictures; those that are due in between count as late
-    tell : called about once a second, and may raise to stop
+    report : called about once a second, and may raise to stop
 
     A picture for which the source raises UsageError is skipped and counted as bad. Raises other errors of the source,
-    ``show`` and ``tell``, after the source is closed.
+    ``show`` and ``report``, after the source is closed.
     """
     box = _Mailbox([maker.blank() for _ in range(BUFFERS)])
     stop = threading.Event()
@@ -184,7 +184,7 @@ def run_live(
             figures.bad, figures.trouble = box.bad, box.trouble
             if time.monotonic() - reported_s >= REPORT_EVERY_S:
                 reported_s = time.monotonic()
-                tell(figures)
+                report(figures)
     finally:
         stop.set()
         worker.join()

@@ -34,7 +34,7 @@ from controller.steps import costs
 from controller.steps.appearance.live_parts import live_arrays
 from controller.steps.appearance.thumbnails import Thumbnails
 from controller.steps.capture.patterns import bracket
-from controller.steps.capture.photographs import kept_if_lit, take_photograph
+from controller.steps.capture.photographs import photograph_series, take_photograph
 from hal.deadline import Deadline
 from hal.interfaces import BundleDisplay
 
@@ -304,11 +304,11 @@ def take_bracket(
 ) -> list[Taken]:  # fmt: skip
     """The photographs of ``photograph_hdr``; ``first_again``: the first exposure is taken at the end once more."""
     exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
-    with kept_if_lit(rig, context) as row:
+    with photograph_series(rig, context) as series:
         for number, exposure_s in enumerate([*exposures_s, *exposures_s[: int(first_again)]]):
             identity = ShotId(kind, f"{name}-{number}")
-            row.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
-    return row.taken
+            series.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
+    return series.taken
 
 
 def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:

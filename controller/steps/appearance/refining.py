@@ -203,7 +203,7 @@ class _Round:
         return photographed_error(radiance, self.solved.target, matrix, self.solved.exposure, mask)
 
     def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
-        light = self.calibrated.seen(self._in_order(frames))
+        light = self.calibrated.predicted_light(self._in_order(frames))
         return np.asarray(light + self.calibrated.calibration.black, np.float32)
 
     def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:

@@ -47,7 +47,7 @@ class Thumbnails:
             self._calibrated = Calibrated(self._folder, self._projectors)
         calibration = self._calibrated.calibration
         solved = read_solved(self._folder, name, self._projectors)
-        seen = self._calibrated.seen([solved.linear[projector] for projector in self._projectors])
+        seen = self._calibrated.predicted_light([solved.linear[projector] for projector in self._projectors])
         return png(thumbnail(seen + calibration.black, calibration.camera_to_xyz, white=solved.exposure))
 
 

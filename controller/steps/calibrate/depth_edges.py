@@ -12,7 +12,6 @@ import numpy as np
 from controller.artefacts.calibration import read_calibration, read_correspondence
 from controller.artefacts.depth_edges import EdgeDots, read_edges, write_edges, write_terms
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.modes import DotOptions
 from controller.artefacts.photographs import PhotographSet
 from controller.artefacts.projectors import Light
 from controller.calibrate.metapixels.depth_edges import (
@@ -36,6 +35,7 @@ from controller.steps.capture.dots import (
     spacing_of,
     take_in_batches,
 )
+from controller.steps.modes import DotOptions
 from controller.transport import build_transport
 from controller.transport.edge_terms import edge_term
 

@@ -11,7 +11,6 @@ from typing import Final
 from controller.artefacts.calibration import read_correspondence
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.modes import DotOptions, mode_step
 from controller.artefacts.photographs import Developed, PhotographSet, Taken
 from controller.artefacts.projectors import DotMetapixels, DotNotes, Light, write_dot_figures
 from controller.calibrate.metapixels.from_dots import DotReport, fit_dots
@@ -35,6 +34,7 @@ from controller.steps.capture.dots import (
     spacing_of,
     take_in_batches,
 )
+from controller.steps.modes import DotOptions, mode_step
 
 CLEAR_GAIN: Final = 0.2
 """Regularity above which a fitted centre is corrected; below it, correction of folds and noise makes it worse."""

@@ -11,7 +11,7 @@ import numpy as np
 from controller.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
 from controller.artefacts.geometry import write_geometry
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.modes import PhotographOptions, PlanUsed
+from controller.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.artefacts.photographs import Developed, light_of, noise_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
 from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned

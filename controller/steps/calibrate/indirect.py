@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.artefacts.calibration import read_captures
 from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.modes import PlanUsed
+from controller.artefacts.pattern_plans import PlanUsed
 from controller.artefacts.photographs import Developed, noise_of
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
 from controller.calibrate.correspondence.opposites import completed

@@ -22,9 +22,8 @@ from controller.artefacts.calibration import read_black
 from controller.artefacts.camera import Exposures
 from controller.artefacts.drift import read_drift
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import mode_of
 from controller.artefacts.photographs import DRIFT, white_again_of
-from controller.artefacts.projectors import Indirect, Light, Pixels
+from controller.artefacts.projectors import Indirect, Light, Pixels, mode_of
 from controller.calibrate.verify.drift import Drift, ProjectorDrift
 from controller.calibrate.verify.drift_report import advice, sentences
 from controller.calibrate.verify.homography_update import update_positions, update_radiometry
@@ -46,7 +45,7 @@ class Way(enum.Enum):
     """How a quick recalibration treats a step of the full one."""
 
     RUN = "run"
-    KEEP = "keep"
+    KEEP = "copy_from_last"
     CORRECT = "correct"
 
 
@@ -101,7 +100,7 @@ def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
         way = way_of(step.id, read_drift(context.folder), mode_of(last.folder))
         if way is Way.RUN:
             return step.run(context)
-        kept = keep(last.folder, step.id, context)
+        kept = copy_from_last(last.folder, step.id, context)
         if kept is None:  # the last calibration had no such step
             return step.run(context)
         return kept if way is Way.KEEP else _correct(rig, last, step.id, kept, context)
@@ -137,7 +136,7 @@ def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
     return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
 
 
-def keep(last: Path, step: StepId, context: Context) -> list[Path] | None:
+def copy_from_last(last: Path, step: StepId, context: Context) -> list[Path] | None:
     """The artefacts of the last calibration's step, in this run's folder; None if it had no such step."""
     with Journal(last) as journal:
         artefacts = journal.latest(step)
@@ -206,4 +205,4 @@ def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
     return {name: image}
 
 
-__all__ = ["Way", "chosen", "keep", "quick_steps", "way_of"]
+__all__ = ["Way", "chosen", "copy_from_last", "quick_steps", "way_of"]

@@ -22,7 +22,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.calibrate.grade import verification_photographs_step, verify_step
-from controller.steps.calibrate.quick import Way, keep
+from controller.steps.calibrate.quick import Way, copy_from_last
 from controller.steps.capture.patterns import capture_steps
 
 ANEW = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
@@ -72,7 +72,7 @@ def _exposure(last: Calibrated, exposing: Step, context: Context) -> Sequence[Pa
 
 
 def _kept(last: Calibrated, step: Step, way: Way, context: Context) -> Sequence[Path]:
-    kept = keep(last.folder, step.id, context)
+    kept = copy_from_last(last.folder, step.id, context)
     if kept is None:  # the last calibration had no such step
         return step.run(context)
     if way is Way.CORRECT:

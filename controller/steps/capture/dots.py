@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 
 from controller.artefacts.camera import Exposures
-from controller.artefacts.modes import DotOptions
 from controller.artefacts.photographs import PhotographSet, Taken, captured, codes_of
 from controller.artefacts.projectors import Pixels
 from controller.calibrate.metapixels.from_dots import largest_sigma_px, peak_share
@@ -24,6 +23,7 @@ from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context
 from controller.steps.capture.patterns import bracket
 from controller.steps.capture.photographs import Planned, take_all
+from controller.steps.modes import DotOptions
 
 BATCH: Final = 16
 """Photographs between two checks of the lamps: so many are lost if one went off."""

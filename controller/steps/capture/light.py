@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.artefacts.calibration import merge_photographs, read_black
 from controller.artefacts.camera import Exposures
-from controller.artefacts.modes import PhotographOptions, PlanUsed, known_map
+from controller.artefacts.pattern_plans import PhotographOptions, PlanUsed, known_map
 from controller.artefacts.photographs import WHITE, Developed, Taken, light_of, noise_of, white_bracket, white_name
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light
 from controller.calibrate.correspondence.coloured_code import decode_colours

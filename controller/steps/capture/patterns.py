@@ -10,8 +10,8 @@ from pathlib import Path
 
 from controller.artefacts.camera import Exposures
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import PhotographOptions
 from controller.artefacts.names import CAPTURES
+from controller.artefacts.pattern_plans import PhotographOptions
 from controller.artefacts.photographs import BLACK, WHITE, codes_of
 from controller.artefacts.projectors import Light
 from controller.capture.acquire import Shot

@@ -40,7 +40,7 @@ from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
 
 MORE_DELAY_S = 0.1
-LOOK_EVERY_S = 30.0
+CHECK_LAMPS_EVERY_S = 30.0
 """Time between two checks of the lamps: at most this much work is lost when a lamp fails."""
 
 
@@ -64,62 +64,62 @@ def take_all(rig: Rig, context: Context, plan: Sequence[Planned], *, into: Photo
     """
     use_delay(rig, context.folder)
     watch = CameraWatch(rig.camera)
-    with kept_if_lit(rig, context) as row:
+    with photograph_series(rig, context) as series:
         for number, planned in enumerate(plan):
             context.advance(number / len(plan), planned.name)
-            row.add(_take(rig, context, planned, into.shot(planned.name, planned.projector)))
-            watch.look(context)
-    return [into.write(context.folder, row.taken), *(photograph.path for photograph in row.taken)]
+            series.add(_take(rig, context, planned, into.shot(planned.name, planned.projector)))
+            watch.check(context)
+    return [into.write(context.folder, series.taken), *(photograph.path for photograph in series.taken)]
 
 
 @dataclass(slots=True)
-class Row:
-    """A row of photographs, and how many of them certainly have the light of all lamps."""
+class PhotographSeries:
+    """Photographs of one step, and how many of them certainly have the light of all lamps."""
 
     rig: Rig
     context: Context
     taken: list[Taken] = field(default_factory=list)
-    _sure: int = 0
-    _looked_at_s: float = field(default_factory=time.monotonic)
+    _confirmed: int = 0
+    _checked_at_s: float = field(default_factory=time.monotonic)
 
-    def add(self, one: Taken) -> None:
-        """Check the lamps from time to time. Raises as ``Rig.check_light``."""
-        self.taken.append(one)
-        if time.monotonic() - self._looked_at_s >= LOOK_EVERY_S:
-            self.look(self.context.deadline)
+    def add(self, photograph: Taken) -> None:
+        """Check the lamps every CHECK_LAMPS_EVERY_S. Raises as ``Rig.check_light``."""
+        self.taken.append(photograph)
+        if time.monotonic() - self._checked_at_s >= CHECK_LAMPS_EVERY_S:
+            self.check_lamps(self.context.deadline)
 
-    def look(self, deadline: Deadline) -> None:
+    def check_lamps(self, deadline: Deadline) -> None:
         """Check the lamps; if one fails, discard the photographs since the last check. Raises as ``check_light``."""
-        if not any(photograph.fresh for photograph in self.taken[self._sure :]):
+        if not any(photograph.fresh for photograph in self.taken[self._confirmed :]):
             return
         try:
             self.rig.check_light(deadline=deadline)
         except Cancelled:
             raise
         except DeviceError:
-            for photograph in self.taken[self._sure :]:
+            for photograph in self.taken[self._confirmed :]:
                 if photograph.fresh:
                     delete_photograph(photograph.path)
-            del self.taken[self._sure :]
+            del self.taken[self._confirmed :]
             raise
-        self._sure, self._looked_at_s = len(self.taken), time.monotonic()
+        self._confirmed, self._checked_at_s = len(self.taken), time.monotonic()
 
 
 @contextlib.contextmanager
-def kept_if_lit(rig: Rig, context: Context) -> Iterator[Row]:
-    """A row to which photographs are added as they are taken. If a lamp has failed at its end, or when it is stopped,
-    the photographs since the last check are discarded, because some may lack its light.
+def photograph_series(rig: Rig, context: Context) -> Iterator[PhotographSeries]:
+    """A series to which photographs are added as they are taken. If a lamp has failed at its end, or when it is
+    stopped, the photographs since the last check are discarded, because some may lack its light.
 
     Raises as ``Rig.check_light``. A continued run takes the discarded ones again.
     """
-    row = Row(rig, context)
+    series = PhotographSeries(rig, context)
     try:
-        yield row
-        row.look(context.deadline)
+        yield series
+        series.check_lamps(context.deadline)
     except BaseException:
-        # With its own time limit, and without an error: the caller reports the error that ended the row.
+        # With its own time limit, and without an error: the caller reports the error that ended the series.
         with contextlib.suppress(DeviceError):
-            row.look(in_seconds(sum(guard.answer_s for guard in rig.guards)))
+            series.check_lamps(in_seconds(sum(guard.answer_s for guard in rig.guards)))
         raise
 
 
@@ -152,12 +152,12 @@ def _take(rig: Rig, context: Context, planned: Planned, identity: ShotId) -> Tak
     if acquirer.protected:
         last = LastShown(frames, thumbprint(path, exposure_s), presented.sequence)
         if before is not None and changed_share(before.frames, frames) > CHANGED_FRAMES:
-            path, exposure_s, last = _not_the_one_before(rig, context, identity, shot, (path, exposure_s, last), before)
+            path, exposure_s, last = _changed_photograph(rig, context, identity, shot, (path, exposure_s, last), before)
         acquirer.last = last
     return _journalled(context, identity, settings, path, exposure_s)
 
 
-def _not_the_one_before(
+def _changed_photograph(
     rig: Rig, context: Context, identity: ShotId, shot: Shot, first: tuple[Path, float, LastShown], before: LastShown
 ) -> tuple[Path, float, LastShown]:
     """The photograph if it differs from the previous one; otherwise one taken much later.

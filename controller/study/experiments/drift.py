@@ -11,7 +11,7 @@ import numpy as np
 from controller.calibrate.verify.drift import Drift, DriftCause
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, Recalibration, StageControl, Subject
-from controller.study.lab.trial import Trial, shown, trial
+from controller.study.lab.trial import Trial, photograph_frames, run_trial
 from controller.study.output.drawing import Line, plotted
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 
@@ -47,7 +47,7 @@ class BumpResult:
 def drifting(subject: Subject) -> Result:
     """Bump one part after the other by growing amounts; check, recalibrate, and photograph the same appearance."""
     hand: StageControl = subject.parts.hand
-    before = trial(subject, "undisturbed")
+    before = run_trial(subject, "undisturbed")
     quiet = hand.drift("undisturbed")
     name = subject.calibration.projectors[0].name
     bumps = []
@@ -59,7 +59,7 @@ def drifting(subject: Subject) -> Result:
         seen: Trial | None = None
         if what != CAMERA:
             # Who looks on does not stand where the camera stands: a moved camera changes nothing on the object.
-            seen = shown(subject, f"{key}-unnoticed", before.wanted, before.frames)
+            seen = photograph_frames(subject, f"{key}-unnoticed", before.wanted, before.frames)
         drift = hand.drift(key)
         recalibrated = level in RECALIBRATED_LEVELS[what]
         quick = hand.quickly(key) if recalibrated else None
@@ -103,7 +103,7 @@ def camera_pixel_mm(subject: Subject) -> float:
 
 
 def _error(again: Recalibration | None, name: str) -> float | None:
-    return None if again is None else trial(again.subject, name).quality.delta_e
+    return None if again is None else run_trial(again.subject, name).quality.delta_e
 
 
 def _named(drift: Drift, what: str, projector: str) -> bool:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from controller.artefacts.modes import DotOptions
+from controller.steps.modes import DotOptions
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import StageControl, Subject
-from controller.study.lab.trial import trial
+from controller.study.lab.trial import run_trial
 from controller.study.output.drawing import Line, plotted
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 
@@ -43,7 +43,7 @@ def effort(subject: Subject) -> Result:
         subject.advance(number / len(ways), way)
         key = way.replace(", r = ", "-")
         again = hand.again(key, options)
-        made = trial(again.subject, key)
+        made = run_trial(again.subject, key)
         projectors = len(subject.calibration.projectors)
         found = made.quality
         results.append(

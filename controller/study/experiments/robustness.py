@@ -12,7 +12,7 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, StageControl, Subject
-from controller.study.lab.trial import Trial, shown, trial
+from controller.study.lab.trial import Trial, photograph_frames, run_trial
 from controller.study.output.drawing import Line, plotted
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 
@@ -101,7 +101,7 @@ class DisturbanceResult:
 
 def robustness(subject: Subject) -> Result:
     """Increase every disturbance until the error of the same photographed appearance has doubled in both measures."""
-    base = trial(subject, "undisturbed")
+    base = run_trial(subject, "undisturbed")
     results: list[DisturbanceResult] = []
     for number, disturbance in enumerate(DISTURBANCES):
         for place, level in enumerate(disturbance.levels):
@@ -118,17 +118,17 @@ def _run_level(subject: Subject, undisturbed: Trial, disturbance: Disturbance, l
     hand: StageControl = subject.parts.hand
     key = f"{disturbance.name.replace(' ', '-').replace(chr(39), '')}-{level:g}"
     if disturbance.frames is not None:
-        made = shown(subject, key, undisturbed.wanted, disturbance.frames(undisturbed.frames, level))
+        made = photograph_frames(subject, key, undisturbed.wanted, disturbance.frames(undisturbed.frames, level))
         return DisturbanceResult(disturbance, level, made, None)
     changes = disturbance.changes or disturbance.after
     assert changes is not None
     hand.disturb(*changes(subject, level))
     try:
         if disturbance.changes is None:
-            made = shown(subject, key, undisturbed.wanted, undisturbed.frames)
+            made = photograph_frames(subject, key, undisturbed.wanted, undisturbed.frames)
             return DisturbanceResult(disturbance, level, made, None)
         again = hand.again(key)
-        return DisturbanceResult(disturbance, level, trial(again.subject, key), again.worst_percent)
+        return DisturbanceResult(disturbance, level, run_trial(again.subject, key), again.worst_percent)
     except VelaturaError as error:
         if error.code == "cancelled":
             raise

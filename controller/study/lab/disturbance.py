@@ -10,7 +10,6 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.drift import read_drift
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.grade import graded
-from controller.artefacts.modes import DotOptions
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.verify.drift import Drift
 from controller.rig.rig import Rig
@@ -22,6 +21,7 @@ from controller.steps.calibrate.drift import drift_steps
 from controller.steps.calibrate.full import calibration_steps
 from controller.steps.calibrate.grade import verify_step
 from controller.steps.calibrate.quick import quick_steps
+from controller.steps.modes import DotOptions
 from controller.study.lab.photographing import RigPhotographer
 from controller.study.lab.subject import BenchChange, Recalibration, Subject
 

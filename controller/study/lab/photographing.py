@@ -13,7 +13,6 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.calibration import read_correspondence, read_phase_map
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import DotOptions
 from controller.artefacts.photographs import Developed, PhotographSet
 from controller.artefacts.projectors import DotNotes, Light
 from controller.calibrate.metapixels.from_dots import fit_dots
@@ -27,6 +26,7 @@ from controller.steps.appearance.publishing import take_hdr
 from controller.steps.appearance.solving import device_frames
 from controller.steps.calibrate.dots import capture_step, read_dots
 from controller.steps.capture.photographs import frames_digest
+from controller.steps.modes import DotOptions
 from controller.study.lab.subject import Dots, Shares
 
 FAINTEST_SHARE = 0.01

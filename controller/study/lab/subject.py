@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.sparse as sp
 
-from controller.artefacts.modes import DotOptions
 from controller.calibrate.values import Calibration, Geometry, Metapixels
 from controller.calibrate.verify.drift import Drift
 from controller.core.arrays import FloatImage, Mask
@@ -19,6 +18,7 @@ from controller.solve.drive_levels import DriveLevels
 from controller.solve.exposed import exposed
 from controller.solve.feasibility import target_radiance
 from controller.solve.targets.values import Target
+from controller.steps.modes import DotOptions
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
 

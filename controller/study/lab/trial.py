@@ -42,16 +42,16 @@ def live_frames(subject: Subject, base: Base, radiance: FloatImage) -> Sequence[
     return [to_light(frame, radiometry) for frame, radiometry in zip(frames, radiometries, strict=True)]
 
 
-def trial(subject: Subject, name: str) -> Trial:
+def run_trial(subject: Subject, name: str) -> Trial:
     """A photograph wrapped on the reconstructed object, at an exposure that 95 % of it can reach."""
     wanted = subject.wanted(photograph_target(subject))
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
     black = subject.calibration.black
     solution = solve_bounded(subject.transport, wanted.direct, black, weights=weights, smoothness=SMOOTHNESS)
-    return shown(subject, name, wanted, solution.frames)
+    return photograph_frames(subject, name, wanted, solution.frames)
 
 
-def shown(subject: Subject, name: str, wanted: ReachableTarget, frames: Sequence[FloatImage]) -> Trial:
-    """The same frames photographed, now."""
+def photograph_frames(subject: Subject, name: str, wanted: ReachableTarget, frames: Sequence[FloatImage]) -> Trial:
+    """Photograph ``frames`` in the state in which the stage is now, and compare with what is wanted."""
     picture = subject.light.photograph(name, frames, white=wanted.white)
     return Trial(wanted, frames, picture, quality(subject, picture, wanted))

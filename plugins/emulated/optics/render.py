@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hal.runtime.jit import compiled
 from plugins.emulated.optics.effects.depth_of_field import confusion_px, defocused
-from plugins.emulated.optics.effects.dithering import shown
+from plugins.emulated.optics.effects.dithering import mean_light
 from plugins.emulated.optics.effects.flaws import veiled
 from plugins.emulated.optics.effects.levels import Dithering
 from plugins.emulated.optics.effects.spectra import colours
@@ -67,7 +67,7 @@ def channels(
     else:
         start, frames = shutter.start_s / dithering.frame_s, shutter.open_s / dithering.frame_s
         wanted = _looked_up(table, frame)
-        made = shown(wanted, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
+        made = mean_light(wanted, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
         each = np.float32(black) + np.float32(1.0 - black) * made
     if light.white_segment > 0.0:
         each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)

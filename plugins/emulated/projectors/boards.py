@@ -23,9 +23,9 @@ from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.optoma import OptomaBoard
 from plugins.emulated.projectors.serial import Board
 
-USUAL: Final = "optoma-later"
+DEFAULT_BOARD: Final = "optoma-later"
 BOARDS: Final[Mapping[str, Callable[[EmulatedLamp], Board]]] = {
-    USUAL: OptomaBoard,
+    DEFAULT_BOARD: OptomaBoard,
     "epson-escvp21": EpsonBoard,
     "benq": BenqBoard,
     "christie": ChristieBoard,

@@ -11,8 +11,6 @@ from typing import Final
 
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
-_BURNING: Final = (LampPhase.WARMING, LampPhase.LIT)
-
 
 class NecBoard:
     """The binary protocol: five bytes of header, of which the last counts the data, the data, and the sum.
@@ -69,7 +67,7 @@ class NecBoard:
             self._lamp.extinguish()
             return b""
         if code in self._shutters:
-            if self._lamp.phase not in _BURNING:
+            if not self._lamp.burning:
                 return None
             self._lamp.shutter_closed = code in (b"\x02\x10", b"\x02\x16")
             return b""
@@ -81,13 +79,11 @@ class NecBoard:
     def _running(self) -> bytes:
         """078-2: 16 bytes; the third to sixth tell power, cooling, whether a power process runs, and the operation."""
         phase = self._lamp.phase
-        status = bytes([phase in _BURNING, phase is LampPhase.COOLING, phase is LampPhase.WARMING, self._operation()])
+        status = bytes([self._lamp.burning, phase is LampPhase.COOLING, phase is LampPhase.WARMING, self._operation()])
         return b"\x40\xff" + status + b"\xff" * 10
 
     def _operation(self) -> int:
-        phase = self._lamp.phase
-        broken = phase not in _BURNING and (self._lamp.too_hot or (self._lamp.failed and self._lamp.strikes))
-        return 0x06 if broken else self._OPERATION[phase]
+        return 0x06 if self._lamp.faulty else self._OPERATION[self._lamp.phase]
 
     def _basic(self) -> bytes:
         """305-3: 16 bytes; what was asked, the operation, what is shown, the signal's types, the mutes, freeze."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines, broken
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 
@@ -26,12 +26,12 @@ class EpsonBoard:
     def __init__(self, lamp: EmulatedLamp, quirks: EpsonQuirks | None = None) -> None:
         self._lamp = lamp
         self._quirks = quirks or EpsonQuirks()
-        self._lines = Lines(ord("\r"))
+        self._lines = LineBuffer(ord("\r"))
         self._owes_prompt = False
         self._menu = {b"SOURCE": b"30", b"VKEYSTONE": b"128", b"LUMINANCE": b"00"}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        answers = [self._answer(line, busy) for line in self._lines.whole(data)]
+        answers = [self._answer(line, busy) for line in self._lines.feed(data)]
         return [answer for answer in answers if answer]
 
     def notices(self) -> list[bytes]:
@@ -43,13 +43,13 @@ class EpsonBoard:
     def _answer(self, line: bytes, busy: bool) -> bytes:
         if self._quirks.deaf_while_warming and self._lamp.phase is LampPhase.WARMING:
             return b""
-        prompt = b"" if broken(self._lamp) else b":"
+        prompt = b"" if self._lamp.faulty else b":"
         reply = b"ERR" if busy else self._act(line.strip(b"\n "))
         return b"" if reply is None else (reply + b"\r" if reply else b"") + prompt
 
     def _act(self, line: bytes) -> bytes | None:
         """The reply before the prompt: b"" nothing, None: the prompt comes later."""
-        burning = self._lamp.phase in BURNING
+        burning = self._lamp.burning
         if line in (b"PWR ON", b"PWR OFF"):
             return self._switch(line == b"PWR ON")
         if line in (b"MUTE ON", b"MUTE OFF") and burning:
@@ -75,7 +75,7 @@ class EpsonBoard:
         return None if self._owes_prompt else b""
 
     def _power(self) -> bytes:
-        if broken(self._lamp):
+        if self._lamp.faulty:
             return b"05"
         codes = {LampPhase.STANDBY: b"00", LampPhase.LIT: b"01", LampPhase.WARMING: b"02", LampPhase.COOLING: b"03"}
         return codes[self._lamp.phase]
@@ -101,12 +101,12 @@ class BenqBoard:
     def __init__(self, lamp: EmulatedLamp, quirks: BenqQuirks | None = None) -> None:
         self._lamp = lamp
         self._quirks = quirks or BenqQuirks()
-        self._lines = Lines(ord("\r"), ord("*"))
+        self._lines = LineBuffer(ord("\r"), ord("*"))
         self._menu = {b"sour": b"HDMI", b"lampm": b"LNOR", b"vkeystone": b"0"} if self._quirks.menus else {}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers, prompt = [], b""
-        for line in self._lines.whole(data):
+        for line in self._lines.feed(data):
             if line.strip():
                 answers.append(prompt + self._reply(line, busy))
                 prompt = b""
@@ -118,7 +118,7 @@ class BenqBoard:
         return []
 
     def _reply(self, line: bytes, busy: bool) -> bytes:
-        quirks, standby = self._quirks, self._lamp.phase not in BURNING
+        quirks, standby = self._quirks, not self._lamp.burning
         answer = b"*Block item#" if busy else self._act(line.lower())
         if quirks.starless_in_standby and standby and b"=" in answer:
             answer = answer.removeprefix(b"*")
@@ -133,7 +133,7 @@ class BenqBoard:
             return b"*Illegal format#"
         if key == b"pow" and value in (b"on", b"off"):
             return self._switch(value == b"on")
-        standby = self._lamp.phase not in BURNING
+        standby = not self._lamp.burning
         if value == b"?" and key in (b"pow", b"ltim"):
             hours = b"*LTIM= %d" if self._quirks.bare_hours else b"*LTIM=%d#"
             return hours % self._lamp.hours if key == b"ltim" else b"*POW=OFF#" if standby else b"*POW=ON#"
@@ -177,12 +177,12 @@ class ChristieBoard:
     def __init__(self, lamp: EmulatedLamp, *, lamps: bool = True) -> None:
         self._lamp = lamp
         self._lamps = lamps
-        self._lines = Lines(ord(")"), ord("("))
+        self._lines = LineBuffer(ord(")"), ord("("))
         self._phase = lamp.phase
-        self._told_broken = False
+        self._reported_faulty = False
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line for line in self._lines.whole(data) if line.startswith(b"(")]
+        lines = [line for line in self._lines.feed(data) if line.startswith(b"(")]
         return [answer for answer in (self._reply(line[1:], busy) for line in lines) if answer]
 
     def notices(self) -> list[bytes]:
@@ -190,10 +190,10 @@ class ChristieBoard:
         if self._lamp.phase is not self._phase:
             self._phase = self._lamp.phase
             due += [self._FYI % self._lamp.hours] if self._lamps else []
-        is_broken = broken(self._lamp)
-        if is_broken and not self._told_broken:
+        faulty = self._lamp.faulty
+        if faulty and not self._reported_faulty:
             due.append(self._ERROR)
-        self._told_broken = is_broken
+        self._reported_faulty = faulty
         return due
 
     def _reply(self, message: bytes, busy: bool) -> bytes:
@@ -216,7 +216,7 @@ class ChristieBoard:
             self._lamp.shutter_closed = one
             return True
         if one:
-            self._told_broken = False
+            self._reported_faulty = False
             return self._lamp.strike()
         self._lamp.extinguish()
         return True
@@ -240,10 +240,10 @@ class PanasonicBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = Lines(0x03, 0x02)
+        self._lines = LineBuffer(0x03, 0x02)
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line for line in self._lines.whole(data) if line.startswith(b"\x02")]
+        lines = [line for line in self._lines.feed(data) if line.startswith(b"\x02")]
         return [b"\x02" + (b"ER401" if busy else self._act(line[1:])) + b"\x03" for line in lines]
 
     def notices(self) -> list[bytes]:
@@ -260,7 +260,7 @@ class PanasonicBoard:
         elif line == b"POF":
             self._lamp.extinguish()
             done = True
-        elif line in (b"OSH:0", b"OSH:1") and self._lamp.phase in BURNING:
+        elif line in (b"OSH:0", b"OSH:1") and self._lamp.burning:
             self._lamp.shutter_closed = line == b"OSH:1"
             done = True
         return line if done else b"ER402" if line.startswith(b"OSH:") else b"ER401"

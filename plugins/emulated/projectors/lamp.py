@@ -72,10 +72,9 @@ class EmulatedLamp:
         A failed lamp takes the strike and stays dark.
         """
         with self._lock:
-            phase = self.phase
-            if phase in (LampPhase.WARMING, LampPhase.LIT):
+            if self.burning:
                 return True
-            if phase is LampPhase.COOLING or self._hot or not self._mains:
+            if self.phase is LampPhase.COOLING or self._hot or not self._mains:
                 return False
             self._strikes += 1
             if not self._failed:
@@ -99,6 +98,17 @@ class EmulatedLamp:
             if self._off_since is not None and now - self._off_since < self._timing.cool_down_s:
                 return LampPhase.COOLING
             return LampPhase.STANDBY
+
+    @property
+    def burning(self) -> bool:
+        """Whether it warms or is lit."""
+        return self.phase in (LampPhase.WARMING, LampPhase.LIT)
+
+    @property
+    def faulty(self) -> bool:
+        """Whether its projector reports an error: it should burn, and the lamp failed or is too hot."""
+        with self._lock:
+            return not self.burning and (self._hot or (self._failed and self._strikes > 0))
 
     def light_level(self) -> float:
         """Share of the projector's full light: 0 when dark or behind shutter or douser, rising while it warms; then

@@ -102,13 +102,13 @@ class OptomaBoard:
         return struck
 
     def _mute(self, parameter: bytes) -> bytes:
-        if parameter not in (b"0", b"1", b"2") or self._lamp.phase not in (LampPhase.WARMING, LampPhase.LIT):
+        if parameter not in (b"0", b"1", b"2") or not self._lamp.burning:
             return b"F\r"
         self._lamp.shutter_closed = parameter == b"1"
         return b"P\r"
 
     def _read(self, command: int) -> bytes | None:
-        burning = self._lamp.phase in (LampPhase.WARMING, LampPhase.LIT)
+        burning = self._lamp.burning
         if command == 124:
             return b"1" if burning else b"0"
         if command == 108:

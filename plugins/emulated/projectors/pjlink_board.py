@@ -86,20 +86,17 @@ class PjLinkBoard:
             return _FIXED[name]
         if pj_class == b"2" and name in _SECOND:
             return _SECOND[name]
-        if name in (b"INPT", b"AVMT") and not self._burning():
+        if name in (b"INPT", b"AVMT") and not self._lamp.burning:
             return b"ERR3"
         state: dict[bytes, Callable[[], bytes]] = {
             b"POWR": lambda: _POWER[self._lamp.phase],
-            b"LAMP": lambda: b"%d %d" % (self._lamp.hours, self._burning()),
+            b"LAMP": lambda: b"%d %d" % (self._lamp.hours, self._lamp.burning),
             b"ERST": lambda: b"0%d%d000" % (2 * self._lamp.failed, 2 * self._lamp.too_hot),
             b"NAME": lambda: self._name,
             b"INPT": lambda: self._input,
             b"AVMT": self._muted,
         }
         return state[name]() if name in state else b"ERR1"
-
-    def _burning(self) -> bool:
-        return self._lamp.phase in (LampPhase.WARMING, LampPhase.LIT)
 
     def _muted(self) -> bytes:
         video, audio = self._lamp.shutter_closed, self._audio_muted
@@ -118,7 +115,7 @@ class PjLinkBoard:
     def _mute(self, parameter: bytes) -> bytes:
         if parameter not in self.odd.mutes:
             return b"ERR2"
-        if not self._burning():
+        if not self._lamp.burning:
             return b"ERR3"
         on = parameter[1:] == b"1"
         if parameter[:1] in b"13":
@@ -130,7 +127,7 @@ class PjLinkBoard:
     def _select(self, parameter: bytes) -> bytes:
         if parameter not in _FIXED[b"INST"].split():
             return b"ERR2"
-        if not self._burning():
+        if not self._lamp.burning:
             return b"ERR3"
         self._input = parameter
         return b"OK"

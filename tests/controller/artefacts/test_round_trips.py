@@ -18,7 +18,6 @@ from controller.artefacts.camera import Exposures
 from controller.artefacts.depth_edges import edged, write_terms
 from controller.artefacts.geometry import projectors_of, read_geometry, write_geometry
 from controller.artefacts.grade import ErrorMaps, graded, read_error_maps, write_grade
-from controller.artefacts.modes import DotOptions, mode_step
 from controller.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, Taken, light_of
 from controller.artefacts.projectors import Light, PixelFigures, Pixels
 from controller.artefacts.solved import Solved, SolvedBase, is_solved, read_solved, remove_solved
@@ -26,6 +25,7 @@ from controller.calibrate.geometry.values import Reconstruction
 from controller.calibrate.values import Geometry, Pinhole
 from controller.core.arrays import load_arrays, save_arrays
 from controller.solve.bounded.solver import Solution
+from controller.steps.modes import DotOptions, mode_step
 from controller.transport.edge_terms import EdgedTransport, EdgeTerm
 from tests.controller.artefacts.names import projectors
 

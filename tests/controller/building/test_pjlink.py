@@ -186,7 +186,7 @@ def test_a_viewer_may_only_ask(kiosk: MemoryKiosk, tmp_path: Path) -> None:
     st.text(max_size=80),
 )
 def test_every_line_gets_one_line_that_is_no_more_than_the_longest(line: bytes, name: str) -> None:
-    command = lines.asked(line.removesuffix(b"\r"))
+    command = lines.parse_command(line.removesuffix(b"\r"))
     if command is None:
         return
     now = KioskState(1, name, "playing", "", 0.0, playing=name)

@@ -97,7 +97,7 @@ def test_a_stalled_stream_keeps_its_last_picture_and_one_that_comes_back_goes_on
 
         def play() -> None:
             with pytest.raises(KeyboardInterrupt):
-                run_live(source, TargetMaker(SIZE), show, rate_hz=50, tell=tell)
+                run_live(source, TargetMaker(SIZE), show, rate_hz=50, report=tell)
 
         worker = threading.Thread(target=play)
         worker.start()

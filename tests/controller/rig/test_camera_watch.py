@@ -66,9 +66,9 @@ def codes(context: Context) -> list[str]:
 def test_every_mended_fault_is_journalled_once(context: Context) -> None:
     camera = TellingCamera(mended=[("camera-busy", "It was busy."), ("camera-usb-back", "It came back.")])
     watch = CameraWatch(camera)
-    watch.look(context)
+    watch.check(context)
     camera.mended.append(("camera-busy", "It was busy again."))
-    watch.look(context)
+    watch.check(context)
     assert codes(context) == ["camera-busy", "camera-usb-back", "camera-busy"]
     assert context.journal.events()[-1].text == "It was busy again."
     assert {event.level for event in context.journal.events()} == {"warning"}
@@ -79,8 +79,8 @@ def test_a_low_battery_is_told_to_the_technician_once_a_run(context: Context, he
     for _ in range(3):
         moments = iter((0.0, 0.0, 0.0, 2 * EVERY_S, 2 * EVERY_S))
         watch = CameraWatch(camera, clock=lambda moments=moments: next(moments))  # type: ignore[misc]
-        watch.look(context)
-        watch.look(context)
+        watch.check(context)
+        watch.check(context)
     assert camera.asked == 6
     assert codes(context) == ["camera-battery-low"]
     assert [level for _, level in heard.said] == [Level.WARNING]
@@ -92,22 +92,22 @@ def test_the_state_is_asked_for_once_a_minute_not_after_each_photograph(context:
     camera = TellingCamera()
     watch = CameraWatch(camera, clock=lambda: now)
     for _ in range(100):
-        watch.look(context)
+        watch.check(context)
         now += EVERY_S / 10
     assert camera.asked == 10
 
 
 def test_a_camera_that_does_not_tell_its_state_stops_nothing(context: Context) -> None:
     camera = TellingCamera(silent=DeviceTimeout("camera-silent", what="It said nothing.", remedy="Wait."))
-    CameraWatch(camera).look(context)
+    CameraWatch(camera).check(context)
     assert codes(context) == ["camera-silent"]
 
 
 def test_a_stop_takes_hold_while_the_camera_is_asked(context: Context) -> None:
     with pytest.raises(Cancelled):
-        CameraWatch(TellingCamera(silent=Cancelled())).look(context)
+        CameraWatch(TellingCamera(silent=Cancelled())).check(context)
 
 
 def test_a_camera_whose_driver_tells_nothing_is_left_alone(context: Context) -> None:
-    CameraWatch(ModelCamera()).look(context)
+    CameraWatch(ModelCamera()).check(context)
     assert codes(context) == []

@@ -11,11 +11,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from controller.artefacts.modes import DotOptions
 from controller.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.calibrate.verify.registration import Motion
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError
+from controller.steps.modes import DotOptions
 from controller.study.experiments.adaptation import ADAPTED, CUT, adaptation
 from controller.study.experiments.drift import LEVELS_PX, BumpResult, _criteria, drifting
 from controller.study.experiments.effort import effort

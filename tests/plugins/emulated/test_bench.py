@@ -30,7 +30,7 @@ from plugins.emulated.cameras.shot import ShotSettings
 from plugins.emulated.optics.stands import Stands
 from plugins.emulated.optics.truth import BenchTruth, DouserTruth, MainsTruth, ProjectorTruth, read_truth, write_truth
 from plugins.emulated.optics.world import World
-from plugins.emulated.projectors.boards import BOARDS, USUAL, login_of
+from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, login_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.wires import projector_on_its_wire
 from plugins.projectors.network.driver import open_network_projector
@@ -126,7 +126,7 @@ SIX = ("benq", "nec", "hitachi", "panasonic-dz", "sony-adcp", "jvc")
 def test_projectors_of_many_families_are_served_on_serial_lines_and_lan_ports(
     tmp_path: Path, shrink: Callable[[BenchTruth], BenchTruth]
 ) -> None:
-    assert set(SIX) < set(BOARDS) - {USUAL}
+    assert set(SIX) < set(BOARDS) - {DEFAULT_BOARD}
     EmulatedBench(Stands(len(SIX))).prepare(tmp_path / "stage", size="small", object_file=None, seed=11)
     truth = shrink(read_truth(tmp_path / "stage"))
     others = [

@@ -134,7 +134,7 @@ def test_a_frame_is_visible_only_after_the_displays_latency(tmp_path: Path) -> N
     now = time.monotonic()
     path.write_bytes(memory_output({"P1": grey(10)}, 2, now - 1.0))
     visible = VisibleFrames(path, latency_s=0.05)
-    visible.look()
+    visible.update()
     path.write_bytes(memory_output({"P1": grey(20)}, 4, now))
     assert [(share, levels(found)) for share, found in visible.during(now, now + 0.04)] == [(1.0, 10)]
     assert [levels(found) for _, found in visible.during(now + 0.06, now + 0.10)] == [20]
@@ -144,7 +144,7 @@ def test_frames_that_change_during_an_exposure_share_its_time(tmp_path: Path) ->
     path = tmp_path / "frame"
     path.write_bytes(memory_output({"P1": grey(10)}, 2, 100.0))
     visible = VisibleFrames(path, latency_s=0.0)
-    visible.look()
+    visible.update()
     path.write_bytes(memory_output({"P1": grey(20)}, 4, 101.0))
     parts = visible.during(100.75, 101.75)
     assert [levels(found) for _, found in parts] == [10, 20]

@@ -12,7 +12,7 @@ ORDER: Final = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 1
 """Bayer's matrix: adjacent pixels take their turns at different times."""
 
 
-def shown(light: FloatImage, *, levels: int, turns: int, start: float, frames: float) -> FloatImage:
+def mean_light(light: FloatImage, *, levels: int, turns: int, start: float, frames: float) -> FloatImage:
     """The mean light (rows, columns, 3) of a dithered panel during an exposure.
 
     ``light``: wanted, 0 to 1; ``levels``: that the panel makes in one frame; ``turns``: frames in which it comes round;

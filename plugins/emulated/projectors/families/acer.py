@@ -6,7 +6,7 @@ so that a common mistake would show.
 
 from __future__ import annotations
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 
@@ -15,10 +15,10 @@ class AcerBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = Lines(ord("\r"), ord("*"))
+        self._lines = LineBuffer(ord("\r"), ord("*"))
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        return [b"*001\r" if busy else self._act(line) for line in self._lines.whole(data) if line.startswith(b"* 0 ")]
+        return [b"*001\r" if busy else self._act(line) for line in self._lines.feed(data) if line.startswith(b"* 0 ")]
 
     def notices(self) -> list[bytes]:
         return []
@@ -32,7 +32,7 @@ class AcerBoard:
                 lamp.extinguish()
                 return b"*000\r"
             case b"Lamp ?":
-                return b"*000\rLamp %d\r" % (lamp.phase in BURNING)
+                return b"*000\rLamp %d\r" % lamp.burning
             case b"Lamp":
                 return b"*000\r%04d\r" % lamp.hours
         return b"*001\r"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from typing import Any, Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, broken
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _STATES: Final = {
@@ -56,7 +55,7 @@ class BarcoPulseBoard:
         return [json.dumps({"jsonrpc": "2.0", "method": "property.changed", "params": changed}).encode()]
 
     def _now(self) -> str:
-        return "error" if broken(self._lamp) else _STATES[self._lamp.phase]
+        return "error" if self._lamp.faulty else _STATES[self._lamp.phase]
 
     def _reply(self, asked: Any, busy: bool) -> dict[str, Any] | None:
         if not isinstance(asked, dict) or "id" not in asked:
@@ -77,7 +76,7 @@ class BarcoPulseBoard:
         if method == "system.poweroff":
             lamp.extinguish()
             return None
-        if method == "property.set" and params.get("property") == "optics.shutter.target" and lamp.phase in BURNING:
+        if method == "property.set" and params.get("property") == "optics.shutter.target" and lamp.burning:
             lamp.shutter_closed = params.get("value") == "Closed"
             return True
         replies = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines, broken
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _STATES: Final = {LampPhase.STANDBY: b"0", LampPhase.WARMING: b"1", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
@@ -19,10 +19,10 @@ class DigitalProjectionBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = Lines(ord("\r"), ord("*"))
+        self._lines = LineBuffer(ord("\r"), ord("*"))
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line[1:] for line in self._lines.whole(data) if line.startswith(b"*")]
+        lines = [line[1:] for line in self._lines.feed(data) if line.startswith(b"*")]
         return [self._reply(line, busy) + b"\r" for line in lines]
 
     def notices(self) -> list[bytes]:
@@ -40,7 +40,7 @@ class DigitalProjectionBoard:
         lamp = self._lamp
         if value == b"?":
             replies = {
-                b"status": b"4" if broken(lamp) else _STATES[lamp.phase],
+                b"status": b"4" if lamp.faulty else _STATES[lamp.phase],
                 b"laser.hours": b"%d" % lamp.hours,
                 b"shutter": b"%d" % lamp.shutter_closed,
             }
@@ -50,7 +50,7 @@ class DigitalProjectionBoard:
         if name == b"power.off":
             lamp.extinguish()
             return b""
-        if name == b"shutter" and value in (b"0", b"1") and lamp.phase in BURNING:
+        if name == b"shutter" and value in (b"0", b"1") and lamp.burning:
             lamp.shutter_closed = value == b"1"
             return value
         return None
@@ -64,10 +64,10 @@ class DigitalProjectionVBoard:
     def __init__(self, lamp: EmulatedLamp, *, number: bytes = b"00") -> None:
         self._lamp = lamp
         self._number = number
-        self._lines = Lines(ord("\r"), ord("V"))
+        self._lines = LineBuffer(ord("\r"), ord("V"))
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line for line in self._lines.whole(data) if line[1:3] in (self._number, b"99")]
+        lines = [line for line in self._lines.feed(data) if line[1:3] in (self._number, b"99")]
         return [(b"F" if busy else self._act(line[3:])) + b"\r" for line in lines]
 
     def notices(self) -> list[bytes]:

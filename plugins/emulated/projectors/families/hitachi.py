@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _HEAD: Final = b"\xbe\xef\x03\x06\x00"
@@ -56,7 +55,7 @@ class HitachiBoard:
             elif not lamp.strike():
                 return b"\x1c\x00\x01"
             return b"\x06"
-        if action == _SET and kind == 0x3020 and lamp.phase in BURNING:
+        if action == _SET and kind == 0x3020 and lamp.burning:
             lamp.shutter_closed = value == 1
             return b"\x06"
         return b"\x1c\x00\x02"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines, broken
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _UNIT: Final = b"\x89\x01"
@@ -20,12 +20,12 @@ class JvcBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = Lines(ord("\n"))
+        self._lines = LineBuffer(ord("\n"))
         self._menu = {b"IP": b"6", b"PMLP": b"0"}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers = []
-        for line in self._lines.whole(data):
+        for line in self._lines.feed(data):
             noise, unit, command = line.rpartition(_UNIT)
             head = noise[-1:]  # what came before it is passed over
             if busy or not unit:
@@ -46,12 +46,12 @@ class JvcBoard:
         if command == b"PW0":
             self._lamp.extinguish()
             return True
-        if command[:-1] in self._menu and self._lamp.phase in BURNING:
+        if command[:-1] in self._menu and self._lamp.burning:
             self._menu[command[:-1]] = command[-1:]
             return True
         return command == b""  # a check of the connection
 
     def _answer(self, command: bytes) -> bytes | None:
-        power = b"4" if broken(self._lamp) else _PHASES[self._lamp.phase]
+        power = b"4" if self._lamp.faulty else _PHASES[self._lamp.phase]
         replies = {b"PW": power, b"MD": b"ILAFPJ -- B5B1", b"IFLT": b"%04X" % self._lamp.hours}
-        return (replies | self._menu if self._lamp.phase in BURNING else replies).get(command)
+        return (replies | self._menu if self._lamp.burning else replies).get(command)

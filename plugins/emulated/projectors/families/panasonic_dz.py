@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _PHASES: Final = {LampPhase.STANDBY: b"0", LampPhase.WARMING: b"1", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
@@ -21,11 +21,11 @@ class PanasonicDzBoard:
         self._lamp = lamp
         self._number = number
         self._menu = {b"IIS": b"HD1", b"LPM": b"0"}
-        self._lines = Lines(0x03, 0x02)
+        self._lines = LineBuffer(0x03, 0x02)
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         answers = []
-        for line in self._lines.whole(data):
+        for line in self._lines.feed(data):
             if not line.startswith(b"\x02"):
                 continue
             head, _, command = line[1:].partition(b";")
@@ -44,10 +44,10 @@ class PanasonicDzBoard:
             b"Q$S": _PHASES[lamp.phase],
             b"Q$L:1": b"%d" % lamp.hours,
             b"QID": b"DZ870",
-            b"QPW": b"001" if lamp.phase in BURNING else b"000",
+            b"QPW": b"001" if lamp.burning else b"000",
             b"QSH": b"%d" % lamp.shutter_closed,
         }
-        if lamp.phase in BURNING:
+        if lamp.burning:
             replies |= {b"QIN": self._menu[b"IIS"], b"QSL": self._menu[b"LPM"]}
             key, _, value = command.partition(b":")
             if key in self._menu and value:
@@ -58,7 +58,7 @@ class PanasonicDzBoard:
         if command == b"POF":
             lamp.extinguish()
             return b"POF"
-        if command in (b"OSH:0", b"OSH:1") and lamp.phase in BURNING:
+        if command in (b"OSH:0", b"OSH:1") and lamp.burning:
             lamp.shutter_closed = command == b"OSH:1"
             return command
         if command == b"PON" and lamp.strike():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING, Lines
+from plugins.emulated.projectors.families.line_buffer import LineBuffer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _ADCP: Final = {
@@ -26,13 +26,13 @@ class AdcpBoard:
 
     def __init__(self, lamp: EmulatedLamp) -> None:
         self._lamp = lamp
-        self._lines = Lines(ord("\n"))
+        self._lines = LineBuffer(ord("\n"))
         self._menu = {b"input": b'"hdmi1"', b"light_output_mode": b'"high"'}
 
     def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
         return [
             (b"err_inactive" if busy else self._act(line.strip())) + b"\r\n"
-            for line in self._lines.whole(data)
+            for line in self._lines.feed(data)
             if line.strip()
         ]
 
@@ -60,7 +60,7 @@ class AdcpBoard:
 
     def _chosen(self, key: bytes, value: bytes) -> bytes:
         """What a menu tells, or how it is set; ``blank`` also tells while it is dark."""
-        lamp, burning = self._lamp, self._lamp.phase in BURNING
+        lamp, burning = self._lamp, self._lamp.burning
         if value == b"?" and (burning or key == b"blank"):
             return (self._menu | {b"blank": b'"on"' if lamp.shutter_closed else b'"off"'})[key]
         if key == b"blank" and value not in (b'"on"', b'"off"'):
@@ -115,7 +115,7 @@ class SdcpBoard:
             elif not lamp.strike():
                 return False, self._NOT_NOW
             return True, b""
-        if item == b"\x00\x30" and data in (b"\0\0", b"\0\1") and lamp.phase in BURNING:
+        if item == b"\x00\x30" and data in (b"\0\0", b"\0\1") and lamp.burning:
             lamp.shutter_closed = data == b"\0\1"
             return True, b""
         return False, self._NOT_NOW if item in (b"\x01\x30", b"\x00\x30") else self._OF_ITEM

@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from plugins.emulated.projectors.families.collecting import BURNING
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 
 _DONE: Final = b"\x03\x14\x00\x00\x00\x14"
@@ -59,7 +58,7 @@ class ViewSonicBoard:
         if item == b"\x11\x01":
             lamp.extinguish()
             return _DONE
-        if item == b"\x12\x09" and lamp.phase in BURNING:
+        if item == b"\x12\x09" and lamp.burning:
             lamp.shutter_closed = value == 1
             return _DONE
         return _REFUSED

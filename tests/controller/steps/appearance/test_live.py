@@ -90,13 +90,13 @@ def test_a_stop_takes_hold_and_leaves_no_thread(maker: FrameMaker) -> None:
     class Stopped(Exception):
         pass
 
-    def tell(figures: LiveFigures) -> None:
+    def report(figures: LiveFigures) -> None:
         raise Stopped
 
     source = Numbers(10**6)
     before = threading.active_count()
     with pytest.raises(Stopped):
-        run_live(source, maker, lambda frames: None, rate_hz=50, tell=tell)
+        run_live(source, maker, lambda frames: None, rate_hz=50, report=report)
     assert source.closed
     assert threading.active_count() == before
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.artefacts.modes import DotOptions, dot_options, mode_of, mode_step, read_metapixels
 from controller.artefacts.photographs import PhotographSet, codes_of
+from controller.artefacts.projectors import mode_of, read_metapixels
 from controller.capture.dots import dot_frame, dot_patterns
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError, WorkError
@@ -32,6 +32,7 @@ from controller.steps.capture.dots import (
     take_in_batches,
 )
 from controller.steps.capture.photographs import Planned, take_all
+from controller.steps.modes import DotOptions, dot_options, mode_step
 from hal.deadline import Cancelled, in_seconds
 from tests.controller.rig.rig_model import ModelRig
 

@@ -14,7 +14,13 @@ import pytest
 
 from controller.artefacts.camera import Exposures
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.modes import PhotographOptions, Photographs, PlanUsed, photographs_named, told
+from controller.artefacts.pattern_plans import (
+    PhotographOptions,
+    Photographs,
+    PlanUsed,
+    photographs_named,
+    photographs_sentence,
+)
 from controller.artefacts.photographs import BLACK, light_of
 from controller.artefacts.projectors import Indirect, Light, Pixels
 from controller.calibrate.geometry.values import CameraPrior
@@ -220,4 +226,4 @@ def test_a_projector_is_measured_from_few_photographs(
     assert np.sqrt(np.mean(error**2)) < 0.02
     assert np.abs(light.response - SCENE.response()).max() < 0.01
     assert abs(float(np.median(indirect.share[pixels.seen]))) < 0.015
-    assert told(run, [NAME]) == f"left {number} ({photographs})"
+    assert photographs_sentence(run, [NAME]) == f"left {number} ({photographs})"

@@ -106,7 +106,7 @@ def test_photographs_without_a_lamps_light_are_forgotten_but_earlier_ones_are_ke
 def test_a_lamp_that_dies_in_a_long_row_ends_it_and_costs_only_what_was_taken_since_it_was_looked_at(
     stage: ModelRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shots, "LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(shots, "CHECK_LAMPS_EVERY_S", 0.0)
 
     def advance(fraction: float, note: str) -> None:
         if note == "grey-2":

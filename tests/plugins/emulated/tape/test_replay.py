@@ -21,7 +21,7 @@ from hal.tape.recorder import Tape
 from hal.tape.relay import ptpip_relays, stream_relay
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.projectors.boards import BOARDS, USUAL, baud_of
+from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.quick_profile import quick_profile
@@ -77,7 +77,7 @@ def test_every_serial_family_is_replayed_to_its_driver(family: str, tmp_path: Pa
     (tmp_path / "p.toml").write_text(quick_profile(QUICK, base=family))
     lamp = EmulatedLamp(QUICK)
     lamp.warm_now()
-    board = None if family == USUAL else BOARDS[family](lamp)
+    board = None if family == DEFAULT_BOARD else BOARDS[family](lamp)
     settings = {"profile": "p.toml", "port": "run/tty"}
     with recording(tmp_path) as tape, EmulatedSerialProjector(
         tmp_path / "run" / "tty", lamp, baud=baud_of(family), board=board
