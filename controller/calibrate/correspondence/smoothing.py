@@ -18,8 +18,6 @@ NARROWEST_PX = 2.0
 """Width of the window, camera px, where projector pixels are smaller than that."""
 CURVED_RADIUS = 2
 WORST_CURVED_PX = 0.25
-BAND_ROWS = 256
-"""Rows that are fitted together: what a large camera's picture takes in between stays small."""
 MOST_PULL = 1.0
 """Relative change of the light from a camera pixel to the next; more is an edge, not paint."""
 
@@ -63,26 +61,15 @@ def fit_curved(position_px: FloatImage, valid: Mask, otherwise_px: FloatImage) -
     )
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     kernel = np.linalg.pinv(terms)[0].reshape(side, side)
-    found = np.empty(position_px.shape, np.float32)
-    # what a row becomes depends on no row farther away than this
-    reach = 2 * CURVED_RADIUS
-    for first in range(0, len(found), BAND_ROWS):
-        last = min(first + BAND_ROWS, len(found))
-        top = max(first - reach, 0)
-        near = slice(top, last + reach)
-        fitted, use = _curved(position_px[near], valid[near], kernel)
-        own = slice(first - top, last - top)
-        found[first:last] = np.where(use[own, :, None], fitted[own], otherwise_px[first:last])
-    return found
-
-
-def _curved(position_px: FloatImage, valid: Mask, kernel: Float64) -> tuple[FloatImage, Mask]:
-    """The polynomials' values, and where they serve."""
-    fitted = cv2.filter2D(np.where(valid[..., None], position_px, np.float32(0)), -1, kernel)
-    off = np.where(valid, np.abs(fitted - np.nan_to_num(position_px)).max(axis=2), np.float32(np.inf))
-    around = np.ones(kernel.shape, np.uint8)
+    filled = np.where(valid[..., None], position_px, np.float32(0))
+    fitted = cv2.filter2D(filled, -1, kernel)
+    # in place: a large camera's picture leaves little memory for copies
+    off = np.abs(np.subtract(fitted, filled, out=filled), out=filled).max(axis=2)
+    del filled
+    off[~valid] = np.inf
+    around = np.ones((side, side), np.uint8)
     use = cv2.dilate(off, around, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf) < WORST_CURVED_PX
-    return np.asarray(fitted, np.float32), np.asarray(use)
+    return np.where(use[..., None], fitted, otherwise_px)
 
 
 def _typical_slope(position_px: FloatImage, valid: Mask) -> float:
