@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import numpy.typing as npt
 
 from controller.artefacts.names import read_json, write_json
-from controller.core.arrays import load_arrays, save_arrays
+from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
 
 PICTURE: Final = "verification.png"
-"""The map of errors and their reasons: the projectors one above the other."""
+"""The map of errors and their reasons, the projectors in rows of ``ACROSS``."""
+ACROSS: Final = 3
+"""A screen is wider than high."""
 FIGURES: Final = "verification.json"
 BEFORE, RESOLUTION = "before.png", "resolution.png"
 """Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
@@ -33,6 +36,22 @@ class ErrorMaps:
 
     error: npt.NDArray[Any]
     reasons: npt.NDArray[Any]
+
+
+def in_rows(pictures: Sequence[ByteImage]) -> ByteImage:
+    """Pictures of one size (rows, columns, 3) beside and below each other, the rest of the last row black."""
+    across = min(ACROSS, len(pictures))
+    missing = -len(pictures) % across
+    filled = [*pictures, *[np.zeros_like(pictures[0])] * missing]
+    rows = [np.concatenate(filled[n : n + across], axis=1) for n in range(0, len(filled), across)]
+    return np.concatenate(rows, axis=0)
+
+
+def parts_of(picture: ByteImage, count: int) -> list[ByteImage]:
+    """The ``count`` pictures that ``in_rows`` has put together."""
+    across = min(ACROSS, count)
+    rows = np.split(picture, -(-count // across), axis=0)
+    return [np.ascontiguousarray(one) for row in rows for one in np.split(row, across, axis=1)][:count]
 
 
 def write_grade(

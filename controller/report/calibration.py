@@ -17,7 +17,6 @@ from controller.artefacts.calibration import read_calibration
 from controller.artefacts.geometry import read_geometry_figures, read_points_m
 from controller.artefacts.grade import (
     BEFORE,
-    PICTURE,
     RESOLUTION,
     graded,
     is_graded,
@@ -33,6 +32,7 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.report import plots
+from controller.report.causes import causes_gallery
 from controller.report.light import light_gallery, whites
 from controller.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.report.pictures import Crop, crop_around, fitted, to_screen
@@ -86,7 +86,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
              (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
-            *_blamed(run, figures),
+            *causes_gallery(run, figures["verification"]),
             *light_gallery(calibration, crop),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures, when)),
         ),
@@ -230,20 +230,6 @@ def _maps(run: Path, calibration: Calibration, crop: Crop, fine: ByteImage) -> t
 
 def _map(values: Any, mask: Any, crop: Crop, label: str, **limits: float) -> ByteImage:
     return plots.field(_cut(np.where(mask, values, np.nan).astype(np.float32), crop), label, **limits)
-
-
-def _blamed(run: Path, figures: Mapping[str, Any]) -> tuple[tuple[str, str, tuple[ReportPicture, ...]], ...]:
-    whole = cv2.imread(str(run / PICTURE))
-    if whole is None:
-        return ()
-    panels = np.split(np.asarray(whole[..., ::-1], np.uint8), len(figures["verification"]), axis=0)
-    pictures = tuple(
-        ReportPicture(
-            name, np.ascontiguousarray(panel), " ".join(why["sentence"] for why in row.get("reasons", [])[:3])
-        )
-        for (name, row), panel in zip(figures["verification"].items(), panels, strict=True)
-    )
-    return (("Where the error is large, and why", "Grey is good.", pictures),)
 
 
 def _plots(

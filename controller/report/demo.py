@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import read_geometry_figures
-from controller.artefacts.grade import PICTURE, read_grade_figures
+from controller.artefacts.grade import read_grade_figures
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.artefacts.published import BundleFigures, has_photograph, read_photograph_of, read_playback
@@ -21,6 +20,7 @@ from controller.artefacts.solved import Solved, is_solved, read_base_figures, re
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
+from controller.report.causes import causes_gallery
 from controller.report.light import light_gallery, whites
 from controller.report.one_projector import OneProjector, as_figures, as_rows, one_projector
 from controller.report.one_projector import goals as one_projector_goals
@@ -174,7 +174,7 @@ def _page(
         goals=_goals(judged, figures),
         rows=rows,
         galleries=(
-            *_verification_gallery(run, figures),
+            *causes_gallery(run, figures["verification"]),
             *light_gallery(calibration, crop),
             _frames_gallery(judged, checked),
         ),
@@ -238,30 +238,6 @@ def _goals(judged: Sequence[AppearanceComparison], figures: Mapping[str, Any]) -
         ),
         Goal("Bundle", f"{bundle['bytes'] / 1e6:.2f} MB", note=f"{bundle['ratio']:.1f} x smaller, signed"),
     )  # fmt: skip
-
-
-def _verification_gallery(
-    run: Path, figures: Mapping[str, Any]
-) -> tuple[tuple[str, str, tuple[ReportPicture, ...]], ...]:
-    """Where each projector's prediction errs, and why; nothing for a run from before there was such a map."""
-    verification = figures["verification"]
-    whole = cv2.imread(str(run / PICTURE))
-    if whole is None:
-        return ()
-    panels = np.split(np.asarray(whole[..., ::-1], np.uint8), len(verification), axis=0)
-    pictures = tuple(
-        ReportPicture(
-            f"{name}: {100 * row['relative_rms']:.2f} % error.",
-            np.ascontiguousarray(panel),
-            " ".join(reason["sentence"] for reason in row.get("reasons", [])[:3]),
-        )
-        for (name, row), panel in zip(verification.items(), panels, strict=True)
-    )
-    text = (
-        "A random pattern was predicted and photographed. Colours show where the two differ by more than 5 % "
-        "of the light nearby, and the likely reason; grey is good."
-    )
-    return (("Where the calibration has errors, and why", text, pictures),)
 
 
 def _frames_gallery(

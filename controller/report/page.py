@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup, escape
 
 from controller.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.core.arrays import ByteImage
@@ -23,12 +24,17 @@ from controller.solve.judged import as_rows
 
 @dataclass(frozen=True, slots=True)
 class ReportPicture:
-    """``large``: it holds small text, and wants more than a column of a strip."""
+    """``large``: it holds small text, and wants more than a column of a strip. ``points``: a list below it."""
 
     caption: str
     image: ByteImage
     note: str = ""
     large: bool = False
+    points: tuple[str, ...] = ()
+
+
+Gallery = tuple[str, str, tuple[ReportPicture, ...]]
+"""A title, a text, and pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +72,7 @@ class Page:
     summary: str
     goals: tuple[Goal, ...]
     rows: tuple[PictureRow, ...]
-    galleries: tuple[tuple[str, str, tuple[ReportPicture, ...]], ...] = ()
+    galleries: tuple[Gallery, ...] = ()
     steps: tuple[tuple[str, float], ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     tables: tuple[PageTable, ...] = ()
@@ -99,6 +105,7 @@ def render(page: Page) -> str:
     source = resources.files("controller.report").joinpath("report.html").read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["uri"] = data_uri
+    environment.filters["commands"] = _commands
     return environment.from_string(source).render(
         page=page,
         scale=scale_bar(),
@@ -106,6 +113,14 @@ def render(page: Page) -> str:
         scale_top=ERROR_SCALE_DELTA_E,
         slowest=max((s for _, s in page.steps), default=1.0),
     )
+
+
+def _commands(text: str) -> Markup:
+    """``text`` with what stands in backticks as code, escaped."""
+    parts = text.split("`")
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
 def _typeface() -> str:

@@ -287,14 +287,14 @@ def attribution_picture(why: ErrorAttribution, calibration: Calibration, name: s
 
 def _legend(why: ErrorAttribution, name: str, width: int) -> ByteImage:
     size = width / 1500
-    line, per_line = int(44 * size), 4
+    line, per_line = int(58 * size), 3
     reasons = [reason for reason in COLOURS if np.any(why.labels == reason)]
     # As high for every projector, so that panels of one run can be distinguished by their height.
     band = np.full((line * (1 + math.ceil(len(COLOURS) / per_line)) + int(16 * size), width, 3), 24, np.uint8)
-    write(band, f"projector {name}", (int(20 * size), int(22 * size)), round(30 * size), (235, 235, 235))
+    write(band, f"projector {name}", (int(20 * size), int(30 * size)), round(42 * size), (235, 235, 235))
     for number, reason in enumerate(reasons):
-        x, y = int((20 + 370 * (number % per_line)) * size), line * (1 + number // per_line)
-        cv2.rectangle(band, (x, y + int(8 * size)), (x + int(28 * size), y + int(36 * size)), COLOURS[reason], -1)
-        cv2.rectangle(band, (x, y + int(8 * size)), (x + int(28 * size), y + int(36 * size)), (160, 160, 160), 1)
-        write(band, WORDS[reason][0], (x + int(40 * size), y + int(22 * size)), round(26 * size), (235, 235, 235))
+        x, y = int((20 + 495 * (number % per_line)) * size), line * (1 + number // per_line)
+        cv2.rectangle(band, (x, y + int(12 * size)), (x + int(34 * size), y + int(46 * size)), COLOURS[reason], -1)
+        cv2.rectangle(band, (x, y + int(12 * size)), (x + int(34 * size), y + int(46 * size)), (160, 160, 160), 1)
+        write(band, WORDS[reason][0], (x + int(48 * size), y + int(29 * size)), round(38 * size), (235, 235, 235))
     return band

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
-
-import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.camera import Exposures
@@ -16,6 +13,7 @@ from controller.artefacts.grade import (
     PICTURE,
     ErrorMaps,
     graded,
+    in_rows,
     passes,
     read_grade_figures,
     worst_letter,
@@ -114,20 +112,7 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
     if (said := glossy(gloss_strength(calibration, geometry))) is not None:
         context.reporter.say(said, Level.WARNING)
-    return write_grade(context.folder, figures, maps, png(_in_rows(pictures)))
-
-
-ACROSS: Final = 3
-"""Pictures in a row: a screen is wider than high."""
-
-
-def _in_rows(pictures: Sequence[ByteImage]) -> ByteImage:
-    """Pictures of one size (rows, columns, 3) beside and below each other, the rest of the last row black."""
-    across = min(ACROSS, len(pictures))
-    missing = -len(pictures) % across
-    filled = [*pictures, *[np.zeros_like(pictures[0])] * missing]
-    rows = [np.concatenate(filled[n : n + across], axis=1) for n in range(0, len(filled), across)]
-    return np.concatenate(rows, axis=0)
+    return write_grade(context.folder, figures, maps, png(in_rows(pictures)))
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:

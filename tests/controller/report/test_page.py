@@ -17,7 +17,7 @@ EVIL = "<script>alert('x')</script><img src=x onerror=\"y\">&amp;"
 
 
 def page(text: str = "plain") -> Page:
-    picture = ReportPicture(text, GREY, text)
+    picture = ReportPicture(text, GREY, text, points=(text, f"run `{text}` again"))
     return Page(
         title=text,
         summary=text,
@@ -64,6 +64,13 @@ def test_every_picture_is_in_the_page_itself() -> None:
     assert len(sources) == 4
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert not re.search(r"https?:|<link|<script|@import|url\((?!data:font/ttf;base64,)", html)
+
+
+def test_a_command_in_a_point_is_code() -> None:
+    shown = render(
+        Page("", "", (), (), galleries=(("", "", (ReportPicture("", GREY, points=("run `velatura drift`",)),)),))
+    )
+    assert "run <code>velatura drift</code>" in shown
 
 
 def test_goals_say_whether_they_were_reached() -> None:
