@@ -65,7 +65,9 @@ def install(
     system.run("systemctl", "start", "velatura-x11")
     _outputs(system, again=outputs_again, say=say)
     if restart or any(changed):
-        system.run("systemctl", "restart", *SERVICES[1:])
+        # In this order the player stops only once the controller has, and starts at once, before the controller. In the
+        # other order the projectors are black for as long as the controller takes to stop.
+        system.run("systemctl", "restart", *reversed(SERVICES[1:]))
     system.run("systemctl", "start", TARGET)
     if not system.dry:
         _first_login(system, say)

@@ -82,7 +82,7 @@ def test_once_more_it_changes_nothing(debian: Path) -> None:
 def test_another_version_starts_controller_and_player_again_and_not_the_x_server(debian: Path) -> None:
     installed(debian, FRESH)
     ran = installed(debian, THERE, restart=True).ran
-    assert [line for line in ran if "restart" in line] == ["systemctl restart velatura-player velatura-controller"]
+    assert [line for line in ran if "restart" in line] == ["systemctl restart velatura-controller velatura-player"]
 
 
 def test_a_dry_run_writes_nothing_and_tells_all_of_it(debian: Path) -> None:
