@@ -120,11 +120,11 @@ def _player(life: Living, item: Item) -> None:
     witness = life.witness
     fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
     if item.how in ("killed", "crashes"):
-        screen.dies_at_start += int(item.number)
+        screen.dies_at_start = max(screen.dies_at_start, int(item.number))
         if screen.process is not None:
             screen.process.kill()
     elif item.how == "crashes at a picture":
-        screen.dies_at_play += int(item.number)
+        screen.dies_at_play = max(screen.dies_at_play, int(item.number))
         if screen.process is not None:
             screen.process.kill()
     elif item.how == "hung":

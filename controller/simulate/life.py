@@ -25,10 +25,11 @@ from controller.run.state_machine import State
 from controller.simulate import happenings
 from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE, watched
+from controller.simulate.draw import draw, setting
 from controller.simulate.jobs import SimulatedJobs
 from controller.simulate.promises import Broken, Witness, after_the_end
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.script import Item, Setting, draw, setting
+from controller.simulate.script import Item, Setting
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
@@ -215,6 +216,8 @@ class Life:
                 self.witness.disturb(0.0)
             except (VelaturaError, DeviceError) as error:
                 kiosk.attach(None, f"{error.what} {error.remedy}")
+                # Nothing else of it runs, and whatever happens ends the pause.
+                world.scheduler.stretch = min(world.scheduler.stretch * CALMER, CALM[1])
                 stop.wait(AGAIN_S)
 
     def _follow(self, kiosk: StageKiosk, service: Service) -> None:

@@ -100,7 +100,7 @@ class Witness:
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
-        self._explained_s = 0.0
+        self._unexplained_since_s: float | None = None
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
         self._strikes_since: dict[str, int] = {}
         self.begun_checks: dict[str, int] = {}
@@ -354,15 +354,13 @@ class Witness:
         elif self._black_since_s is None:
             self._black_since_s = now_s
         if not wanted or now_s <= self.clock_wrong_until_s:
-            self._back_by_s = None
+            self._back_by_s = self._unexplained_since_s = None
             return
         self._back(shown, asked_black)
         open_s = now_s - max(self.changed_s, self._began_s)
         dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
-        if dark_s <= SETTLING_S or open_s <= SETTLING_S or self._explained(kiosk, state):
-            self._explained_s = now_s
-        elif now_s - self._explained_s > BLACK_S:
-            raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
+        explained = dark_s <= SETTLING_S or open_s <= SETTLING_S or self._explained(kiosk, state)
+        self._says_why(state, dark_s, explained=explained)
         if not self.calm or open_s < SETTLING_S or asked_black:
             if asked_black:
                 self.disturb(0.0, SETTLING_S)
@@ -380,6 +378,13 @@ class Witness:
             brightness = world.screen.process.brightness
             if shown not in names or abs(brightness - live.brightness) > 0.01:
                 raise Broken("plays while open", f"{shown} at {brightness:g} is shown instead of {wants.appearance}")
+
+    def _says_why(self, state: State, dark_s: float, *, explained: bool) -> None:
+        now_s = self._world.scheduler.now_s
+        # It counts from the first step that finds no explanation: the one before may be minutes old.
+        since_s = self._unexplained_since_s = None if explained else self._unexplained_since_s or now_s
+        if since_s is not None and now_s - since_s > BLACK_S:
+            raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
 
     def _back(self, shown: str, asked_black: bool) -> None:
         if self._back_by_s is not None and self._world.scheduler.now_s > self._back_by_s and not asked_black:

@@ -1,0 +1,238 @@
+"""How a life is drawn from its seed: where it takes place, and what happens in it.
+
+As in swarm testing (Groce and others, 2012) each life has only some kinds of things, and those more often. What a few
+kinds do together is hardly ever seen in lives that all have a little of everything.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+from zoneinfo import ZoneInfo
+
+from controller.simulate.calendar import Calendar
+from controller.simulate.lamps import LINE_TROUBLES
+from controller.simulate.player import TROUBLES
+from controller.simulate.scheduler import DAY_S
+from controller.simulate.script import Item, Setting
+from controller.simulate.stage import APPEARANCES, NAMES
+
+HOUR_S: Final = 3600.0
+CHANGING: Final = ("Europe/Vienna", "America/New_York", "Australia/Lord_Howe")
+"""Zones whose clocks change twice a year."""
+ZONES: Final = (*CHANGING, "Asia/Kolkata", "UTC")
+DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+WORK: Final = ("recalibrate", "compare", "test-shots")
+CANCELLED: Final = 0.5
+
+LEFT_OUT: Final = (0.25, 0.5, 0.75)
+"""Share of the kinds of things, and of the ways in which each happens, that a life does not have."""
+LEANINGS: Final = (1.0, 1.0, 4.0)
+PACES_H: Final = (1.0, 3.0, 8.0, 30.0)
+NEAR: Final = (0.0, 0.2, 0.5)
+"""Share of what happens that happens around an opening or a closing, and how long before and after it."""
+AROUND_S: Final = (-300.0, 120.0)
+SEVERAL: Final = (0.1, 0.3, 0.6)
+"""Share of what happens that does not come alone."""
+ALIKE: Final = (0.0, 0.1, 0.4)
+"""Share of what happens to one projector that has a cause that all of them share, such as their air or their mains."""
+RESTLESS: Final = ("garbled", "flaky", *TROUBLES)
+RESTLESS_S: Final = 900.0
+"""Trouble that comes and goes every second is not drawn for longer: it would take most of the time of a life."""
+LONGEST_S: Final = 40_000.0
+
+_Weights = Mapping[str, float]
+KINDS: Final[_Weights] = {
+    "line": 14, "lamp fails": 4, "lamp reports": 3, "lamp switched by hand": 3, "player": 8, "camera gone": 3,
+    "disk full": 6, "disk low": 1, "file damaged": 4, "bundle damaged": 3, "killed": 5, "bundles unreadable": 2,
+    "killed while writing": 6, "power cut": 5, "restarted": 4, "clock set": 3, "network gone": 3, "drift": 4,
+    "command": 28,
+}  # fmt: skip
+COMMANDS: Final[_Weights] = {
+    "start": 6, "stop": 6, "play": 4, "rotate": 2, "next": 3, "black": 3, "pause": 3, "brightness": 3, "identify": 2,
+    "recalibrate": 4, "cancel": 3, "compare": 2, "set-schedule": 3, "seen": 1, "save-settings": 3, "test-shots": 1,
+}  # fmt: skip
+FILES: Final[_Weights] = {
+    "kiosk/events.sqlite": 1, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
+    "bundles/starts.json": 1, "lamps.json": 1, "kiosk/stage.toml.good": 1,
+}  # fmt: skip
+HOW: Final[Mapping[str, Sequence[str]]] = {
+    "line": LINE_TROUBLES,
+    "lamp fails": ("", "goes out"),
+    "lamp reports": ("temperature", "cover", "lamp-failed", "fan"),
+    "lamp switched by hand": ("off", "on"),
+    "player": ("killed", "hung", "crashes", "crashes at a picture", *TROUBLES),
+    "file damaged": ("cut", "flipped", "empty", "removed"),
+    "bundle damaged": ("", "all"),
+    "restarted": ("lamps stay lit", "lamps off"),
+}
+LASTS_S: Final[Mapping[str, tuple[float, float]]] = {
+    "seconds": (0.5, 30.0), "minutes": (30.0, 900.0), "hours": (900.0, LONGEST_S),
+}  # fmt: skip
+AFTER: Final = ("at once", "at once", "while it lasts", "while it lasts", "as it ends")
+"""When another thing happens after the first of several."""
+MOST_TOGETHER: Final = 4
+ENDLESS: Final = ("killed", "drift", "restarted", "killed while writing", "command", "lamp switched by hand")
+
+
+def setting(seed: str) -> Setting:
+    """As drawn from the seed. Where the clocks change soon, hours over midnight are usual: they meet the change."""
+    chance = random.Random(f"{seed} life")
+    soon = chance.random() < 0.5
+    zone = chance.choice(CHANGING if soon else ZONES)
+    rows = hours(chance, chance.choice((0.1, 0.9, 0.9) if soon else (0.0, 0.1, 0.9)))
+    return Setting(begins(chance, zone, soon=soon).timestamp(), zone, rows, chance.choice(["03:30", "02:30", "23:00"]))
+
+
+def hours(chance: random.Random, late: float) -> list[dict[str, str]]:
+    """Rows of opening hours, never two at a time; this share of them over midnight."""
+    rows = []
+    for day in DAYS:
+        if chance.random() < 0.15:
+            continue
+        opens = chance.randrange(8 * 60, 18 * 60)
+        # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
+        closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
+        if chance.random() < late:
+            closes = chance.randrange(27 * 60 + 5, 31 * 60)
+        rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
+    return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
+
+
+def _clock(minutes: int) -> str:
+    return f"{minutes // 60 % 24:02}:{minutes % 60:02}"
+
+
+def begins(chance: random.Random, zone: str, *, soon: bool) -> datetime:
+    """When a life begins; with ``soon`` some two days before the clocks of the zone change."""
+    day = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=chance.randrange(0, 1000))
+    if soon:
+        later = [day + timedelta(days=number) for number in range(200)]
+        offsets = [one.astimezone(ZoneInfo(zone)).utcoffset() for one in later]
+        changes = [number for number in range(1, 200) if offsets[number] != offsets[number - 1]]
+        day += timedelta(days=max(0, changes[0] - 3)) if changes else timedelta()
+    return day + timedelta(minutes=chance.randrange(1440))
+
+
+class Leaning:
+    """What one life has, and how often: drawn for each choice when it is first made, always the same for a seed."""
+
+    def __init__(self, seed: str) -> None:
+        self._seed = seed
+        chance = random.Random(f"{seed} leaning")
+        self._left_out = chance.choice(LEFT_OUT)
+        self.pace_s = chance.choice(PACES_H) * HOUR_S
+        self.near, self.several, self.alike = chance.choice(NEAR), chance.choice(SEVERAL), chance.choice(ALIKE)
+        self._weights: dict[str, dict[str, float]] = {}
+
+    def drawn(self, chance: random.Random, what: str, usual: _Weights | Sequence[str]) -> str:
+        """One of these, as often as this life has it."""
+        if what not in self._weights:
+            self._weights[what] = self._weigh(what, usual if isinstance(usual, Mapping) else dict.fromkeys(usual, 1.0))
+        weights = self._weights[what]
+        return chance.choices(list(weights), list(weights.values()))[0]
+
+    def _weigh(self, what: str, usual: _Weights) -> dict[str, float]:
+        chance = random.Random(f"{self._seed} leaning {what}")
+        weights = {name: weight * chance.choice(LEANINGS) for name, weight in usual.items()}
+        kept = {name: weight for name, weight in weights.items() if chance.random() >= self._left_out}
+        return kept or dict([chance.choice(list(weights.items()))])
+
+
+def draw(seed: str, days: float) -> list[Item]:
+    """The script of a life. Each has a pace and a leaning of its own.
+
+    Of several things that come together, some come at once, some while the first lasts, and some as it ends. In some
+    lives much happens when the stage opens or closes, which is when a kiosk does most.
+    """
+    chance, leaning, place = random.Random(f"{seed} script"), Leaning(seed), setting(seed)
+    calendar = Calendar(place.zone, place.rows)
+    items: list[Item] = []
+    at_s = chance.expovariate(1 / min(leaning.pace_s, 5 * HOUR_S)) + 600.0
+    while at_s < days * DAY_S:
+        if chance.random() < leaning.near:
+            edge_s = calendar.changes_s(place.begins_unix_s + at_s) - place.begins_unix_s
+            at_s = min(max(at_s, edge_s + chance.uniform(*AROUND_S)), days * DAY_S)
+        first = _one(chance, at_s, leaning)
+        items += _with_others(chance, first, leaning)
+        if chance.random() < leaning.several:
+            for _ in range(chance.randint(1, MOST_TOGETHER)):
+                items += _with_others(chance, _one(chance, _after_s(chance, first), leaning), leaning)
+        at_s += chance.expovariate(1 / leaning.pace_s) + 30.0
+    return sorted((item for item in items if item.at_s < days * DAY_S), key=lambda item: item.at_s)
+
+
+def _after_s(chance: random.Random, first: Item) -> float:
+    match chance.choice(AFTER):
+        case "while it lasts":
+            return first.at_s + chance.uniform(0.0, first.for_s or 600.0)
+        case "as it ends":
+            return first.at_s + first.for_s + chance.uniform(0.0, 300.0)
+        case _:
+            return first.at_s + chance.expovariate(1 / 60.0)
+
+
+def _with_others(chance: random.Random, item: Item, leaning: Leaning) -> list[Item]:
+    """It, and what comes of the same cause: the other projectors', or that people think better of it."""
+    if item.who in NAMES and chance.random() < leaning.alike:
+        others = [replace(item, who=name, at_s=round(item.at_s + chance.expovariate(1 / 20.0), 3)) for name in NAMES]
+        return [item if other.who == item.who else other for other in others]
+    if item.who in WORK and chance.random() < CANCELLED:
+        return [item, Item(round(item.at_s + chance.uniform(1.0, 120.0), 3), "command", "cancel")]
+    return [item]
+
+
+def _one(chance: random.Random, at_s: float, leaning: Leaning) -> Item:  # noqa: PLR0911 - one for each kind
+    at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
+    how = leaning.drawn(chance, what, HOW[what]) if what in HOW else ""
+    lasts_s = round(chance.uniform(*LASTS_S[leaning.drawn(chance, "lasts", list(LASTS_S))]), 1)
+    lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s
+    name = chance.choice(NAMES)
+    match what:
+        case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand":
+            return Item(at_s, what, name, how, lasts_s)
+        case "player":
+            return Item(
+                at_s,
+                what,
+                "",
+                how,
+                lasts_s if how in TROUBLES else 0.0,
+                chance.randint(1, 4) * how.startswith("crashes"),
+            )
+        case "file damaged":
+            return Item(at_s, what, leaning.drawn(chance, "file", FILES), how, number=round(chance.random(), 3))
+        case "bundle damaged":
+            return Item(at_s, what, "", how, max(600.0, lasts_s))
+        case "killed while writing":
+            return Item(at_s, what, number=chance.randint(1, 12))
+        case "clock set":
+            number = chance.choice([chance.uniform(-7000, 7000), chance.uniform(-200_000, 200_000), -1.5e9])
+            return Item(at_s, what, "", "", lasts_s, round(number, 1))
+        case "command":
+            return _command(at_s, chance, leaning.drawn(chance, "command", COMMANDS))
+        case _:
+            return Item(at_s, what, "", how, lasts_s)
+
+
+def _command(at_s: float, chance: random.Random, who: str) -> Item:
+    values: dict[str, Any] = {}
+    match who:
+        case "play":
+            values = {"name": chance.choice(APPEARANCES), **({"fade_s": 2.0} if chance.random() < 0.5 else {})}
+        case "black" | "pause" | "identify":
+            values = {"on": chance.random() < 0.5}
+        case "brightness":
+            values = {"percent": chance.choice([0, 10, 50, 100])}
+        case "recalibrate":
+            values = {"kind": chance.choice(["quick", "full"])}
+        case "set-schedule":
+            values = {"time_zone": chance.choice(ZONES), "drift_check": chance.choice(["03:30", "02:30", ""]),
+                      "rows": hours(chance, chance.choice((0.0, 0.1, 0.9)))}  # fmt: skip
+        case "save-settings":
+            values = {"text": chance.choice(["comment", "projector", "display"])}
+    return Item(at_s, "command", who, arguments=json.dumps(values, sort_keys=True) if values else "")
