@@ -22,14 +22,16 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service, serving
 from controller.run.state_machine import State
-from controller.simulate import happenings
-from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE, watched
-from controller.simulate.draw import draw, setting
+from controller.simulate.happen import happenings
+from controller.simulate.happen.commands import arguments_of, believe, whole
+from controller.simulate.happen.draw import draw, setting
+from controller.simulate.happen.script import Item, Setting
 from controller.simulate.jobs import SimulatedJobs
-from controller.simulate.promises import Broken, Witness, after_the_end
+from controller.simulate.judge.calendar import Calendar
+from controller.simulate.judge.promises import Broken
+from controller.simulate.judge.witness import Witness, after_the_end
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.script import Item, Setting
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
@@ -276,10 +278,10 @@ class Life:
             return
 
         def asked() -> None:
-            with contextlib.suppress(VelaturaError, DeviceError), happenings.whole(self):
-                values = happenings.arguments_of(self, item, kiosk)
+            with contextlib.suppress(VelaturaError, DeviceError), whole(self):
+                values = arguments_of(self, item, kiosk)
                 socket_table({"kiosk": kiosk})[item.who](**values)
-                happenings.believe(self, item, values)
+                believe(self, item, values)
 
         self.world.scheduler.task(asked, "command", program).start()
 

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 from controller.core.errors import WorkError
 from controller.run.progress import Level, Reporter
+from controller.simulate.happen.script import to_json
+from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import LIFE_DAYS, Life, Outcome
-from controller.simulate.promises import PROMISES
 from controller.simulate.scheduler import DAY_S
-from controller.simulate.script import to_json
 from controller.simulate.shrink import shortened
 from hal.deadline import Cancelled
 

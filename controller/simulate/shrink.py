@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from controller.simulate.happen.script import Item
 from controller.simulate.life import Life, Outcome
 from controller.simulate.scheduler import DAY_S
-from controller.simulate.script import Item
 
 MOST_TRIES: Final = 60
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from controller.simulate.draw import draw, setting
+from controller.simulate.happen.draw import draw, setting
+from controller.simulate.happen.script import from_json, to_json
+from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import Life
-from controller.simulate.promises import PROMISES
-from controller.simulate.script import from_json, to_json
 
 FOUND = Path(__file__).parent / "found"
 ONE = "from controller.simulate.life import Life; print(Life('same', 0.5).live().digest)"

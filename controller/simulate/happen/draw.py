@@ -14,11 +14,11 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 from zoneinfo import ZoneInfo
 
-from controller.simulate.calendar import Calendar
+from controller.simulate.happen.script import Item, Setting
+from controller.simulate.judge.calendar import Calendar
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
 from controller.simulate.scheduler import DAY_S
-from controller.simulate.script import Item, Setting
 from controller.simulate.stage import APPEARANCES, NAMES
 
 HOUR_S: Final = 3600.0

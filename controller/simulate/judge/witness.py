@@ -1,4 +1,4 @@
-"""What a kiosk promises, checked after each of its steps against what really is."""
+"""Checks after each step of a kiosk what it promises against what really is."""
 
 from __future__ import annotations
 
@@ -10,46 +10,22 @@ from controller.kiosk.decide.live_changes import LiveChanges
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
-from controller.simulate.calendar import Calendar
 from controller.simulate.disk import STAGE
+from controller.simulate.judge.calendar import Calendar
+from controller.simulate.judge.promises import Broken
+from controller.simulate.judge.wanted import Wanted
 from controller.simulate.world import SimulatedWorld
 
 if TYPE_CHECKING:
     from controller.kiosk.api.kiosk import StageKiosk
     from controller.kiosk.service import Service
 
-PROMISES: Final = {
-    "lamp rules": "No lamp is switched on while it is hot, or before its minimum off time.",
-    "one owner": "A device is used by one program, and by one of its threads, at a time.",
-    "no crash": "Nothing ends with an unexpected error.",
-    "decides always": "The decider waits for nothing.",
-    "remedy": "An error says what happened and what to do.",
-    "state": "The log's last word on the state is the state.",
-    "black while closed": "No picture is shown while the stage is closed.",
-    "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
-    "rests while closed": "A closed stage without work is off, cools, or says what is wrong.",
-    "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
-    "serves": "A service that was started runs, also with a damaged stage.toml, as long as the last good one is there.",
-    "off is off": "When a stage says that every lamp is off, none burns that it struck.",
-    "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
-    "says why it is dark": "While an open stage shows nothing, it says why.",
-    "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
-    "nothing lost": "Events, settings and counts survive each end of the service.",
-    "once a night": "The nightly check is begun at most once a night.",
-    "at night": "The nightly check begins only while the stage is closed.",
-    "few words": "What goes wrong again every second does not fill the log.",
-    "strikes counted": "A lamp is struck at most as often as it is counted.",
-    "few strikes": "A lamp that gives no light is not struck again and again.",
-    "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
-    "as usual again": "What people changed of the picture ends when the stage closes.",
-    "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
-    "work ends": "Work ends by itself, when it is cancelled and when it fails, and lets go of the stage.",
-    "devices back": "A camera that is there again is opened again.",
-}
 SETTLING_S: Final = 200.0
 """After a change of any kind, the stage may be between what it did and what it is to do: warm-up, rests, cooling."""
 REPAIR_S: Final = 2000.0
 """After a fault: the longest retry out of the state fault, and the lamps' times."""
+PLAYER_S: Final = 120.0
+"""After trouble with the player: its longest pause before a start, and a start that fails."""
 BLACK_S: Final = 30.0
 DARK_S: Final = 240.0
 BACK_S: Final = 15.0
@@ -61,17 +37,9 @@ WORDS_S: Final = 300.0
 STAYS_S: Final = 120.0
 WORK_S: Final = 3600.0
 LOOKED_S: Final = 300.0
+FAR_S: Final = 9 * 86_400.0
 _RESTING: Final = (State.OFF, State.COOLING, State.FAULT)
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
-
-
-class Broken(Exception):
-    """``promise``: its name in ``PROMISES``."""
-
-    def __init__(self, promise: str, how: str) -> None:
-        super().__init__(f"{promise}: {how}")
-        assert promise in PROMISES
-        self.promise = promise
 
 
 class Witness:
@@ -82,14 +50,12 @@ class Witness:
     """
 
     def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
-        self._world, self.calendar = world, calendar
+        self._world, self.wanted = world, Wanted(calendar, lambda: world.truth_s)
         self.paused_long = False
-        self._edge_s, self._open = -1.0, False
-        self.override: tuple[bool, float] | None = None
         self.disturbed_until_s, self.clock_wrong_until_s = SETTLING_S, 0.0
         self.player_disturbed_until_s = 0.0
         self.changed_s = 0.0
-        self._wanted: bool | None = None
+        self._was_open: bool | None = None
         self._began_s, self._stepped_s = 0.0, 0.0
         self.read = 0
         self.rows: dict[int, EventRow] = {}
@@ -111,37 +77,6 @@ class Witness:
         self.stays_lit: dict[str, float | None] = {}
         self._work: Request | None = None
         self._work_since_s = self._worked_s = 0.0
-
-    # -- what is wanted
-
-    def wanted_open(self) -> bool:
-        """Whether the stage is to be open now, by its hours and what people said."""
-        truth_s = self._world.truth_s
-        if truth_s >= self._edge_s:
-            self._open, self._edge_s = self.calendar.open(truth_s), self.calendar.changes_s(truth_s)
-        if self.override is not None and truth_s >= self.override[1]:
-            self.override = None
-        return self._open if self.override is None else self.override[0]
-
-    def next_edge_s(self) -> float:
-        """When hours change next, in the world's time."""
-        self.wanted_open()
-        return self._edge_s - self._world.begins_unix_s
-
-    def use(self, calendar: Calendar) -> None:
-        """New hours: what a person said stays, until they change next, if they say the same as the old ones."""
-        said = self.calendar.open(self._world.truth_s)
-        self.calendar, self._edge_s = calendar, -1.0
-        if self.override is not None:
-            now_says = calendar.open(self._world.truth_s)
-            self.override = (self.override[0], calendar.changes_s(self._world.truth_s)) if now_says is said else None
-        self.wanted_open()
-
-    def say(self, wanted: bool) -> None:
-        """A person opened or closed the stage, until its hours change next."""
-        self.override = None
-        if self.wanted_open() is not wanted:
-            self.override = (wanted, self._edge_s)
 
     # -- the service
 
@@ -173,9 +108,28 @@ class Witness:
         self._back_by_s, self.stays_lit = None, {}
         self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
 
+    def disturb_player(self, for_s: float) -> None:
+        """Trouble with the player, so long, and what it takes until it shows what it should."""
+        self.player_disturbed_until_s = max(
+            self.player_disturbed_until_s, self._world.scheduler.now_s + for_s + PLAYER_S
+        )
+
+    def next_edge_s(self) -> float:
+        """When hours change next, in the world's time."""
+        return self.wanted.edge_s() - self._world.begins_unix_s
+
+    def unsure(self, for_s: float) -> None:
+        """For so long nobody knows from outside whether the kiosk takes itself for open."""
+        self.clock_wrong_until_s = max(self.clock_wrong_until_s, self._world.scheduler.now_s + for_s)
+
+    def unsure_until_hours(self) -> None:
+        """As ``unsure``, until the hours change next; what people said before may have ended."""
+        self.wanted.override = None
+        self.unsure(min(self.next_edge_s() - self._world.scheduler.now_s, FAR_S) + SETTLING_S)
+
     def lamps_that_stay(self) -> dict[str, float | None]:
         """Those that a restart now must leave lit, and since when they are."""
-        if not (self.calm and self.wanted_open()):
+        if not (self.calm and self.wanted.open()):
             return {}
         return {name: lamp.lit_at_s for name, lamp in self._world.lamps.items() if lamp.shines}
 
@@ -208,9 +162,9 @@ class Witness:
             raise Broken("decides always", f"it did not for {now_s - self._stepped_s:.1f} s")
         self._stepped_s = now_s
         news = self._listen(service)
-        wanted = self.wanted_open()
-        if wanted is not self._wanted:
-            self._wanted, self.changed_s = wanted, now_s
+        wanted = self.wanted.open()
+        if wanted is not self._was_open:
+            self._was_open, self.changed_s = wanted, now_s
             if wanted:
                 self.forgive()
         state = service.reconciler.machine.state
@@ -253,7 +207,7 @@ class Witness:
                 self._logged_state = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
                 open_s = now_s - self.changed_s
-                if self._wanted and self.wanted_open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
+                if self._was_open and self.wanted.open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
                     raise Broken("at night", row.text)
                 key = row.text.partition("(")[2].partition(")")[0]
                 self.begun_checks[key] = self.begun_checks.get(key, 0) + 1

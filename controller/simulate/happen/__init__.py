@@ -1,0 +1,1 @@
+"""What happens to a simulated kiosk from outside: `draw` makes a `script`, whose items `happenings` lets happen."""

@@ -1,0 +1,71 @@
+"""What people ask of a kiosk, and what the witness has to believe of it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.simulate.happen.living import Living
+from controller.simulate.happen.script import Item
+from controller.simulate.judge.calendar import Calendar
+from controller.simulate.judge.witness import SETTLING_S
+from controller.simulate.scheduler import Killed
+
+
+@contextlib.contextmanager
+def whole(life: Living) -> Iterator[None]:
+    """Of a command in the middle of which the program is killed, nobody knows whether it was kept."""
+    try:
+        yield
+    except Killed:
+        life.witness.unsure_until_hours()
+        raise
+
+
+def arguments_of(life: Living, item: Item, kiosk: StageKiosk) -> dict[str, Any]:
+    """The values of a command. Raises VelaturaError."""
+    values: dict[str, Any] = json.loads(item.arguments or "{}")
+    if item.who == "save-settings":
+        values["text"] = _changed(kiosk.settings(), values["text"])
+    return values
+
+
+def _changed(text: str, what: str) -> str:
+    if what == "comment":
+        return f"{text.rstrip()}\n# A comment.\n"
+    if what == "projector":
+        plain, other = 'address = "192.0.2.1"', 'address = "192.0.2.1"\nprofile = "pjlink"'
+        return text.replace(other, plain) if other in text else text.replace(plain, other)
+    return (
+        text.replace("power_down_s = 20.0", "power_down_s = 21.0")
+        if "power_down_s = 20.0" in text
+        else text.replace("power_down_s = 21.0", "power_down_s = 20.0")
+    )
+
+
+def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
+    """A command was accepted: what it asks for is wanted from now on."""
+    witness, now_s = life.witness, life.world.scheduler.now_s
+    if item.who in ("start", "play", "rotate"):
+        witness.wanted.say(True)
+        witness.disturb(0.0, SETTLING_S)
+        if item.who == "start":
+            witness.forgive()
+    elif item.who == "stop":
+        witness.wanted.say(False)
+        witness.disturb(0.0, SETTLING_S)
+    elif item.who == "set-schedule":
+        witness.wanted.use(Calendar(values["time_zone"], values["rows"]))
+        life.news.set()
+        witness.disturb(0.0)
+    elif item.who == "test-shots":
+        witness.light_until_s = now_s + 900.0 + SETTLING_S
+    elif item.who in ("save-settings", "recalibrate", "compare", "cancel"):
+        witness.disturb(0.0)
+    else:
+        witness.disturb(0.0, 60.0)
+    if life.world.disk.full:
+        life.witness.unsure_until_hours()

@@ -1,0 +1,128 @@
+"""Files and bundles that go bad, and what people do about it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from controller.bundle.install import current, previous
+from controller.bundle.reader import Bundle
+from controller.bundle.starts import Starts
+from controller.core.errors import VelaturaError
+from controller.simulate.disk import STAGE
+from controller.simulate.happen.living import Living
+from controller.simulate.happen.script import Item
+from controller.simulate.judge.witness import REPAIR_S
+from controller.simulate.stage import TRUST, publish
+
+SECTOR_BYTES: Final = 512
+MEND_FILE_S: Final = 600.0
+
+
+def file_damaged(life: Living, item: Item) -> None:
+    """While the service is away, a file becomes another one. Somebody puts the settings right after a while."""
+    life.end_of_program()
+    path = STAGE / item.who
+    before = path.read_bytes() if path.is_file() else None
+    if before is not None:
+        life.damaged.add(item.who)
+        # A stage.toml that is gone is not replaced: it would most likely be the wrong folder.
+        gone = item.who == "stage.toml" and item.how == "removed"
+        life.unreadable |= {item.who, "kiosk/stage.toml.good"} if gone else {item.who}
+        if item.how == "removed":
+            path.unlink()
+        else:
+            path.write_bytes(_damaged(before, item))
+        if item.who.startswith("kiosk/events"):
+            life.witness.begun_checks.clear()
+            life.witness.unsure_until_hours()
+        if item.who.endswith("lamps.json"):
+            life.witness.ledger_lost()
+        if item.who == "schedule.toml":
+            # With other hours for a while, what people said may have ended.
+            life.witness.unsure_until_hours()
+        if item.who in ("stage.toml", "schedule.toml"):
+            life.witness.unsure(MEND_FILE_S + REPAIR_S)
+            if item.who not in life.sound:  # of a file that is damaged twice, what it was before the first time
+                life.sound[item.who] = before
+                life.later(MEND_FILE_S, partial(_put_right, life, path))
+    life.world.scheduler.sleep(2.0)
+    life.boot()
+
+
+def _damaged(content: bytes, item: Item) -> bytes:
+    at = int(item.number * len(content))
+    if item.how == "empty":
+        return b""
+    if item.how == "cut":
+        return content[:at]
+    size = 64
+    if len(content) > 8 * SECTOR_BYTES:
+        # Disks lose whole sectors; in a small file that would be all of it.
+        at, size = at - at % SECTOR_BYTES, SECTOR_BYTES
+    return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + size]) + content[at + size :]
+
+
+def _put_right(life: Living, path: Path) -> None:
+    path.write_bytes(life.sound.pop(path.name))
+    life.unreadable.discard(path.name)
+    life.repaired_s = life.world.scheduler.now_s
+    if life.service is not None:
+        life.restart(lit=True)
+    life.witness.disturb(0.0)
+
+
+def bundle_damaged(life: Living, item: Item) -> None:
+    """The file of the installed bundle goes bad, or those of all, and the player dies.
+
+    After a while the appearances are published again. Until then the bundle before plays, where there is a sound one.
+    """
+    bundles, world, witness = STAGE / "bundles", life.world, life.witness
+    newest, earlier = current(bundles), previous(bundles)
+    if newest is None:
+        return
+    _spoil(newest)
+    if item.how == "all" and earlier is not None:
+        _spoil(earlier)
+    if world.screen.process is not None:
+        world.screen.process.kill()
+    repaired_s = item.for_s or MEND_FILE_S
+    witness.disturb(0.0 if _goes_back(bundles, earlier) else repaired_s)
+    witness.disturb_player(repaired_s)
+
+    def repair() -> None:
+        publish(STAGE, int(world.truth_s))
+        witness.disturb(0.0)
+
+    life.later(repaired_s, repair)
+
+
+def bundles_unreadable(life: Living, item: Item) -> None:
+    """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left."""
+    disk, witness = life.world.disk, life.witness
+    disk.blind = True
+    witness.disturb(item.for_s)
+    witness.disturb_player(item.for_s)
+
+    def repair() -> None:
+        disk.blind = False
+
+    life.later(item.for_s, repair)
+
+
+def _spoil(file: Path) -> None:
+    content = file.read_bytes()
+    half = len(content) // 2
+    file.write_bytes(content[:half] + bytes(byte ^ 0xA5 for byte in content[half:]))
+
+
+def _goes_back(bundles: Path, earlier: Path | None) -> bool:
+    """Whether the player can play the bundle before instead of the newest."""
+    if earlier is None or earlier.name == Starts.read(bundles).given_up:
+        return False
+    try:
+        Bundle.open_trusted(earlier, TRUST).close()
+    except VelaturaError:
+        return False
+    return True

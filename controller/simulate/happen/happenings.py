@@ -1,0 +1,208 @@
+"""What the items of a script do to a life, and how the witness has to take them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Final
+
+from controller.simulate.disk import TOTAL_BYTES
+from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
+from controller.simulate.happen.living import Living
+from controller.simulate.happen.script import Item
+from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
+from controller.simulate.lamps import RULES, Lamp
+
+GOES_OUT_S: Final = 35.0
+"""Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
+HOLD_S: Final = 7200.0
+"""For so long a kiosk's time may stand still after its clock was set back."""
+
+
+def happen(life: Living, item: Item) -> None:
+    """Let it happen. Raises Broken."""
+    _DEEDS[item.what](life, item)
+
+
+def _line(life: Living, item: Item) -> None:
+    line = life.world.lines[item.who]
+    line.trouble = item.how
+    line.connection += item.how == "gone"
+    life.witness.disturb(item.for_s + 120.0)
+
+    def repair() -> None:
+        line.trouble = ""
+
+    life.later(item.for_s, repair)
+
+
+def _lamp_fails(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    if item.how == "goes out":
+        lamp.lasts_s = GOES_OUT_S
+    else:
+        lamp.dud = True
+        lamp.go_dark()
+    life.witness.disturb(item.for_s)
+    life.later(item.for_s, partial(_new_lamp, life, lamp))
+
+
+def _new_lamp(life: Living, lamp: Lamp) -> None:
+    """A technician puts in a new one, and opens the stage if it is to be open."""
+    lamp.dud, lamp.fault, lamp.lasts_s = False, "", float("inf")
+    life.witness.disturb(0.0)
+    if life.service is not None:
+        for supervisor in life.service.devices.projectors:
+            supervisor.forgive()
+    life.witness.forgive()
+
+
+def _lamp_reports(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    lamp.fault = item.how
+    if item.how in ("temperature", "cover"):
+        lamp.go_dark()
+    life.witness.disturb(item.for_s)
+    life.later(item.for_s, partial(_new_lamp, life, lamp))
+
+
+def _by_hand(life: Living, item: Item) -> None:
+    lamp = life.world.lamps[item.who]
+    now_s = life.world.scheduler.now_s
+    if item.how == "off":
+        lamp.go_dark()
+    elif not lamp.lit and not lamp.bad and now_s - lamp.off_at_s >= RULES.minimum_off_s:
+        lamp.lit_at_s, lamp.by_hand = now_s, True
+    life.witness.disturb(0.0)
+
+
+def _player(life: Living, item: Item) -> None:
+    screen, witness = life.world.screen, life.witness
+    fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
+    if item.how in ("killed", "crashes"):
+        screen.dies_at_start = max(screen.dies_at_start, int(item.number))
+        if screen.process is not None:
+            screen.process.kill()
+    elif item.how == "crashes at a picture":
+        screen.dies_at_play = max(screen.dies_at_play, int(item.number))
+        if screen.process is not None:
+            screen.process.kill()
+    elif item.how == "hung":
+        screen.hung = True
+    else:
+        screen.trouble = item.how
+
+        def repair() -> None:
+            screen.trouble = ""
+
+        life.later(item.for_s, repair)
+    witness.disturb_player(item.for_s)
+    witness.disturb(item.for_s, PLAYER_S)
+    if fell:
+        witness.player_fell()
+
+
+def _camera(life: Living, item: Item) -> None:
+    camera = life.world.camera
+    camera.gone = True
+    camera.connection += 1
+
+    def repair() -> None:
+        camera.gone = False
+
+    life.later(item.for_s, repair)
+
+
+def _disk_full(life: Living, item: Item) -> None:
+    disk = life.world.disk
+    disk.full = True
+    life.witness.disturb(item.for_s)
+
+    def repair() -> None:
+        disk.full = False
+
+    life.later(item.for_s, repair)
+
+
+def _disk_low(life: Living, item: Item) -> None:
+    disk = life.world.disk
+    disk.free_bytes = 1_000_000_000
+
+    def repair() -> None:
+        disk.free_bytes = TOTAL_BYTES // 2
+
+    life.later(item.for_s, repair)
+
+
+def _killed(life: Living, item: Item) -> None:
+    lit = life.witness.lamps_that_stay()
+    life.end_of_program()
+    life.world.scheduler.sleep(2.0)
+    life.boot()
+    life.witness.stays_lit = lit
+
+
+def _killed_writing(life: Living, item: Item) -> None:
+    life.world.disk.kill_after = int(item.number)
+    life.witness.disturb(600.0)
+
+
+def _power_cut(life: Living, item: Item) -> None:
+    world = life.world
+    life.end_of_program()
+    if world.screen.process is not None:
+        world.screen.process.kill()
+    for lamp in world.lamps.values():
+        lamp.go_dark()
+    world.scheduler.sleep(item.for_s + 1.0)
+    world.reboot()
+    life.witness.disturb(0.0)
+    life.witness.forgive()
+    life.boot()
+
+
+def _restarted(life: Living, item: Item) -> None:
+    lit = life.witness.lamps_that_stay() if item.how == "lamps stay lit" else {}
+    life.restart(lit=item.how == "lamps stay lit")
+    life.witness.stays_lit = lit
+
+
+def _clock(life: Living, item: Item) -> None:
+    world, witness = life.world, life.witness
+    world.clock_off_s, world.is_synchronised = item.number, False
+    life.witness.unsure(item.for_s + HOLD_S + REPAIR_S)
+
+    def repair() -> None:
+        world.clock_off_s, world.is_synchronised = 0.0, True
+        life.witness.unsure(HOLD_S + REPAIR_S)
+        if witness.wanted.override is not None:
+            life.witness.unsure_until_hours()
+
+    life.later(item.for_s, repair)
+
+
+def _no_network(life: Living, item: Item) -> None:
+    world = life.world
+    world.no_network = True
+
+    def repair() -> None:
+        world.no_network = False
+
+    life.later(item.for_s, repair)
+
+
+def _drift(life: Living, item: Item) -> None:
+    life.world.drifted = True
+
+
+def _command(life: Living, item: Item) -> None:
+    life.command(item)
+
+
+_DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
+    "line": _line, "lamp fails": _lamp_fails, "lamp reports": _lamp_reports, "lamp switched by hand": _by_hand,
+    "player": _player, "camera gone": _camera, "disk full": _disk_full, "disk low": _disk_low,
+    "file damaged": file_damaged, "bundle damaged": bundle_damaged, "bundles unreadable": bundles_unreadable,
+    "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
+    "clock set": _clock, "network gone": _no_network, "drift": _drift, "command": _command,
+}  # fmt: skip

@@ -1,0 +1,35 @@
+"""A life, as far as what happens to it has to know it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from controller.kiosk.service import Service
+from controller.simulate.happen.script import Item
+from controller.simulate.judge.witness import Witness
+from controller.simulate.scheduler import Event
+from controller.simulate.world import SimulatedWorld
+
+
+class Living(Protocol):
+    """A life, as far as it is needed here; see ``life.Life``."""
+
+    world: SimulatedWorld
+    witness: Witness
+    service: Service | None
+    damaged: set[str]
+    unreadable: set[str]
+    sound: dict[str, bytes]
+    repaired_s: float
+    news: Event
+
+    def later(self, seconds: float, repair: Callable[[], None]) -> None: ...
+
+    def boot(self) -> None: ...
+
+    def end_of_program(self) -> None: ...
+
+    def restart(self, *, lit: bool) -> None: ...
+
+    def command(self, item: Item) -> None: ...

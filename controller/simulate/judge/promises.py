@@ -1,0 +1,43 @@
+"""What a kiosk promises."""
+
+from __future__ import annotations
+
+from typing import Final
+
+PROMISES: Final = {
+    "lamp rules": "No lamp is switched on while it is hot, or before its minimum off time.",
+    "one owner": "A device is used by one program, and by one of its threads, at a time.",
+    "no crash": "Nothing ends with an unexpected error.",
+    "decides always": "The decider waits for nothing.",
+    "remedy": "An error says what happened and what to do.",
+    "state": "The log's last word on the state is the state.",
+    "black while closed": "No picture is shown while the stage is closed.",
+    "dark while closed": "No lamp burns while the stage is closed and no work needs it.",
+    "rests while closed": "A closed stage without work is off, cools, or says what is wrong.",
+    "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
+    "serves": "A service that was started runs, also with a damaged stage.toml, as long as the last good one is there.",
+    "off is off": "When a stage says that every lamp is off, none burns that it struck.",
+    "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
+    "says why it is dark": "While an open stage shows nothing, it says why.",
+    "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
+    "nothing lost": "Events, settings and counts survive each end of the service.",
+    "once a night": "The nightly check is begun at most once a night.",
+    "at night": "The nightly check begins only while the stage is closed.",
+    "few words": "What goes wrong again every second does not fill the log.",
+    "strikes counted": "A lamp is struck at most as often as it is counted.",
+    "few strikes": "A lamp that gives no light is not struck again and again.",
+    "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
+    "as usual again": "What people changed of the picture ends when the stage closes.",
+    "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
+    "work ends": "Work ends by itself, when it is cancelled and when it fails, and lets go of the stage.",
+    "devices back": "A camera that is there again is opened again.",
+}
+
+
+class Broken(Exception):
+    """``promise``: its name in ``PROMISES``."""
+
+    def __init__(self, promise: str, how: str) -> None:
+        super().__init__(f"{promise}: {how}")
+        assert promise in PROMISES
+        self.promise = promise
