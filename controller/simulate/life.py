@@ -41,7 +41,7 @@ LIFE_DAYS: Final = 14.0
 AGAIN_S: Final = 5.0
 CALM: Final = (8.0, 240.0, 2400.0)
 """How far pauses are stretched: while lamps or work are under way, while something is wrong, while all is well."""
-CALMER: Final = 1.6
+CALMER: Final = 2.0
 END_S: Final = 150.0
 SERVES_S: Final = 60.0
 GOOD: Final = "kiosk/stage.toml.good"
