@@ -25,6 +25,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
 from controller.artefacts.projectors import IndirectFigures, Light
 from controller.bundle.export import png
+from controller.calibrate.photometry.glare import veiled, veiling_glare
 from controller.calibrate.photometry.gloss import gloss_strength, glossy
 from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
@@ -110,8 +111,9 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
     geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
-    if (said := glossy(gloss_strength(calibration, geometry))) is not None:
-        context.reporter.say(said, Level.WARNING)
+    for said in glossy(gloss_strength(calibration, geometry)), veiled(veiling_glare(calibration, geometry)):
+        if said is not None:
+            context.reporter.say(said, Level.WARNING)
     return write_grade(context.folder, figures, maps, png(in_rows(pictures)))
 
 
