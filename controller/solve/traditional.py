@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
+from controller.core.checks import check_image
 from controller.core.errors import UsageError
 from controller.solve.exposed import Exposed, exposed
 from controller.transport import build_transport
@@ -32,19 +33,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
             what=f"Projector number {n + 1} does not exist.",
             remedy=f"Choose one from 1 to {len(calibration.projectors)}.",
         )
-    if target.shape != calibration.black.shape:
-        sizes = [" x ".join(map(str, image.shape)) for image in (target, calibration.black)]
-        raise UsageError(
-            "image-wrong-size",
-            what=f"The target is {sizes[0]} instead of {sizes[1]}.",
-            remedy="Make the target as large as this stage's camera image.",
-        )
-    if not np.isfinite(target).all():
-        raise UsageError(
-            "target-not-finite",
-            what="The target has pixels that are not finite numbers.",
-            remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
-        )
+    check_image("target", target, calibration.black.shape)
     frames = [np.zeros((*p.metapixels.valid.shape, 3), np.float32) for p in calibration.projectors]
     projector = calibration.projectors[n]
     metapixels = projector.metapixels

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator
 
 from controller.core.arrays import FloatImage, Mask
-from controller.core.errors import UsageError
+from controller.core.checks import check_shape
 from controller.transport.camera_box import CameraBox
 from controller.transport.planes import frame_planes, image_planes, plane_frames, plane_image
 
@@ -222,13 +222,12 @@ class LightTransport(LinearOperator[np.float32], ABC):
         return _vector(self.adjoint_planes(r), x)
 
     def _checked(self, image: FloatImage) -> FloatImage:
-        if image.shape != (*self.camera_shape, 3):
-            raise _wrong_size("camera image", image.shape, (*self.camera_shape, 3))
+        check_shape("camera image", image.shape, (*self.camera_shape, 3))
         return image
 
     def _check_frame(self, n: int, frame: FloatImage) -> None:
-        if frame.shape != (*self.sizes[n], 3):
-            raise _wrong_size(f"frame of projector {n + 1}", frame.shape, (*self.sizes[n], 3))
+        wanted = (*self.sizes[n], 3)
+        check_shape(f"frame of projector {n + 1}", frame.shape, wanted, "Make it as large as the projector's image.")
 
 
 _Vector = npt.NDArray[np.floating]
@@ -241,11 +240,3 @@ def _planes(x: _Vector, pixels: int) -> FloatImage:
 def _vector(planes: FloatImage, x: _Vector) -> _Vector:
     """Flat, and in double precision where ``x`` is: norms of solvers that work in it must not overflow."""
     return planes.reshape(-1).astype(np.result_type(x, np.float32), copy=False)
-
-
-def _wrong_size(what: str, got: tuple[int, ...], wanted: tuple[int, ...]) -> UsageError:
-    return UsageError(
-        "image-wrong-size",
-        what=f"A {what} is {' x '.join(map(str, got))} instead of {' x '.join(map(str, wanted))}.",
-        remedy="Give an image of the size of this stage's camera or projector.",
-    )

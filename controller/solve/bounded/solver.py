@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
+from controller.core.checks import check_image
 from controller.core.errors import UsageError
 from controller.solve.bounded.descent import IterationControl
 from controller.solve.bounded.gradient import add_smoothness_to_majoriser, inner, weighted_residual
@@ -57,19 +58,7 @@ class Solution:
 
 def check_target(transport: LightTransport, target: FloatImage) -> None:
     """Raise UsageError "image-wrong-size" or "target-not-finite" unless ``target`` can be a camera image here."""
-    if target.shape != (*transport.camera_shape, 3):
-        raise UsageError(
-            "image-wrong-size",
-            what=f"The target is {' x '.join(map(str, target.shape))} instead of {transport.camera_shape[0]} x "
-            f"{transport.camera_shape[1]} x 3.",
-            remedy="Make the target as large as this stage's camera image.",
-        )
-    if not np.isfinite(target).all():
-        raise UsageError(
-            "target-not-finite",
-            what="The target has pixels that are not finite numbers.",
-            remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
-        )
+    check_image("target", target, (*transport.camera_shape, 3))
 
 
 def solve_bounded(

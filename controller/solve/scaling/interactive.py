@@ -29,7 +29,7 @@ from controller.bundle.live_maps import (
 )
 from controller.calibrate.values import Radiometry
 from controller.core.arrays import ByteImage, FloatImage
-from controller.core.errors import UsageError
+from controller.core.checks import check_shape, not_finite
 from controller.solve.appearance import Base
 from controller.solve.bounded.solver import check_target
 from controller.solve.scaling.kernels import (
@@ -100,7 +100,7 @@ class Interactive:
 
         Raises UsageError("image-wrong-size", "target-not-finite").
         """
-        _check_size(target.shape, (*self.camera, 3), "this stage's camera image")
+        check_shape("target", target.shape, (*self.camera, 3))
         picture = np.ascontiguousarray(target, np.float32)
         factor, block = self._factor, self._block
         maps = self._gain, self._offset, self._used
@@ -111,11 +111,7 @@ class Interactive:
             small = picture if factor == 1 else small_picture(picture, factor)
             finite = scale_plainly(small, block, *maps, self._side, self._scale, self._of(small))
         if not finite:
-            raise UsageError(
-                "target-not-finite",
-                what="The target has pixels that are not finite numbers.",
-                remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
-            )
+            raise not_finite("target")
         made = self.blank()
         self._show(made)
         return made
@@ -130,7 +126,9 @@ class Interactive:
         ``brightness``: the radiance of its white. Raises UsageError("image-wrong-size").
         """
         width, height = self.maps.target_px
-        _check_size(picture.shape, (height, width, 3), "the targets of this stage's live mode")
+        check_shape(
+            "target", picture.shape, (height, width, 3), "Make it as large as the targets of this stage's live mode."
+        )
         light = np.float32(brightness) * self._table
         pixels = np.ascontiguousarray(picture, np.uint8)
         indirect, thrown = self.maps.indirect, self._thrown
@@ -196,15 +194,6 @@ def interactive(
     check_target(transport, black)
     maps = scaling_maps(transport, base, black, radiometries, indirect=indirect)
     return Interactive(maps, transport.camera_shape)
-
-
-def _check_size(found: tuple[int, ...], wanted: tuple[int, ...], what: str) -> None:
-    if found != wanted:
-        raise UsageError(
-            "image-wrong-size",
-            what=f"The target is {' x '.join(map(str, found))} instead of {' x '.join(map(str, wanted))}.",
-            remedy=f"Make it as large as {what}.",
-        )
 
 
 def _block(maps: LiveMaps) -> int:

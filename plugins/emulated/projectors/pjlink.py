@@ -7,26 +7,22 @@ show.
 from __future__ import annotations
 
 import contextlib
-import errno
 import random
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from types import TracebackType
+from collections.abc import Iterator
 from typing import Final
 
-from hal.errors import DeviceError
-from plugins.emulated.faults import Faults
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
+from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.pjlink_board import CR, REFUSAL, PasswordCheck, PjLinkBoard, PjLinkOddities
-from plugins.emulated.scenario import ScenarioPlayer
+from plugins.emulated.projectors.tcp_projector import TcpProjector
 
 _LONGEST: Final = 200
 _TICK_S: Final = 0.05
 
 
-class EmulatedPjLinkProjector:
+class EmulatedPjLinkProjector(TcpProjector):
     """A projector on loopback TCP. ``start`` and ``stop`` it, or use it in a ``with`` statement.
 
     Parameters
@@ -58,84 +54,18 @@ class EmulatedPjLinkProjector:
         odd: PjLinkOddities | None = None,
         wedges_below_s: float = 0.0,
     ) -> None:
-        self.lamp = lamp
-        self.faults = Faults()
-        self.scenario: ScenarioPlayer | None = None
+        super().__init__(lamp, port=port, wedges_below_s=wedges_below_s)
         self._board = PjLinkBoard(lamp, name, odd)
         self.heard: list[bytes] = []
         self._board_lock = threading.Lock()
-        self._wanted_port = port
         self._password = password
         self._idle_s = idle_s
         self._chatty = chatty
-        self._wedges_below_s = wedges_below_s
-        self._heard_at_s = 0.0
-        self.wedged = False
         self._random = random.Random(seed)
-        self._stop = threading.Event()
-        self._listener: socket.socket | None = None
-        self._threads: list[threading.Thread] = []
-
-    @property
-    def address(self) -> str:
-        """``127.0.0.1:port``, once started."""
-        if self._listener is None:
-            raise DeviceError(
-                "emulator-not-started",
-                what="The emulated projector has no address before it starts.",
-                remedy="Start it first.",
-            )
-        return "{}:{}".format(*self._listener.getsockname()[:2])
 
     def set_oddities(self, odd: PjLinkOddities) -> None:
         """Behave so from the next message on."""
         self._board.odd = odd
-
-    def start(self) -> None:
-        """Listen. Raises DeviceError("port-in-use") naming the port."""
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind(("127.0.0.1", self._wanted_port))
-            listener.listen(8)
-        except OSError as error:
-            listener.close()
-            raise _no_port(self._wanted_port, error) from error
-        listener.settimeout(_TICK_S)
-        self._stop.clear()
-        self._listener = listener
-        self._spawn(self._accept, listener)
-
-    def stop(self) -> None:
-        """Close every connection and end. Harmless when called twice."""
-        self._stop.set()
-        for thread in self._threads:
-            thread.join(timeout=2.0)
-        self._threads.clear()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-
-    def __enter__(self) -> EmulatedPjLinkProjector:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    def _spawn(self, work: Callable[[socket.socket], None], on: socket.socket) -> None:
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
-        thread = threading.Thread(target=work, args=(on,), name="pjlink projector", daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-    def _accept(self, listener: socket.socket) -> None:
-        while not self._stop.is_set():
-            with contextlib.suppress(TimeoutError):
-                client, _ = listener.accept()
-                self._spawn(self._serve, client)
 
     def _serve(self, client: socket.socket) -> None:
         with client, contextlib.suppress(OSError):
@@ -158,7 +88,7 @@ class EmulatedPjLinkProjector:
                             return
                         continue
                     line = check.command  # noqa: PLW2901 - the proof goes before the first command only
-                self._wedge()
+                self._hang_if_too_soon()
                 self.heard.append(line)
                 with self._board_lock:
                     answer = self._board.answer(line, busy=self.faults.now.busy)
@@ -168,12 +98,6 @@ class EmulatedPjLinkProjector:
                     self._send(client, b"%2LKUP=02:00:00:00:00:01\r\0\0" + answer if self._chatty else answer)
                     if self._board.odd.closes:
                         return
-
-    def _wedge(self) -> None:
-        now_s, before_s = time.monotonic(), self._heard_at_s
-        self._heard_at_s = now_s
-        occupied = self.lamp.phase in (LampPhase.WARMING, LampPhase.COOLING)
-        self.wedged |= occupied and now_s - before_s < self._wedges_below_s
 
     def _lines(self, client: socket.socket) -> Iterator[bytes]:
         """Lines without their CR until the client goes, is idle too long, or sends a line that never ends."""
@@ -200,17 +124,3 @@ class EmulatedPjLinkProjector:
             self._stop.wait(wait_s)
         if not lost:
             client.sendall(carried)
-
-
-def _no_port(port: int, error: OSError) -> DeviceError:
-    if error.errno == errno.EADDRINUSE:
-        return DeviceError(
-            "port-in-use",
-            what=f"TCP port {port} is in use by another program.",
-            remedy=f"Stop that program (ss -ltnp | grep {port} names it), or choose another port.",
-        )
-    return DeviceError(
-        "port-not-opened",
-        what=f"TCP port {port} could not be opened: {error.strerror}.",
-        remedy="Choose a port of 1024 or above.",
-    )

@@ -10,20 +10,17 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Final
 
-from hal.errors import DeviceError
-from plugins.emulated.faults import Faults
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
+from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.network.gates import Gate, OpenGate
 from plugins.emulated.projectors.serial import Board
-from plugins.emulated.scenario import ScenarioPlayer
+from plugins.emulated.projectors.tcp_projector import TcpProjector
 
 _TICK_S: Final = 0.02
 
 
-class EmulatedNetworkProjector:
+class EmulatedNetworkProjector(TcpProjector):
     """A projector on loopback TCP. ``start`` and ``stop`` it, or use it in a ``with`` statement.
 
     Parameters
@@ -51,72 +48,17 @@ class EmulatedNetworkProjector:
         boot_s: float = 0.0,
         seed: int = 1,
     ) -> None:
-        self.lamp = lamp
-        self.faults = Faults()
-        self.scenario: ScenarioPlayer | None = None
+        super().__init__(lamp, port=port, wedges_below_s=wedges_below_s)
         self.connections = 0
         self._board = board
         self._new_board = self._copied(board)
-        self._wanted_port = port
         self._gate = gate
         self._password = password
         self._random = random.Random(seed)
-        self._wedges_below_s = wedges_below_s
-        self._heard_at_s = 0.0
-        self.wedged = False
         self._boot_s = boot_s
         self._awake_at_s: float | None = time.monotonic()
         self._board_turn = threading.Lock()
-        self._stop = threading.Event()
-        self._listener: socket.socket | None = None
         self._clients: set[socket.socket] = set()
-        self._threads: list[threading.Thread] = []
-
-    @property
-    def address(self) -> str:
-        """``127.0.0.1:port``, once started."""
-        if self._listener is None:
-            raise DeviceError(
-                "emulator-not-started",
-                what="The emulated projector has no address before it starts.",
-                remedy="Start it first.",
-            )
-        return "{}:{}".format(*self._listener.getsockname()[:2])
-
-    def start(self) -> None:
-        """Listen. Raises DeviceError("port-in-use") naming the port."""
-        try:
-            listener = socket.create_server(("127.0.0.1", self._wanted_port))
-        except OSError as error:
-            raise DeviceError(
-                "port-in-use",
-                what=f"TCP port {self._wanted_port} can't be used: {error.strerror}.",
-                remedy="Stop the program that uses it, or choose another port.",
-            ) from error
-        self._wanted_port = listener.getsockname()[1]
-        listener.settimeout(_TICK_S)
-        self._stop.clear()
-        self._listener = listener
-        self._spawn(lambda: self._accept(listener))
-
-    def stop(self) -> None:
-        """Close every connection and end. Harmless when called twice."""
-        self._stop.set()
-        for thread in self._threads:
-            thread.join(timeout=2.0)
-        self._threads.clear()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-
-    def __enter__(self) -> EmulatedNetworkProjector:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def unplug(self) -> None:
         """Pull the network cable: connections end, and none is accepted. The projector itself goes on."""
@@ -161,24 +103,17 @@ class EmulatedNetworkProjector:
     def _copied(self, board: Board) -> Board:
         return copy.deepcopy(board, {id(self.lamp): self.lamp})
 
-    def _spawn(self, work: Callable[[], None]) -> None:
-        self._threads = [thread for thread in self._threads if thread.is_alive()]
-        thread = threading.Thread(target=work, name="network projector", daemon=True)
-        self._threads.append(thread)
-        thread.start()
+    def _tick(self) -> None:
+        if self.scenario is not None:
+            self.scenario.tick()
 
-    def _accept(self, listener: socket.socket) -> None:
-        while not self._stop.is_set():
-            if self.scenario is not None:
-                self.scenario.tick()
-            with contextlib.suppress(TimeoutError):
-                client, _ = listener.accept()
-                self.connections += 1
-                if self.awake:
-                    self._clients.add(client)
-                    self._spawn(lambda client=client: self._serve(client))  # type: ignore[misc]
-                else:
-                    client.close()
+    def _accepted(self, client: socket.socket) -> None:
+        self.connections += 1
+        if self.awake:
+            self._clients.add(client)
+            super()._accepted(client)
+        else:
+            client.close()
 
     def _serve(self, client: socket.socket) -> None:
         gate = self._gate(self._password, self._random)
@@ -205,7 +140,9 @@ class EmulatedNetworkProjector:
         with self._board_turn:
             answers = self._board.notices()
             if heard is not None and heard.commands:
-                self._wedge(len(heard.commands))
+                if self.scenario is not None:
+                    self.scenario.heard(len(heard.commands))
+                self._hang_if_too_soon()
                 answers = [*answers, *self._board.feed(heard.commands, busy=self.faults.now.busy)]
         for answer in answers:
             answered = True
@@ -214,12 +151,3 @@ class EmulatedNetworkProjector:
                 self._stop.wait(wait_s)
                 client.sendall(carried)
         return not (answered and gate.closes)
-
-    def _wedge(self, count: int) -> None:
-        """Hang if spoken to too soon while the board is occupied with the lamp."""
-        if self.scenario is not None:
-            self.scenario.heard(count)
-        now_s, before_s = time.monotonic(), self._heard_at_s
-        self._heard_at_s = now_s
-        occupied = self.lamp.phase in (LampPhase.WARMING, LampPhase.COOLING)
-        self.wedged |= occupied and now_s - before_s < self._wedges_below_s

@@ -1,0 +1,33 @@
+"""Checks of images that callers give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError
+
+CAMERA_SIZE = "Make it as large as this stage's camera image."
+
+
+def check_shape(what: str, found: tuple[int, ...], wanted: tuple[int, ...], remedy: str = CAMERA_SIZE) -> None:
+    """Raise UsageError("image-wrong-size") unless both are the same; ``what``: the image's name in a sentence."""
+    if found != wanted:
+        sizes = [" x ".join(map(str, shape)) for shape in (found, wanted)]
+        raise UsageError("image-wrong-size", what=f"The {what} is {sizes[0]} instead of {sizes[1]}.", remedy=remedy)
+
+
+def check_image(what: str, image: FloatImage, shape: tuple[int, ...]) -> None:
+    """As ``check_shape``; raises UsageError("target-not-finite"), too."""
+    check_shape(what, image.shape, shape)
+    if not np.isfinite(image).all():
+        raise not_finite(what)
+
+
+def not_finite(what: str) -> UsageError:
+    """The error of an image with NaN or infinite pixels."""
+    return UsageError(
+        "target-not-finite",
+        what=f"The {what} has pixels that are not finite numbers.",
+        remedy="Replace NaN and infinite pixels, for example by 0 outside the object.",
+    )
