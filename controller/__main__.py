@@ -5,19 +5,14 @@ Heavy imports are inside the commands, so that ``velatura --help`` is fast.
 
 from __future__ import annotations
 
-import os
-import platform
 import sys
 import threading
-import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from controller.cli.plain_install import run_without_commands
-from controller.core.extras import EXTRA_OF, extra_missing
+from controller.core.extras import EXTRA_OF
 
 try:
     import typer
@@ -43,24 +38,21 @@ from controller.cli.commands.photograph import photograph
 from controller.cli.commands.plan import plan
 from controller.cli.commands.report import report
 from controller.cli.commands.study import study
+from controller.cli.error_reports import DONE, FAILED, report_error
 from controller.cli.record_command import record
 from controller.cli.running import Json, StageFolder, group, projector_names, work
 from controller.cli.simulate_command import simulate
-from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.core.files import file_error
-from hal.runtime.caches import prepare_libraries, state_folder, temporary_folder
+from controller.core.errors import UsageError
+from hal.runtime.caches import prepare_libraries
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
-    from hal.errors import DeviceError
 
 __all__ = ["COMMANDS", "GROUPS", "Json", "StageFolder", "application", "main", "run", "work"]
 
 AcceptGrade = Annotated[
     bool, typer.Option("--accept-grade", help="Accept a calibration below the grade in stage.toml.")
 ]
-
-DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
 
 SUMMARY: Final = "Gives a physical object a new appearance with light from several superimposed projectors."
 
@@ -287,7 +279,7 @@ def application() -> typer.Typer:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit: 0 done, 1 the work failed, 2 wrong use, 3 a device failed, 130 stopped."""
+    """Run the command line and exit with a code of ``cli.error_reports``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     console.prepare_streams()
     prepare_libraries()
@@ -303,106 +295,8 @@ def run(arguments: Sequence[str]) -> int:
     except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
     except BaseException as error:  # noqa: BLE001 - the last boundary: no caller could show it
-        return _report_error(error, as_json=as_json)
+        return report_error(error, as_json=as_json)
     return outcome if isinstance(outcome, int) else DONE
-
-
-def _report_error(error: BaseException, *, as_json: bool) -> int:
-    """Show ``error`` as two sentences and return the exit code. If output was lost, show that instead."""
-    if isinstance(error, typer.Exit):
-        return error.exit_code
-    if isinstance(error, OSError) and console.output_lost(error):
-        return FAILED
-    try:
-        shown = _explained(error)
-        if shown is None:
-            return _crashed(error, as_json=as_json)
-        console.show_error(shown.code, shown.what, shown.remedy, as_json=as_json)
-    except OSError:
-        if not console.output_lost():
-            raise
-    else:
-        return shown.exit_code
-    return FAILED
-
-
-@dataclass(frozen=True, slots=True)
-class _Shown:
-    code: str
-    what: str
-    remedy: str
-    exit_code: int
-
-
-def _explained(error: BaseException) -> _Shown | None:
-    """The message for ``error``; None for one that should never happen."""
-    from hal.deadline import Cancelled
-    from hal.errors import DeviceError
-
-    if isinstance(error, KeyboardInterrupt | typer.Abort | Cancelled) or getattr(error, "code", None) == "cancelled":
-        return _Shown(
-            "cancelled", "The work was stopped on request.", "Run the same command to continue from here.", STOPPED
-        )
-    if isinstance(error, typer.TyperException):
-        message = error.format_message()
-        sentence = message if message.endswith((".", "?")) else f"{message}."
-        return _Shown("wrong-use", sentence, "`velatura --help` shows the commands and their options.", WRONG_USE)
-    known = _as_velatura_error(error)
-    if isinstance(known, DeviceError):
-        return _Shown(known.code, known.what, known.remedy, DEVICE_FAILED)
-    return None if known is None else _Shown(known.code, known.what, known.remedy, known.exit_code)
-
-
-def _as_velatura_error(error: BaseException) -> VelaturaError | DeviceError | None:
-    from hal.errors import DeviceError
-
-    if isinstance(error, VelaturaError | DeviceError):
-        return error
-    if isinstance(error, ModuleNotFoundError):
-        return extra_missing(error.name or "")
-    if isinstance(error, OSError):
-        return file_error(error)
-    if isinstance(error, MemoryError):
-        return WorkError("no-memory", what="This computer has too little memory.",
-                         remedy="Close other programs, or use a smaller stage, picture or mesh.")  # fmt: skip
-    return None
-
-
-def _crashed(error: BaseException, *, as_json: bool) -> int:
-    """For an unexpected error: write the traceback to a file and show a short message."""
-    report = "".join(
-        [
-            f"time: {time.strftime('%Y-%m-%d %H:%M:%S%z')}\n",
-            f"command: {sys.argv!r}\npython: {sys.version}\nsystem: {platform.platform()}\n\n",
-            *traceback.format_exception(error),
-        ]
-    )
-    name = f"crash-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
-    path = _kept(report, name)
-    console.show_error(
-        "crash",
-        f"An unexpected error occurred ({type(error).__name__}).",
-        f"Send {path} to the maintainers. It contains the details."
-        if path
-        else "The error report could not be written.",
-        as_json=as_json,
-    )
-    return FAILED
-
-
-def _kept(report: str, name: str) -> Path | None:
-    for folder in (state_folder, temporary_folder):
-        try:
-            place = folder()
-            place.mkdir(parents=True, exist_ok=True)
-            path = place / name
-            # Only a new file, readable only for this user: the folder may be shared.
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-                file.write(report)
-        except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
-            continue
-        return path
-    return None
 
 
 if __name__ == "__main__":

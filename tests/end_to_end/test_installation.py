@@ -147,7 +147,7 @@ def test_without_a_home_folder_everything_works_and_leaves_nothing(tmp_path: Pat
     ):
         done = called([sys.executable, *words], env, tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
-    crash = "from controller.__main__ import _report_error; _report_error(ZeroDivisionError(), as_json=False)"
+    crash = "from controller.cli.error_reports import report_error; report_error(ZeroDivisionError(), as_json=False)"
     done = called([sys.executable, "-c", crash], env, tmp_path)
     assert str(temporary) in done.stderr
     assert [path.name for path in temporary.iterdir() if not path.name.startswith(("crash-", "velatura-"))] == []
