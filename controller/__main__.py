@@ -216,10 +216,13 @@ def play(
     names: Annotated[list[str] | None, typer.Argument(help="The appearances to show, one after the other.")] = None,
     sequence: Annotated[Path | None, typer.Option(help="Instead: a TOML file with [[item]] tables.")] = None,
     seconds: Annotated[
-        float, typer.Option(help="Seconds per appearance (several: 10; one: until Ctrl-C).", min=0)
+        float,
+        typer.Option(help="Seconds per appearance (several: 10; one: until Ctrl-C).", min=0, show_default=False),
     ] = 0.0,
     fade: Annotated[float, typer.Option(help="Cross-fade in seconds.", min=0, max=600)] = 0,
-    repeat: Annotated[int, typer.Option(help="How often the playlist repeats (default: until Ctrl-C).", min=0)] = 0,
+    repeat: Annotated[
+        int, typer.Option(help="How often the playlist repeats (default: until Ctrl-C).", min=0, show_default=False)
+    ] = 0,
     as_json: Json = False,
 ) -> None:
     """Switch the projectors on and show appearances of the installed bundle."""

@@ -27,7 +27,8 @@ def live(
     fps: Annotated[float, typer.Option(help="Maximum pictures per second.", min=0.1, max=240)] = 25.0,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat the video, or the pictures of the folder.")] = False,
     seconds: Annotated[
-        float, typer.Option(help="Duration in seconds (default: to the end or until Ctrl-C).", min=0)
+        float,
+        typer.Option(help="Duration in seconds (default: to the end or until Ctrl-C).", min=0, show_default=False),
     ] = 0.0,
     into: Annotated[
         Path | None,

@@ -8,7 +8,6 @@ from importlib import resources
 from typing import Any, Final
 
 from hal.errors import DeviceError
-from plugins.emulated.projectors.board_sanyo import SanyoBoard
 from plugins.emulated.projectors.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.projectors.boards_text import BenqBoard, ChristieBoard, EpsonBoard, PanasonicBoard
 from plugins.emulated.projectors.families.acer import AcerBoard
@@ -17,6 +16,7 @@ from plugins.emulated.projectors.families.digital_projection import DigitalProje
 from plugins.emulated.projectors.families.hitachi import HitachiBoard
 from plugins.emulated.projectors.families.jvc import JvcBoard
 from plugins.emulated.projectors.families.panasonic_dz import PanasonicDzBoard
+from plugins.emulated.projectors.families.sanyo import SanyoBoard
 from plugins.emulated.projectors.families.sony import AdcpBoard, SdcpBoard
 from plugins.emulated.projectors.families.viewsonic import ViewSonicBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp

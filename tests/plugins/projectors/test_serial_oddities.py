@@ -13,8 +13,8 @@ import pytest
 from hal.deadline import in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
-from plugins.emulated.projectors.board_sanyo import SanyoBoard
 from plugins.emulated.projectors.boards import BOARDS
+from plugins.emulated.projectors.families.sanyo import SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.odd_board import OddBoard
 from tests.plugins.conftest import each, wait_for_power

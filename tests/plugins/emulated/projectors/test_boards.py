@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from plugins.emulated.projectors.board_sanyo import SanyoBoard
 from plugins.emulated.projectors.boards_binary import Ep910Board, NecBoard
 from plugins.emulated.projectors.boards_text import (
     BenqBoard,
@@ -14,6 +13,7 @@ from plugins.emulated.projectors.boards_text import (
     EpsonQuirks,
     PanasonicBoard,
 )
+from plugins.emulated.projectors.families.sanyo import SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.plugins.emulated.conftest import Clock
 
