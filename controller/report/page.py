@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup, escape
 
 from controller.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.core.arrays import ByteImage
@@ -115,12 +114,10 @@ def render(page: Page) -> str:
     )
 
 
-def _commands(text: str) -> Markup:
-    """``text`` with what stands in backticks as code, escaped."""
+def _commands(text: str) -> list[tuple[str, bool]]:
+    """The parts of ``text``, and whether each is a command, which stands in backticks."""
     parts = text.split("`")
-    if len(parts) % 2 == 0:
-        return escape(text)
-    return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
+    return [(part, n % 2 == 1) for n, part in enumerate(parts)] if len(parts) % 2 else [(text, False)]
 
 
 def _typeface() -> str:
