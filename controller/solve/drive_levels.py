@@ -46,8 +46,9 @@ class DriveLevels:
         _solve(self._light, image_planes(light), self.mask, out)
         if self._segment is not None:
             share = self._segment[..., None]
-            # what is below none has no white in it
-            out -= share * np.maximum(out.min(axis=2, keepdims=True), 0)
+            # what is below none has no white in it, and an infinite level stays one
+            least = out.min(axis=2, keepdims=True)
+            out -= share * np.where(np.isfinite(least), np.maximum(least, 0), 0)
             out /= 1 - share
         return out
 

@@ -108,3 +108,18 @@ def test_what_is_in_reach_ends_where_the_projectors_do(stage: Stage) -> None:
     pure = np.broadcast_to(np.array([1.0, 0.0, 0.0], np.float32), levels.shape)
     without = DriveLevels(dataclasses.replace(transport, segments=()))
     np.testing.assert_allclose(drive.of(without.light(pure))[inside].max(axis=1), 1 / 0.75, rtol=1e-3)
+
+
+def test_where_a_colour_is_never_seen_no_level_makes_it(stage: Stage) -> None:
+    calibration = with_segment(stage(), 0.25)
+    parts = []
+    for part in calibration.projectors:
+        white = part.white.copy()
+        white[20:40, 20:40, 0] = 0
+        parts.append(dataclasses.replace(part, white=white))
+    drive = DriveLevels(build_transport(dataclasses.replace(calibration, projectors=tuple(parts))))
+    levels = drive.of(np.full((*drive.mask.shape, 3), 0.1, np.float32))
+    dark = np.zeros_like(drive.mask)
+    dark[22:38, 22:38] = True
+    assert np.isposinf(levels[dark & drive.mask]).all()
+    assert not np.isnan(levels).any()
