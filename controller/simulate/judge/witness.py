@@ -66,7 +66,7 @@ class Witness:
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
-        self._unexplained_since_s: float | None = None
+        self._found_since_s: dict[str, float] = {}
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
         self._strikes_since: dict[str, int] = {}
         self.begun_checks: dict[str, int] = {}
@@ -76,7 +76,7 @@ class Witness:
         self._judged_s = 0.0
         self.stays_lit: dict[str, float | None] = {}
         self._work: Request | None = None
-        self._work_since_s = self._worked_s = 0.0
+        self._work_since_s = 0.0
 
     # -- the service
 
@@ -278,6 +278,7 @@ class Witness:
     def _closed(self, service: Service, state: State, wanted: bool) -> None:
         world, now_s = self._world, self._world.scheduler.now_s
         if wanted or now_s <= self.clock_wrong_until_s:
+            self._found_s("restless", False)
             return
         shut_s = now_s - max(self.changed_s, self._began_s)
         if shut_s > BLACK_S and service.reconciler.live != LiveChanges():
@@ -288,9 +289,9 @@ class Witness:
         works = service.reconciler.working or now_s < self.light_until_s
         if works:
             self.changed_s = max(self.changed_s, now_s - BLACK_S - 1)
-            self._worked_s = now_s
+        restless = shut_s > BLACK_S and not works and state not in _RESTING
         # Work that is given up in a step leaves the stage as it is until the next.
-        if min(shut_s, now_s - self._worked_s) > BLACK_S and state not in _RESTING:
+        if self._found_s("restless", restless) > 0:
             raise Broken("rests while closed", f"it is {state.value}, {shut_s:.0f} s after it closed")
         burning = [name for name, lamp in world.lamps.items() if lamp.lit]
         if shut_s > DARK_S and burning and not works and self.calm:
@@ -308,13 +309,15 @@ class Witness:
         elif self._black_since_s is None:
             self._black_since_s = now_s
         if not wanted or now_s <= self.clock_wrong_until_s:
-            self._back_by_s = self._unexplained_since_s = None
+            self._back_by_s = None
+            self._found_s("unexplained", False)
             return
         self._back(shown, asked_black)
         open_s = now_s - max(self.changed_s, self._began_s)
         dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
-        explained = dark_s <= SETTLING_S or open_s <= SETTLING_S or self._explained(kiosk, state)
-        self._says_why(state, dark_s, explained=explained)
+        unexplained = dark_s > SETTLING_S and open_s > SETTLING_S and not self._explained(kiosk, state)
+        if self._found_s("unexplained", unexplained) > BLACK_S:
+            raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
         if not self.calm or open_s < SETTLING_S or asked_black:
             if asked_black:
                 self.disturb(0.0, SETTLING_S)
@@ -333,12 +336,13 @@ class Witness:
             if shown not in names or abs(brightness - live.brightness) > 0.01:
                 raise Broken("plays while open", f"{shown} at {brightness:g} is shown instead of {wants.appearance}")
 
-    def _says_why(self, state: State, dark_s: float, *, explained: bool) -> None:
+    def _found_s(self, what: str, now: bool) -> float:
+        """For how long each step has found this. The step before the first of them may be minutes older."""
         now_s = self._world.scheduler.now_s
-        # It counts from the first step that finds no explanation: the one before may be minutes old.
-        since_s = self._unexplained_since_s = None if explained else self._unexplained_since_s or now_s
-        if since_s is not None and now_s - since_s > BLACK_S:
-            raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
+        if not now:
+            self._found_since_s.pop(what, None)
+            return 0.0
+        return now_s - self._found_since_s.setdefault(what, now_s)
 
     def _back(self, shown: str, asked_black: bool) -> None:
         if self._back_by_s is not None and self._world.scheduler.now_s > self._back_by_s and not asked_black:
