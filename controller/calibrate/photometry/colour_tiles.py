@@ -31,7 +31,8 @@ class TileMeasurements:
 
     ``levels`` (tiles, 3) int64 device values shown; ``ratio`` (tiles, 3) light per camera channel, white being 1;
     ``weight`` (tiles, 3): inverse of its variance; ``photograph`` (tiles,) int64: which one of the tiles' photographs
-    it is from, from 0; ``pixels``: camera pixels that they come from
+    it is from, from 0; ``pixels``: camera pixels that they come from; ``indirect`` (tiles, 3): light that was taken
+    away from ``ratio``, as it is when the lamp is as strong as at white
     """
 
     levels: npt.NDArray[np.int64]
@@ -39,10 +40,13 @@ class TileMeasurements:
     weight: Float64
     photograph: npt.NDArray[np.int64]
     pixels: int
+    indirect: Float64
 
     def at(self, strength: Float64) -> TileMeasurements:
         """As they would be had the lamp been as strong as at white; ``strength`` of it in each photograph."""
-        return dataclasses.replace(self, ratio=self.ratio / strength[self.photograph][:, None])
+        # a stronger lamp throws more light at other surfaces, too
+        seen = (self.ratio + self.indirect) / strength[self.photograph][:, None]
+        return dataclasses.replace(self, ratio=seen - self.indirect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,26 +103,29 @@ def measure_tiles(
     total = _sums(white[inside], which, number)
     full = np.maximum(np.percentile(white[inside], 99, axis=0), 1e-12) if which.size else np.ones(3)
     used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
-    levels, ratios, weights, photographs = [], [], [], []
+    levels, ratios, weights, photographs, thrown = [], [], [], [], []
     for photograph, pattern in enumerate(tiles_patterns):
         shown = tile_levels(pattern, plan.size_px)
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
-        doubt = np.zeros((number, 3))
+        away = np.zeros((number, 3))
         if indirect is not None:
             known = indirect.of(shown)[inside]
             light -= known
-            doubt = DOUBT * _sums(known, which, number)
+            away = _sums(known, which, number)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = (_sums(light, which, number) / total)[used]
             variance = NOISE * (np.maximum(ratio, 0) + ratio**2 + 0.02) * full / total[used] + SYSTEMATIC**2
-            variance += (doubt / total)[used] ** 2
+            taken = (away / total)[used]
+            variance += (DOUBT * taken) ** 2
         measured = np.isfinite(ratio).all(axis=1)
         levels.append(_levels_of(shown, side)[used][measured])
         ratios.append(ratio[measured])
         weights.append(1 / variance[measured])
+        thrown.append(taken[measured])
         photographs.append(np.full(np.count_nonzero(measured), photograph, np.int64))
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    return TileMeasurements(np.concatenate(levels), ratio, weight, np.concatenate(photographs), int(which.size))
+    shown_in, away = np.concatenate(photographs), np.concatenate(thrown)
+    return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away)
 
 
 def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from controller.calibrate.photometry.colour_tiles import measure_tiles
+from controller.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, device_frame, plan_patterns
@@ -112,6 +112,32 @@ def test_a_lamp_that_flickers_between_the_photographs_bends_no_response(flicker:
     radiometry, report = measure_radiometry(captures, PLAN)
     assert max(off(radiometry, scene())) < 0.006
     assert report.flicker == pytest.approx(max(abs(change) for change in flicker), abs=0.004)
+
+
+def in_a_pale_room(flicker: tuple[float, ...]) -> tuple[Radiometry, float]:
+    """A third of white comes by way of other surfaces, and is known; what is found, and the flicker that is."""
+    captures, truth = dict(before_response(scene())), scene()
+    black, white = captures["black"], captures["white"] - captures["black"]
+    thrown = (white / 3).astype(np.float32)
+    captures["white"] = (black + white + thrown).astype(np.float32)
+    for pattern, change in zip(PLAN.of_kind(PatternKind.COLOUR_TILES), flicker, strict=True):
+        own = captures[pattern.name] - black
+        mean = own.mean(axis=(0, 1)) / white.mean(axis=(0, 1))
+        captures[pattern.name] = (black + (1 + change) * (own + thrown * mean)).astype(np.float32)
+    for pattern in PLAN.of_kind(PatternKind.GRAY):
+        captures[pattern.name] = (captures[pattern.name] + thrown / 2).astype(np.float32)
+    known = KnownIndirect(thrown, Radiometry(truth.response(), np.array(truth.mixing)))
+    radiometry, report = measure_radiometry(captures, PLAN, indirect=known)
+    return radiometry, report.flicker
+
+
+@pytest.mark.parametrize("flicker", [(0.03, 0.03, 0.03), (-0.03, -0.03, -0.03), (-0.04, -0.03, -0.04)])
+def test_a_lamp_that_flickers_throws_more_light_at_other_surfaces_too(flicker: tuple[float, ...]) -> None:
+    steady, _ = in_a_pale_room((0.0, 0.0, 0.0))
+    found, seen = in_a_pale_room(flicker)
+    at = 64
+    np.testing.assert_allclose(found.response[:, at], steady.response[:, at], rtol=0.01)
+    assert seen == pytest.approx(max(abs(change) for change in flicker), abs=0.01)
 
 
 @dataclass(frozen=True)
