@@ -86,7 +86,7 @@ class Caller:
             raise
         except BaseException as error:
             # A driver may also raise SystemExit and asyncio's cancellation, which are not Exceptions.
-            if isinstance(error, DeviceError) and _is_whole(error):
+            if isinstance(error, DeviceError) and _is_complete(error):
                 raise
             raise self.fault(f"raised {_described(error)} in {name}") from error
         if problem := mismatch(value, returns):
@@ -211,7 +211,7 @@ def _has(made: object, name: str) -> bool:
         return False
 
 
-def _is_whole(error: DeviceError) -> bool:
+def _is_complete(error: DeviceError) -> bool:
     """A subclass may have forgotten to call DeviceError's constructor."""
     return all(isinstance(getattr(error, name, None), str) for name in ("code", "what", "remedy"))
 

@@ -30,7 +30,7 @@ class DeviceWorker(ABC, Generic[Device]):
         self._device: Device | None = None
 
     @abstractmethod
-    def _found(self) -> Device:
+    def _open_device(self) -> Device:
         """The device, just opened."""
 
     def _prepare(self, device: Device) -> None:
@@ -59,7 +59,7 @@ class DeviceWorker(ABC, Generic[Device]):
 
     def _open(self) -> Device:
         if self._device is None:
-            device = self._found()
+            device = self._open_device()
             try:
                 self._prepare(device)
             except BaseException:

@@ -123,7 +123,7 @@ class WorkerLink(ABC, Generic[Opened]):
         for again in (False, True):
             try:
                 if worker.open is None:
-                    worker.open = self._found(deadline)
+                    worker.open = self._find_device(deadline)
                 deadline.sleep(0.0)  # the caller has given up: a relay must not move minutes later
                 return work(worker.open)
             except self._broken as error:
@@ -136,7 +136,7 @@ class WorkerLink(ABC, Generic[Opened]):
                 raise
         raise AssertionError
 
-    def _found(self, deadline: Deadline) -> Opened:
+    def _find_device(self, deadline: Deadline) -> Opened:
         """``find``, but what cannot be opened is given half of the time, at most 2 s, to leave the list or to open."""
         listed = deadline.within(min(_LISTED_S, deadline.left_s() / 2))
         while True:
@@ -151,7 +151,7 @@ class WorkerLink(ABC, Generic[Opened]):
         """Raises DeviceGone if the device was unplugged during the second attempt."""
         with contextlib.suppress(*self._broken):
             try:
-                worker.open = self._found(deadline)
+                worker.open = self._find_device(deadline)
             except DeviceError as error:
                 if isinstance(error, DeviceGone):
                     raise

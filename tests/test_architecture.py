@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 from collections import Counter
 from graphlib import TopologicalSorter
@@ -115,3 +116,13 @@ def imports() -> dict[str, set[str]]:
 
 def test_no_file_imports_itself_by_way_of_others() -> None:
     TopologicalSorter(imports()).prepare()  # raises CycleError, which names the files
+
+
+def test_every_kernel_of_the_tables_is_a_function_of_its_module() -> None:
+    missing = []
+    for table in (ROOT / top / "kernels.json" for top in ("controller", "plugins")):
+        for module, kernels in json.loads(table.read_text("utf-8")).items():
+            tree = ast.parse((ROOT / module.replace(".", "/")).with_suffix(".py").read_text("utf-8"))
+            functions = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+            missing += [f"{module}.{name}" for name in kernels if name.partition(".")[0] not in functions]
+    assert missing == []

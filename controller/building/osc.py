@@ -127,7 +127,7 @@ async def serve(options: OscOptions, verbs: Verbs) -> None:
     logging.getLogger().addFilter(_not_the_librarys)
     try:
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(_tell(channel, options.listeners, verbs))
+            tasks.create_task(_send_feedback(channel, options.listeners, verbs))
             while True:
                 datagram, source = await listener.waiting.get()
                 for verb, arguments in requests(datagram):
@@ -160,7 +160,7 @@ async def _answer(
         channel.sendto(message("error", verb[:40], "crash", "Export the diagnostics."), source)
 
 
-async def _tell(channel: asyncio.DatagramTransport, listeners: Sequence[Address], verbs: Verbs) -> None:
+async def _send_feedback(channel: asyncio.DatagramTransport, listeners: Sequence[Address], verbs: Verbs) -> None:
     """Send each value to the listeners when it has changed; all at the beginning."""
     last_sent: State = {}
     with changes(verbs) as changed:

@@ -137,7 +137,7 @@ class _Session:
             _LOG.debug("PJLink has no inputs.", exc_info=True)
         if lines.is_question(command):
             return lines.answer(command, self._verbs.status(), names, metadata.version("velatura"))
-        wanted = lines.meant(command, names)
+        wanted = lines.verb_for(command, names)
         if isinstance(wanted, str):
             return wanted
         try:

@@ -61,7 +61,7 @@ def inputs(names: Sequence[str]) -> dict[str, str]:
     return dict(zip(INPUTS, names, strict=False))
 
 
-def meant(command: Command, names: Sequence[str]) -> Wanted | str:
+def verb_for(command: Command, names: Sequence[str]) -> Wanted | str:
     """What a command that changes something means, or the error code of the specification (2.2)."""
     value = command.parameter
     shown = {code: Wanted("play", {"name": name}) for code, name in inputs(names).items()}

@@ -150,8 +150,8 @@ class PatternPlan:
                 found += [pattern, *(other for other in self.computed if other.opposite == pattern.name)]
         return tuple(found)
 
-    def tells_phase(self, prefix: str) -> bool:
-        """Whether the steps of a sinusoid tell its phase; one picture and its opposite tell only how strong it is."""
+    def measures_phase(self, prefix: str) -> bool:
+        """Whether the steps of a sinusoid give its phase; one picture and its opposite only give its strength."""
         return len(self.sinusoids(prefix)) > 2
 
 

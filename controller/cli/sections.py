@@ -26,6 +26,8 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Develop and study": ("emulate", "record", "study", "benchmark", "simulate", "states"),
 }  # fmt: skip
 OTHERS: Final = "More"
+LONGEST_SENTENCE: Final = 200
+"""Characters, far more than any first sentence has."""
 
 
 class Sections(TyperGroup):
@@ -35,14 +37,15 @@ class Sections(TyperGroup):
         names = self.list_commands(ctx)
         listed = {name for section in SECTIONS.values() for name in section}
         for title, section in {**SECTIONS, OTHERS: tuple(name for name in names if name not in listed)}.items():
-            rows = [(name, self._about(ctx, name, formatter)) for name in section if name in names]
+            rows = [(name, self._about(ctx, name)) for name in section if name in names]
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
-    def _about(self, ctx: Any, name: str, formatter: Any) -> str:
+    def _about(self, ctx: Any, name: str) -> str:
+        """The first sentence of its help, whole: half a sentence tells nothing."""
         command = self.get_command(ctx, name)
-        return "" if command is None else command.get_short_help_str(max(45, formatter.width - 20))
+        return "" if command is None else command.get_short_help_str(LONGEST_SENTENCE)
 
 
 def show_version(asked: bool) -> None:

@@ -26,13 +26,13 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
     try:
         yield
     finally:
-        _tell(reporter, "Switching the projectors off.")
+        _report(reporter, "Switching the projectors off.")
         # Before the state changes: a failing listener (a full disk under the journal) must not keep lamps lit.
         failures = power_down(rig.guards, within_s=power_down_s)
         for failure in failures:
-            _tell(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
+            _report(reporter, f"Projector {failure.projector} could not be switched off: {failure.error}", Level.ERROR)
         for name in (guard.name for guard in rig.guards if guard.by_hand):
-            _tell(reporter, f"Switch projector {name} off with its own remote control now.", Level.WARNING)
+            _report(reporter, f"Switch projector {name} off with its own remote control now.", Level.WARNING)
         if machine.allows(Event.STOP):
             machine.handle(Event.STOP, "the lamps are switched off")
         _cut_mains(rig, reporter)
@@ -50,12 +50,12 @@ def lit(rig: Rig, machine: Machine, *, power_down_s: float, reporter: Reporter) 
 def _cut_mains(rig: Rig, reporter: Reporter) -> None:
     if not rig.circuits:
         return
-    _tell(reporter, "Waiting until the lamps have cooled, to switch their mains off.")
+    _report(reporter, "Waiting until the lamps have cooled, to switch their mains off.")
     for stuck in open_circuits(rig.circuits, rig.guards):
-        _tell(reporter, f"The mains of relay {stuck.circuit} stay on: {stuck.error}", Level.WARNING)
+        _report(reporter, f"The mains of relay {stuck.circuit} stay on: {stuck.error}", Level.WARNING)
 
 
-def _tell(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
+def _report(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
     # A closed terminal or reader must not keep lamps lit.
     with contextlib.suppress(OSError, ValueError):
         reporter.say(text, level)

@@ -99,12 +99,12 @@ class Tracker:
     def begin(self, index: int) -> None:
         """Step ``index`` starts."""
         self._index, self._step_began_s, self._step_fraction = index, self._clock(), 0.0
-        self._tell(Phase.RUNNING)
+        self._report(Phase.RUNNING)
 
     def advance(self, step_fraction: float, note: str = "") -> None:
         """Progress of the present step (0..1); it never decreases."""
         self._step_fraction = min(1.0, max(step_fraction, self._step_fraction))
-        self._tell(Phase.RUNNING, note)
+        self._report(Phase.RUNNING, note)
 
     def end(self) -> None:
         """The present step is done."""
@@ -120,9 +120,9 @@ class Tracker:
     def _close(self, phase: Phase) -> None:
         self._passed += self._weights[self._index]
         self._step_fraction = 0.0
-        self._tell(phase)
+        self._report(phase)
 
-    def _tell(self, phase: Phase, note: str = "") -> None:
+    def _report(self, phase: Phase, note: str = "") -> None:
         now_s, total = self._clock(), sum(self._weights)
         running = self._weights[self._index] * self._step_fraction
         fraction = min(1.0, (self._passed + running) / total)

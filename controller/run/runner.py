@@ -138,12 +138,12 @@ class Runner:
             tracker.skip(index)
             return done
         tracker.begin(index)
-        self._tell(step.enter, step.heading)
+        self._report(step.enter, step.heading)
         began_at_s = time.time()
         context = Context(self._journal.folder, self._journal, deadline, self._reporter, dict(results), tracker.advance)
         paths = step.run(context)
         artefacts = self._journal.complete(step.id, inputs, paths, began_at_s=began_at_s)
-        self._tell(step.leave, step.heading)
+        self._report(step.leave, step.heading)
         tracker.end()
         return artefacts
 
@@ -155,7 +155,7 @@ class Runner:
         }
         return {**step.inputs, **made}
 
-    def _tell(self, event: Event | None, reason: str) -> None:
+    def _report(self, event: Event | None, reason: str) -> None:
         if self._machine is not None and event is not None:
             self._machine.handle(event, reason)
 

@@ -85,7 +85,7 @@ def calibrate(
         dark=True,
         before=lambda rig: device_checks(rig, prior),
     )
-    tell_grade(checked, run, last, reporter, accept_grade=accept_grade)
+    report_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
 
 
@@ -231,7 +231,7 @@ def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bo
     return run
 
 
-def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
+def report_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
     """After a calibration: warn if it is worse than the previous one, or not good enough to publish."""
     worst = worst_grade(checked)
     compare_with_last(run, last, reporter)
@@ -243,6 +243,16 @@ def tell_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporte
 
 
 __all__ = [
-    "KEY_FILE", "calibrate", "calibrating", "finished_calibration", "finished_calibrations", "make_appearances",
-    "output_sizes", "signing_key", "stage_trust", "tell_grade", "usable_calibration", "worst_grade",
+    "KEY_FILE",
+    "calibrate",
+    "calibrating",
+    "finished_calibration",
+    "finished_calibrations",
+    "make_appearances",
+    "output_sizes",
+    "report_grade",
+    "signing_key",
+    "stage_trust",
+    "usable_calibration",
+    "worst_grade",
 ]  # fmt: skip

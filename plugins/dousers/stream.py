@@ -44,7 +44,7 @@ class Stream:
             self._check(deadline)
             self._levels[channel] = level
             self._number += 1
-            self._tell()
+            self._publish_levels()
             self._await_sent(deadline)
 
     def verify(self, *, deadline: Deadline) -> None:
@@ -54,7 +54,7 @@ class Stream:
             if not self._levels:
                 return
             if self._running is None or self._running.ended:
-                self._tell()
+                self._publish_levels()
             self._await_sent(deadline)
 
     def end(self) -> None:
@@ -63,7 +63,7 @@ class Stream:
         if running is not None:
             running.end()
 
-    def _tell(self) -> None:
+    def _publish_levels(self) -> None:
         line = {"number": self._number, "levels": self._levels}
         before = self._running
         if before is not None and before.write(line):
@@ -80,7 +80,7 @@ class Stream:
             if running.ended and again:
                 # It ended in the moment in which it was written to.
                 again = False
-                self._tell()
+                self._publish_levels()
                 running = self._process()
                 continue
             if running.ended or patience.passed:

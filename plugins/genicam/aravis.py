@@ -72,7 +72,7 @@ class AravisCamera:
 
     def __init__(self, name: str) -> None:
         self._library = _loaded()
-        self._camera = self._ask("arv_camera_new", name.encode() or None)
+        self._camera = self._call("arv_camera_new", name.encode() or None)
         if not self._camera:
             raise _gone("none was found")
         self._take_control()
@@ -84,7 +84,7 @@ class AravisCamera:
         device, ends_s = self._library.arv_camera_get_device(self._camera), time.monotonic() + CONTROL_S
         while not self._library.arv_gv_device_is_controller(device):
             try:
-                self._ask("arv_gv_device_take_control", device)
+                self._call("arv_gv_device_take_control", device)
             except DeviceError:
                 if time.monotonic() > ends_s:
                     self.close()
@@ -93,41 +93,41 @@ class AravisCamera:
 
     def text(self, what: str) -> str:
         """``vendor_name``, ``model_name``, ``device_serial_number``, ``pixel_format_as_string``."""
-        return printable((self._ask(f"arv_camera_get_{what}", self._camera) or b"").decode(errors="replace"))
+        return printable((self._call(f"arv_camera_get_{what}", self._camera) or b"").decode(errors="replace"))
 
     def exposure_bounds_s(self) -> tuple[float, float]:
         low, high = c_double(), c_double()
-        self._ask("arv_camera_get_exposure_time_bounds", self._camera, byref(low), byref(high))
+        self._call("arv_camera_get_exposure_time_bounds", self._camera, byref(low), byref(high))
         return low.value / 1e6, high.value / 1e6
 
     def set_exposure(self, seconds: float) -> float:
         """Set it; return what the camera has then."""
-        self._ask("arv_camera_set_exposure_time", self._camera, c_double(1e6 * seconds))
-        return float(self._ask("arv_camera_get_exposure_time", self._camera)) / 1e6
+        self._call("arv_camera_set_exposure_time", self._camera, c_double(1e6 * seconds))
+        return float(self._call("arv_camera_get_exposure_time", self._camera)) / 1e6
 
     def formats(self) -> list[str]:
         """The names of its pixel formats."""
         count = c_uint()
-        names = self._ask("arv_camera_dup_available_pixel_formats_as_strings", self._camera, byref(count))
+        names = self._call("arv_camera_dup_available_pixel_formats_as_strings", self._camera, byref(count))
         try:
             return [printable(names[at].decode(errors="replace")) for at in range(count.value)]
         finally:
             self._library.g_free(names)
 
     def set_format(self, name: str) -> None:
-        self._ask("arv_camera_set_pixel_format_from_string", self._camera, name.encode())
+        self._call("arv_camera_set_pixel_format_from_string", self._camera, name.encode())
 
     def has(self, feature: str) -> bool:
-        return bool(self._ask("arv_camera_is_feature_available", self._camera, feature.encode()))
+        return bool(self._call("arv_camera_is_feature_available", self._camera, feature.encode()))
 
     def choose(self, feature: str, value: str) -> None:
         """Set an enumeration, where the camera has it."""
         if self.has(feature):
-            self._ask("arv_camera_set_string", self._camera, feature.encode(), value.encode())
+            self._call("arv_camera_set_string", self._camera, feature.encode(), value.encode())
 
     def frame(self, seconds: float) -> Frame:
         """One image, exposed after this call began."""
-        buffer = self._ask("arv_camera_acquisition", self._camera, c_uint64(int(1e6 * max(seconds, 0.001))))
+        buffer = self._call("arv_camera_acquisition", self._camera, c_uint64(int(1e6 * max(seconds, 0.001))))
         if not buffer:
             raise _late()
         try:
@@ -149,14 +149,14 @@ class AravisCamera:
         if camera:
             self._library.g_object_unref(camera)
 
-    def _ask(self, name: str, *arguments: Any) -> Any:
+    def _call(self, name: str, *arguments: Any) -> Any:
         """Call a function whose last parameter takes a GError."""
         error = POINTER(_Error)()
         result = getattr(self._library, name)(*arguments, ctypes.cast(ctypes.pointer(error), c_void_p))
         if error:
             code, said = error.contents.code, (error.contents.message or b"").decode(errors="replace")
             self._library.g_error_free(ctypes.cast(error, c_void_p))
-            raise _meant(code, printable(said))
+            raise _device_error(code, printable(said))
         return result
 
 
@@ -178,7 +178,7 @@ def _loaded() -> Any:
     return library
 
 
-def _meant(code: int, said: str) -> DeviceError:
+def _device_error(code: int, said: str) -> DeviceError:
     if code == _TIMEOUT:
         return _late()
     if code in _GONE:

@@ -58,7 +58,7 @@ class Worker(DeviceWorker[AravisCamera]):
     def capture(self, destination: Path, seconds: float) -> list[CapturedFile]:
         camera = self._open()
         assert self._pixels is not None
-        frame = _whole_frame(camera, seconds)
+        frame = _complete_frame(camera, seconds)
         data = encoded(
             frame.data,
             (frame.width_px, frame.height_px),
@@ -72,7 +72,7 @@ class Worker(DeviceWorker[AravisCamera]):
             file.write(memoryview(data))
             return commit_all([file])
 
-    def _found(self) -> AravisCamera:
+    def _open_device(self) -> AravisCamera:
         return AravisCamera(self._name)
 
     def _prepare(self, device: AravisCamera) -> None:
@@ -103,7 +103,7 @@ class Worker(DeviceWorker[AravisCamera]):
         return [round(time_s, 6) for time_s in _THIRDS if low_s <= round(time_s, 6) <= high_s]
 
 
-def _whole_frame(camera: AravisCamera, seconds: float) -> Frame:
+def _complete_frame(camera: AravisCamera, seconds: float) -> Frame:
     """A frame of which no packet was lost. Another one costs nothing: there is no shutter that wears out."""
     ends_s = time.monotonic() + seconds
     while True:

@@ -83,7 +83,7 @@ class Worker(DeviceWorker[Opened]):
             lost = name == "capture" and isinstance(translation, DeviceGone | DeviceTimeout)
             raise (shot_lost(translation) if lost else translation) from error
 
-    def _found(self) -> Opened:
+    def _open_device(self) -> Opened:
         failure: DeviceError = DeviceGone(
             "camera-off",
             what=f"libgphoto2 finds no camera{f' at {self._port}' if self._port else ''}.",

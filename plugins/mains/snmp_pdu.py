@@ -45,7 +45,7 @@ class SnmpPdu:
         self._values = {True: on, False: off}
 
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        reply = self._outlets.run(self._asked(_DESCRIPTION), deadline)
+        reply = self._outlets.run(self._request(_DESCRIPTION), deadline)
         words = "".join(character for character in str(reply) if character.isprintable()).strip()
         return DeviceIdentity("", words[:80] or "PDU")
 
@@ -56,7 +56,7 @@ class SnmpPdu:
     def state(self, channel: int, *, deadline: Deadline) -> bool:
         """See ``hal.interfaces.PowerSwitch.state``. Raises DeviceRefused("relay-no-channel") and ProtocolError."""
         self._outlets.require(channel)
-        value = self._outlets.run(self._asked(self._oid(channel)), deadline)
+        value = self._outlets.run(self._request(self._oid(channel)), deadline)
         for closed, number in self._values.items():
             if str(value) == str(number):
                 return closed
@@ -70,7 +70,7 @@ class SnmpPdu:
         """Switch an outlet, and check it; no effect if it is so already. Raises DeviceRefused("relay-stuck") too."""
         if self.state(channel, deadline=deadline) is closed:
             return
-        self._outlets.run(self._asked(self._oid(channel), self._values[closed]), deadline)
+        self._outlets.run(self._request(self._oid(channel), self._values[closed]), deadline)
         patience = deadline.within(_SETTLE_S)
         while self.state(channel, deadline=deadline) is not closed:
             if patience.passed:
@@ -83,7 +83,7 @@ class SnmpPdu:
     def _oid(self, channel: int) -> str:
         return f"{self._column}.{channel}"
 
-    async def _asked(self, oid: str, value: int | None = None) -> object:
+    async def _request(self, oid: str, value: int | None = None) -> object:
         """The value of an object, after it was set to ``value`` if that is given. A set is sent once only."""
         from pysnmp.hlapi.v1arch import asyncio as snmp
         from pysnmp.proto.rfc1902 import Integer32

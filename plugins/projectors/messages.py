@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hal.codecs.projectors.json_rpc import OBJECT_END, is_whole
+from hal.codecs.projectors.json_rpc import OBJECT_END, is_complete
 from hal.codecs.projectors.serial_protocol import head_bytes, rest_bytes
 from hal.codecs.projectors.serial_table import Frame, SerialTable
 from hal.deadline import Deadline
@@ -24,7 +24,7 @@ def _framed(link: ByteLink, frame: Frame, longest: int, deadline: Deadline) -> b
 def _object(link: ByteLink, table: SerialTable, deadline: Deadline) -> bytes:
     """A JSON object, up to the brace that closes it."""
     data = link.read_until(OBJECT_END, limit=table.longest_answer, deadline=deadline)
-    while not is_whole(data) and len(data) < table.longest_answer:
+    while not is_complete(data) and len(data) < table.longest_answer:
         data += link.read_until(OBJECT_END, limit=table.longest_answer - len(data), deadline=deadline)
     return data
 

@@ -24,7 +24,7 @@ from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorSt
 from plugins.projectors.network.device_server import open_url
 from plugins.projectors.optional_answers import OptionalAnswers
 from plugins.projectors.serial_conversation import COOLS, SERIAL_CHECK, SerialConversation
-from plugins.projectors.serial_settings import checked_address, read_settings, serial_table, told_powers
+from plugins.projectors.serial_settings import checked_address, read_settings, reported_powers, serial_table
 
 T = TypeVar("T")
 _FIELDS: Final = {"lamp_hours": "lamp hours"}
@@ -58,7 +58,7 @@ class SerialProjector:
         self._name = name
         self._profile = profile
         self._table = table
-        self._view = PowerView(profile.lamp, told_powers(table))
+        self._view = PowerView(profile.lamp, reported_powers(table))
         self._lock = threading.Lock()
         self._transcript = transcript
         self._open_link = open_link
@@ -92,7 +92,7 @@ class SerialProjector:
         now_s = time.monotonic()
         if self._view.in_transition(now_s):
             return True
-        if Power.WARMING in told_powers(self._table):
+        if Power.WARMING in reported_powers(self._table):
             return not self._answered
         return now_s - self._opened_at_s < self._profile.lamp.warm_up_s
 
@@ -192,7 +192,7 @@ class SerialProjector:
 
     def _power(self, deadline: Deadline) -> Power:
         if "power" not in self._table.queries:
-            return self._power_untold(deadline)
+            return self._power_without_codes(deadline)
         try:
             answer = parse_power(self._talk.query("power", deadline=deadline))
         except DeviceBusy as busy:
@@ -202,7 +202,7 @@ class SerialProjector:
         self._answered = True
         return self._view.answered(answer, time.monotonic())
 
-    def _power_untold(self, deadline: Deadline) -> Power:
+    def _power_without_codes(self, deadline: Deadline) -> Power:
         """The power state if the family has no query for it: any other query shows that it is there, or cools."""
         try:
             self._talk.query(next(iter(self._table.queries)), deadline=deadline)

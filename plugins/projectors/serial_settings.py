@@ -26,7 +26,7 @@ def serial_table(profile: ProjectorProfile) -> SerialTable:
     return profile.serial
 
 
-def told_powers(table: SerialTable) -> frozenset[Power]:
+def reported_powers(table: SerialTable) -> frozenset[Power]:
     """The power states in this family's answers."""
     values = table.queries["power"].values if "power" in table.queries else {}
     return frozenset(Power(word) for word in values.values())

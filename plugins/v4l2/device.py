@@ -13,7 +13,7 @@ from typing import Final
 
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout
 from plugins.v4l2 import kernel
-from plugins.v4l2.formats import COMPRESSED, VideoFormat, code_of, number_of, whole_jpeg
+from plugins.v4l2.formats import COMPRESSED, VideoFormat, code_of, is_complete_jpeg, number_of
 from plugins.v4l2.nodes import VideoNode, identify
 
 _BUFFERS: Final = 4
@@ -32,7 +32,7 @@ class VideoDevice:
         try:
             self._handle = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            raise kernel.meant(error) from error
+            raise kernel.device_error(error) from error
         try:
             found = identify(path, self._handle)
             if found is None:
@@ -153,7 +153,7 @@ class VideoDevice:
             for index in range(len(self._maps)):
                 kernel.call(self._handle, kernel.QBUF, self._buffer(index))
             kernel.call(self._handle, kernel.STREAMON, c_int32(kernel.CAPTURE))
-            return self._whole(skip, ends_s)
+            return self._complete_frame(skip, ends_s)
         finally:
             self._stop()
 
@@ -166,12 +166,12 @@ class VideoDevice:
             try:
                 self._maps.append(mmap.mmap(self._handle, one.length, offset=one.m.offset))
             except OSError as error:
-                raise kernel.meant(error) from error
+                raise kernel.device_error(error) from error
 
     def _buffer(self, index: int) -> kernel.Buffer:
         return kernel.Buffer(index=index, type=kernel.CAPTURE, memory=kernel.MMAP)
 
-    def _whole(self, skip: int, ends_s: float) -> bytes:
+    def _complete_frame(self, skip: int, ends_s: float) -> bytes:
         watch = select.poll()
         watch.register(self._handle, select.POLLIN)
         cut = 0
@@ -182,7 +182,7 @@ class VideoDevice:
             one = kernel.Buffer(type=kernel.CAPTURE, memory=kernel.MMAP)
             kernel.call(self._handle, kernel.DQBUF, one)
             data = self._maps[one.index][: one.bytesused]
-            if one.flags & kernel.BAD_FRAME or not self._is_whole(data):
+            if one.flags & kernel.BAD_FRAME or not self._is_complete(data):
                 cut += 1
             elif skip:
                 skip -= 1
@@ -190,9 +190,9 @@ class VideoDevice:
                 return self._rows(data)
             kernel.call(self._handle, kernel.QBUF, self._buffer(one.index))
 
-    def _is_whole(self, data: bytes) -> bool:
+    def _is_complete(self, data: bytes) -> bool:
         if self.format.code in COMPRESSED:
-            return whole_jpeg(data)
+            return is_complete_jpeg(data)
         columns, rows = self.size_px
         row = columns * self.format.bytes_per_pixel
         return len(data) >= max(self._row_bytes, row) * (rows - 1) + row

@@ -73,7 +73,7 @@ def number_of(code: str) -> int:
     return int.from_bytes(code.encode("ascii"), "little")
 
 
-def whole_jpeg(data: bytes) -> bool:
+def is_complete_jpeg(data: bytes) -> bool:
     """Whether a frame of Motion JPEG begins and ends as one; after its end may be zeros."""
     return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
 

@@ -155,7 +155,7 @@ def call(handle: int, request: int, argument: ctypes.Structure | c_int32) -> Non
     try:
         fcntl.ioctl(handle, request, argument)
     except OSError as error:
-        raise meant(error) from error
+        raise device_error(error) from error
 
 
 def answered(handle: int, request: int, argument: ctypes.Structure) -> bool:
@@ -167,7 +167,7 @@ def answered(handle: int, request: int, argument: ctypes.Structure) -> bool:
     return True
 
 
-def meant(error: OSError) -> DeviceError:
+def device_error(error: OSError) -> DeviceError:
     """What an error of the kernel says about the camera."""
     if error.errno in _GONE:
         return DeviceGone(

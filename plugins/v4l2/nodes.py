@@ -37,7 +37,7 @@ def opened(path: Path) -> Iterator[int]:
     try:
         handle = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
-        raise kernel.meant(error) from error
+        raise kernel.device_error(error) from error
     try:
         yield handle
     finally:
@@ -71,7 +71,7 @@ def identify(path: Path, handle: int) -> VideoNode | None:
         return None
     driver, card, bus = (printable(text.decode(errors="replace")) for text in (told.driver, told.card, told.bus_info))
     usb = _CLASS / path.resolve().name / "device" / ".."
-    return VideoNode(path, driver, _told(usb / "manufacturer") or driver, card, _told(usb / "serial"), bus)
+    return VideoNode(path, driver, _text_of(usb / "manufacturer") or driver, card, _text_of(usb / "serial"), bus)
 
 
 def chosen(address: str, serial: str, bus: str) -> VideoNode:
@@ -111,7 +111,7 @@ def chosen(address: str, serial: str, bus: str) -> VideoNode:
     )
 
 
-def _told(file: Path) -> str:
+def _text_of(file: Path) -> str:
     try:
         return printable(file.read_text("utf-8", "replace").strip()[:_LONGEST])
     except OSError:

@@ -73,7 +73,7 @@ class Worker(DeviceWorker[VideoDevice]):
             file.write(memoryview(data))
             return commit_all([file])
 
-    def _found(self) -> VideoDevice:
+    def _open_device(self) -> VideoDevice:
         return VideoDevice(chosen(self._settings.address, self._serial, self._bus).path)
 
     def _prepare(self, device: VideoDevice) -> None:

@@ -336,7 +336,7 @@ def _levels() -> tuple[bytes, ...]:
 
 def _pjlink_asked(data: bytes) -> None:
     if (command := pjlink_lines.parse_command(data)) is not None:
-        pjlink_lines.meant(command, ("marble", "warm wood"))
+        pjlink_lines.verb_for(command, ("marble", "warm wood"))
 
 
 _ARTNET: Final = (
@@ -349,7 +349,7 @@ _JSON_RPC: Final = (
 
 
 def _json_rpc(data: bytes) -> None:
-    json_rpc.is_whole(data)
+    json_rpc.is_complete(data)
     json_rpc.parse_message(data, json_rpc.json_bytes("property.get system.state", 7))
 
 

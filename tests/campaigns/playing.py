@@ -77,12 +77,12 @@ def in_windows(swaps: int, *, width: int, height: int, mode: str) -> Found:
         settings = PlayerSettings(outputs, None, bundle=place / "b.vel", allow_unsigned=True, where=where)
         with start_player(place, settings) as player, Wire(player.socket) as wire:
 
-            def is_whole() -> bool:
+            def is_complete() -> bool:
                 # Reading costs what drawing costs, so not too often.
                 time.sleep(0.2)
                 return server.picture(0, len(NAMES) * width, height).tobytes() in known
 
-            return _watch(wire, player.pid, RATE_HZ, swaps, FEW, is_whole)
+            return _watch(wire, player.pid, RATE_HZ, swaps, FEW, is_complete)
 
 
 def whole(pictures: Pictures) -> bytes:
@@ -97,7 +97,7 @@ def _bundle(place: Path, outputs: list[tuple[str, int, int]], count: int) -> lis
     return sets
 
 
-def _watch(wire: Wire, pid: int, rate_hz: float, swaps: int, count: int, is_whole: Callable[[], bool],
+def _watch(wire: Wire, pid: int, rate_hz: float, swaps: int, count: int, is_complete: Callable[[], bool],
            *, fewest_read: int = 1) -> Found:  # fmt: skip
     wire.ask("sequence", items=[[str(number), 1 / rate_hz] for number in range(count)], rate_hz=rate_hz)
     # Until every set that is kept has been decoded once, memory grows.
@@ -108,7 +108,7 @@ def _watch(wire: Wire, pid: int, rate_hz: float, swaps: int, count: int, is_whol
     read = mixed = 0
     while (status := wire.ask("status"))["swaps"] - begin < swaps or read < fewest_read:
         for _ in range(10):
-            read, mixed = read + 1, mixed + (not is_whole())
+            read, mixed = read + 1, mixed + (not is_complete())
     return Found(
         passed=status["swaps"] - begin,
         read=read,

@@ -148,7 +148,7 @@ def _add_up(
     first, total, square = (np.zeros(shape, np.float32) for _ in range(3))
     mean = np.zeros(shape, np.float32)
     for number, prefix in enumerate(WAVES):
-        if not plan.tells_phase(prefix):
+        if not plan.measures_phase(prefix):
             continue
         light = np.zeros(shape, np.float32)
         steps = plan.sinusoids(prefix)

@@ -97,7 +97,7 @@ def _contrast(
     images = [grey(captures, pattern.name, black.shape) for pattern in steps]
     # a wave of which a step is missing would have another contrast
     whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
-    alone = not plan.tells_phase(prefix)
+    alone = not plan.measures_phase(prefix)
     for pattern, image in zip(steps, images, strict=True):
         _add_step(image, black, position, whole, along, pattern.phase_rad, alone, wave, light)
     # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4; one step and its opposite

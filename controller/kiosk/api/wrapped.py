@@ -16,8 +16,8 @@ def wrapped(run: Path, names: tuple[str, ...], picture: Path) -> bytes:
 
     from controller.artefacts.calibrated import Calibrated
     from controller.solve.targets.values import linear_to_srgb
-    from controller.steps.appearance.requests import made_target
+    from controller.steps.appearance.requests import make_target
 
-    made = made_target("photograph", picture, {}, Calibrated(run, names))
+    made = make_target("photograph", picture, {}, Calibrated(run, names))
     seen = np.rint(255 * np.dstack([linear_to_srgb(made.image), made.mask])).astype(np.uint8)
     return cv2.imencode(".png", cv2.cvtColor(seen, cv2.COLOR_RGBA2BGRA))[1].tobytes()

@@ -162,7 +162,7 @@ OPERATIONS: Final[tuple[Operation, ...]] = (
     Operation("lamp-history", "Hours and strikes of each lamp, day by day", VIEWER, LOOKS, offline=True,
               http=("GET", "/lamps"), command="lamps"),
     # -- jobs
-    Operation("recalibrate", "Start a calibration", OPERATOR, WORKS, (_FULL_OR_QUICK, _ONE_PROJECTOR),
+    Operation("recalibrate", "Calibrate on the running kiosk", OPERATOR, WORKS, (_FULL_OR_QUICK, _ONE_PROJECTOR),
               http=("POST", "/recalibrations"), said="The recalibration has started."),
     Operation("cancel", "End the running job at its next safe point", OPERATOR, CHANGES, answer=Answer.NOTHING,
               said="The job ends at its next safe point."),

@@ -54,7 +54,7 @@ class Commands:
         ticket = None
         try:
             ticket, request = protocol.parse_request(line)
-            values = self._do(request, partial(self._tell, client, ticket))
+            values = self._do(request, partial(self._answer, client, ticket))
             if not isinstance(request, protocol.Hello | protocol.Status | protocol.LoadBundle):
                 self._kept.accepted(request, line)
         except protocol.InvalidRequest as error:
@@ -65,7 +65,7 @@ class Commands:
             if values is not None:
                 self._server.send(client, protocol.answer_line(ticket, values))
 
-    def _tell(self, client: Client, ticket: Any, outcome: PresentedSet | VelaturaError) -> None:
+    def _answer(self, client: Client, ticket: Any, outcome: PresentedSet | VelaturaError) -> None:
         if isinstance(outcome, VelaturaError):
             self._server.send(client, protocol.error_line(ticket, outcome))
         else:

@@ -153,7 +153,7 @@ def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is not JSON")
 
 
-def _whole(value: Any, key: str, most: int) -> int:
+def _integer(value: Any, key: str, most: int) -> int:
     if type(value) is not int or not 0 <= value <= most:
         raise ValueError(f"{key} is not a whole number from 0 to {most}")
     return value
@@ -172,7 +172,7 @@ def _text(value: Any, key: str) -> str:
 
 
 def _show(*, sequence: Any) -> Show:
-    return Show(_whole(sequence, "sequence", 2**64 - 1))
+    return Show(_integer(sequence, "sequence", 2**64 - 1))
 
 
 def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0) -> Play:
@@ -202,7 +202,7 @@ def _sequence(
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
     return Sequence(
         items=tuple(_item(item) for item in items),
-        repeat=_whole(repeat, "repeat", 2**31),
+        repeat=_integer(repeat, "repeat", 2**31),
         rate_hz=None if rate_hz is None else _number(rate_hz, "rate_hz", MAX_RATE_HZ),
         brightness=_share(brightness),
         first_fade_s=None if first_fade_s is None else _fade(first_fade_s),
@@ -210,7 +210,7 @@ def _sequence(
 
 
 def _suggested(*, repeat: Any = 0) -> Suggested:
-    return Suggested(_whole(repeat, "repeat", 2**31))
+    return Suggested(_integer(repeat, "repeat", 2**31))
 
 
 def _item(item: Any) -> tuple[str, float, float]:

@@ -103,7 +103,7 @@ def _publish(
 ) -> Sequence[Path]:
     built, slots = context.folder / BUNDLE, folder / "bundles"
     names = kept_names(folder, context.folder, names)
-    _tell_dropped(slots, names, context.reporter)
+    _report_dropped(slots, names, context.reporter)
     trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
     if (warning := unsigned_warning(trusted[0] if trusted else None, Trust(trusted, not trusted))) is not None:
         context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
@@ -120,7 +120,7 @@ def _publish(
     return [figures.write(context.folder), built]
 
 
-def _tell_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
+def _report_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
     """Report appearances of the installed bundle that the new one lacks, because they have another calibration."""
     dropped = [
         appearance.name

@@ -81,7 +81,7 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
 
     def target() -> Target:
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
-        return made_target(table.kind, file, arguments, calibrated)
+        return make_target(table.kind, file, arguments, calibrated)
 
     return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
 
@@ -133,7 +133,7 @@ def _check_picture(
     check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
 
 
-def made_target(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
+def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
     """The target of a ``kind`` with its checked ``options``, on a calibrated object. Raises UsageError."""
     mask = calibrated.transport.object_mask
     options = dict(options)

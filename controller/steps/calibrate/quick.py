@@ -62,7 +62,7 @@ def quick_steps(
     steps.append(
         Step(
             StepId(StepKind.PLAN),
-            _tell,
+            _report,
             after=(StepId(StepKind.DRIFT),),
             title="Choosing what to repeat",
             weight=0.01,
@@ -77,7 +77,7 @@ def quick_steps(
     return steps
 
 
-def _tell(context: Context) -> Sequence[Path]:
+def _report(context: Context) -> Sequence[Path]:
     """Report the drift. Raises CalibrationError("projector-dark") if no calibration would help."""
     drift = read_drift(context.folder)
     found = sentences(drift)

@@ -44,7 +44,7 @@ def json_bytes(template: str, number: int) -> bytes:
     return json.dumps(request).encode("ascii")
 
 
-def is_whole(data: bytes) -> bool:
+def is_complete(data: bytes) -> bool:
     """Whether ``data``, which ends in a brace, is a whole object."""
     return _loaded(data) is not None
 

@@ -25,7 +25,7 @@ class NetworkTable:
 def parse_network(table: Table) -> NetworkTable:
     """Read the table. Raises ProtocolError("profile-wrong")."""
     made = NetworkTable(
-        port=table.whole("port", 1, 65_535),
+        port=table.integer("port", 1, 65_535),
         login=table.choice("login", LOGINS, "none"),
         user=table.string("user", ""),
     )

@@ -138,10 +138,10 @@ def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
         raise line.wrong("address", f"{address!r} may have only letters and digits")
     replies = root.table("replies", required=notation != "json")
     made = SerialTable(
-        baud=0 if root.has("network") and not line.has("baud") else line.whole("baud", 300, 921_600),
+        baud=0 if root.has("network") and not line.has("baud") else line.integer("baud", 300, 921_600),
         terminator=terminator,
         address=address,
-        longest_answer=line.whole("longest_answer", 4, 4096),
+        longest_answer=line.integer("longest_answer", 4, 4096),
         commands=_commands(root.table("commands"), unknown, binary),
         queries=_queries(root.table("queries"), unknown, binary),
         accepted=_shapes(replies, "accepted", binary, required=notation != "json"),
@@ -161,16 +161,16 @@ def parse_serial(root: Table, unknown: tuple[str, ...]) -> SerialTable:
 
 def _frame(table: Table) -> Frame:
     if table.has("lengths"):
-        lengths = table.wholes("lengths", 1, 255)
+        lengths = table.integers("lengths", 1, 255)
         if wrong := [key for key in lengths if not re.fullmatch(_BYTE, key)]:
             raise table.wrong("lengths", f"{wrong[0]!r} is not a byte such as 1D")
         made = Frame(0, False, 1, "none", {int(key, 16): length for key, length in lengths.items()})
         table.finish()
         return made
     made = Frame(
-        count_at=table.whole("count_at", 0, 64),
+        count_at=table.integer("count_at", 0, 64),
         hexadecimal=table.choice("count", ("byte", "hex")) == "hex",
-        overhead=table.whole("overhead", 1, 64),
+        overhead=table.integer("overhead", 1, 64),
         checksum=table.choice("checksum", ("sum", "sum-but-first", "none")),
     )
     if made.overhead <= made.count_at:

@@ -45,7 +45,7 @@ class Table:
     def string(self, key: str, default: str | None = None) -> str:
         return str(self._value(key, str, "a string", default))
 
-    def whole(self, key: str, low: int, high: int, default: int | None = None) -> int:
+    def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
         value = self._value(key, int, "a whole number", default)
         if not low <= value <= high:
             raise self.wrong(key, f"{value} is not between {low} and {high}")
@@ -91,11 +91,11 @@ class Table:
                 raise inner.wrong(name, f"{value!r} is not one of {', '.join(allowed)}")
         return dict(values)
 
-    def wholes(self, key: str, low: int, high: int) -> dict[str, int]:
+    def integers(self, key: str, low: int, high: int) -> dict[str, int]:
         """A table of whole numbers, each between ``low`` and ``high``."""
         values = self._value(key, dict, "a table", None)
         inner = Table(values, (*self._path, key), self._text, self._file)
-        return {name: inner.whole(name, low, high) for name in values}
+        return {name: inner.integer(name, low, high) for name in values}
 
     def table(self, key: str, *, required: bool = True) -> Table:
         values = self._value(key, dict, "a table", None if required else {})

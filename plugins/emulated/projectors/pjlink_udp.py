@@ -66,17 +66,17 @@ class EmulatedPjLinkUdp:
 
     def select_input(self, name: str) -> None:
         """Somebody chose another input by the projector's own keys."""
-        self._tell(b"%2INPT=" + name.encode("ascii") + b"\r")
+        self._send(b"%2INPT=" + name.encode("ascii") + b"\r")
 
     def _run(self) -> None:
         before = self._state()
-        self._tell(b"%2LKUP=" + self._mac + b"\r")
+        self._send(b"%2LKUP=" + self._mac + b"\r")
         while not self._stop.is_set():
             self._answer()
             now = self._state()
             for line, old in zip(now, before, strict=True):
                 if line != old:
-                    self._tell(line)
+                    self._send(line)
             before = now
 
     def _state(self) -> tuple[bytes, bytes]:
@@ -89,7 +89,7 @@ class EmulatedPjLinkUdp:
             if data == b"%2SRCH\r" and not self._stop.wait(self._answer_after_s):
                 self._socket.sendto(b"%2ACKN=" + self._mac + b"\r", sender)
 
-    def _tell(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         if self._controller is not None:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, self._controller)

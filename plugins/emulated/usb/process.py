@@ -55,48 +55,48 @@ class UsbBusProcess:
 
     def add(self, name: str, kind: str, **settings: Any) -> None:
         """Make a device and plug it in; ``kind``: one of ``KINDS``, or the place of a class, ``module:Class``."""
-        self._ask({"do": "add", "name": name, "kind": kind, "settings": settings})
+        self._request({"do": "add", "name": name, "kind": kind, "settings": settings})
 
     def play(self, name: str, scenario: str) -> None:
         """Play the events of a TOML scenario (see ``plugins.emulated.scenario``) on a device."""
-        self._ask({"do": "play", "name": name, "scenario": scenario})
+        self._request({"do": "play", "name": name, "scenario": scenario})
 
     def rest(self, name: str) -> None:
         """End the scenario of a device; what it has done stays done."""
-        self._ask({"do": "rest", "name": name})
+        self._request({"do": "rest", "name": name})
 
     def happened(self, name: str) -> list[list[Any]]:
         """What a scenario has done so far: [seconds, deed] each."""
-        happened: list[list[Any]] = self._ask({"do": "happened", "name": name})
+        happened: list[list[Any]] = self._request({"do": "happened", "name": name})
         return happened
 
     def plug(self, name: str) -> None:
-        self._ask({"do": "plug", "name": name})
+        self._request({"do": "plug", "name": name})
 
     def unplug(self, name: str) -> None:
-        self._ask({"do": "unplug", "name": name})
+        self._request({"do": "unplug", "name": name})
 
     def forget(self, name: str) -> None:
         """Unplug a device for good."""
-        self._ask({"do": "forget", "name": name})
+        self._request({"do": "forget", "name": name})
 
     def clear(self) -> None:
         """Unplug every device for good."""
-        self._ask({"do": "clear", "name": ""})
+        self._request({"do": "clear", "name": ""})
 
     def set(self, name: str, knob: str, value: Any) -> None:
         """Turn a knob, e.g. ``faults.silent`` or ``lux``."""
-        self._ask({"do": "set", "name": name, "knob": knob, "value": value})
+        self._request({"do": "set", "name": name, "knob": knob, "value": value})
 
     def get(self, name: str, knob: str) -> Any:
-        return self._ask({"do": "get", "name": name, "knob": knob})
+        return self._request({"do": "get", "name": name, "knob": knob})
 
     def call(self, name: str, method: str, *arguments: Any) -> Any:
-        return self._ask({"do": "call", "name": name, "method": method, "arguments": arguments})
+        return self._request({"do": "call", "name": name, "method": method, "arguments": arguments})
 
     def bus(self, question: str, name: str) -> Any:
         """``address_of`` or ``driver_bound``."""
-        return self._ask({"do": "bus", "name": name, "question": question})
+        return self._request({"do": "bus", "name": name, "question": question})
 
     def close(self) -> None:
         if self._process.stdin is not None:
@@ -115,7 +115,7 @@ class UsbBusProcess:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, command: Mapping[str, Any]) -> Any:
+    def _request(self, command: Mapping[str, Any]) -> Any:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:

@@ -223,9 +223,9 @@ class EosBody:
             wanted = now if now != Destination.HOST or not cards else cards[0]
         self._talk.set(EosProperty.CAPTURE_DESTINATION, wanted, deadline, again=again)
         if wanted == Destination.HOST and self._channel.has(Operation.EOS_HOST_CAPACITY):
-            self._tell_space(deadline)
+            self._send_free_space(deadline)
 
-    def _tell_space(self, deadline: Deadline) -> None:
+    def _send_free_space(self, deadline: Deadline) -> None:
         """Some bodies refuse it and expose all the same; one that needs it refuses the release, with its reason."""
         try:
             self._channel.request(

@@ -152,7 +152,7 @@ class PtpUsbLink:
     def _status(self) -> int | None:
         """The code of its status; None if the camera does not support the request."""
         try:
-            return ptp_usb.parse_status(self._pipes.ask_request(ClassRequest.STATUS, 64, _REQUEST_S)).code
+            return ptp_usb.parse_status(self._pipes.class_request(ClassRequest.STATUS, 64, _REQUEST_S)).code
         except (PipeStalled, ProtocolError):
             return None
 

@@ -42,7 +42,7 @@ class Pipes(Protocol):
 
     def send_request(self, request: ClassRequest, data: bytes, seconds: float) -> None: ...
 
-    def ask_request(self, request: ClassRequest, count: int, seconds: float) -> bytes: ...
+    def class_request(self, request: ClassRequest, count: int, seconds: float) -> bytes: ...
 
     def clear_halts(self) -> None:
         """Make halted bulk pipes work again."""
@@ -112,7 +112,7 @@ class PyusbPipes:
     def send_request(self, request: ClassRequest, data: bytes, seconds: float) -> None:
         self._control(_CLASS_OUT, request, data, seconds)
 
-    def ask_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
+    def class_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
         return bytes(self._control(_CLASS_IN, request, count, seconds))
 
     def clear_halts(self) -> None:

@@ -190,7 +190,7 @@ def test_every_line_gets_one_line_that_is_no_more_than_the_longest(line: bytes, 
     if command is None:
         return
     now = KioskState(1, name, "playing", "", 0.0, playing=name)
-    told = lines.answer(command, now, [name], "0.1") if lines.is_question(command) else lines.meant(command, [name])
+    told = lines.answer(command, now, [name], "0.1") if lines.is_question(command) else lines.verb_for(command, [name])
     if isinstance(told, str):
         answer = command.answer(told)
         assert answer.count(b"\r") == 1

@@ -16,7 +16,7 @@ from hal.errors import PluginError
 from hal.registry import OpenContext, check_device
 from plugins.v4l2 import kernel
 from plugins.v4l2.camera import DRIVER
-from plugins.v4l2.formats import code_of, jpeg_file, number_of, rank, video_format, whole_jpeg
+from plugins.v4l2.formats import code_of, is_complete_jpeg, jpeg_file, number_of, rank, video_format
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_motion_jpeg_gets_the_tables_that_it_left_out() -> None:
     while (found := re.search(rb"\xff\xc4", bare)) is not None:
         bare = bare[: found.start()] + bare[found.end() + int.from_bytes(bare[found.end() :][:2], "big") :]
     whole = jpeg_file(bare + bytes(64), (32, 32), "MJPG")
-    assert whole_jpeg(bare + bytes(64))
+    assert is_complete_jpeg(bare + bytes(64))
     assert whole.count(b"\xff\xc4") == 4
     with Image.open(io.BytesIO(whole)) as picture:
         np.testing.assert_allclose(np.asarray(picture).mean(axis=(0, 1)), (200, 60, 20), atol=4)
@@ -70,7 +70,7 @@ def test_motion_jpeg_gets_the_tables_that_it_left_out() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff", b"\0" * 40, b"\xff\xd8" + bytes(40)])
 def test_a_frame_that_is_cut_is_no_whole_jpeg(data: bytes) -> None:
-    assert not whole_jpeg(data)
+    assert not is_complete_jpeg(data)
 
 
 @pytest.mark.parametrize("code", ["YUYV", "UYVY", "RGB3", "BGR3"])

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.codecs.projectors import logins
-from hal.codecs.projectors.json_rpc import Message, Said, is_whole, json_bytes, parse_message
+from hal.codecs.projectors.json_rpc import Message, Said, is_complete, json_bytes, parse_message
 from hal.codecs.projectors.logins import NtGreeting
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, ProtocolError
 
@@ -87,6 +87,6 @@ def test_only_the_answer_to_the_last_message_counts() -> None:
 @given(st.binary(max_size=40), st.integers(0, 60))
 def test_a_part_of_an_object_is_not_whole(noise: bytes, cut: int) -> None:
     whole = b'{"id": 1, "result": {"a": "}{", "b": [1, {"c": 2}]}}'
-    assert is_whole(whole)
-    assert not is_whole(whole[: min(cut, len(whole) - 1)])
-    assert not is_whole(b"x" + noise)
+    assert is_complete(whole)
+    assert not is_complete(whole[: min(cut, len(whole) - 1)])
+    assert not is_complete(b"x" + noise)

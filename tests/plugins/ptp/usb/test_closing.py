@@ -46,7 +46,7 @@ class HeldPipes:
         assert not self.closed
         self.cancelled = self.cancelled or request is ClassRequest.CANCEL
 
-    def ask_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
+    def class_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
         raise PipeStalled
 
     def clear_halts(self) -> None:

@@ -74,7 +74,7 @@ class PortPipes:
         with self._lock:
             self._library.gp_port_usb_msg_class_write(self._port, int(request), 0, 0, data, len(data))
 
-    def ask_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
+    def class_request(self, request: ClassRequest, count: int, seconds: float) -> bytes:
         place = ctypes.create_string_buffer(count)
         with self._lock:
             got = self._must(self._library.gp_port_usb_msg_class_read(self._port, int(request), 0, 0, place, count))
