@@ -62,9 +62,9 @@ class Service:
     """One stage that runs by itself. ``changed`` is called after every step that may have changed something, ``alive``
     by the loop as long as it turns.
 
-    ``problem``: why it runs with older settings than those of stage.toml, or None. ``cools``: the projectors whose
-    lamps are switched off at its end; None: all. ``world``: clock, threads and all else outside; ``jobs``
-    makes the handlers of all kinds of jobs.
+    ``problem``: why it runs with older settings than those of stage.toml, or None. ``cools_at_end``: the projectors
+    whose lamps are switched off at its end; None: all. ``world``: clock, threads and all else outside; ``jobs`` makes
+    the handlers of all kinds of jobs.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Service:
         stage = checked.stage
         self._world = world = world or World()
         self.problem = problem
-        self.cools: tuple[str, ...] | None = None
+        self.cools_at_end: tuple[str, ...] | None = None
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
         self.bundles = BundleStore(stage.folder, stage_trust(stage), world.monotonic)
@@ -186,9 +186,9 @@ class Service:
     def end(self, *, leave_lit: bool) -> None:
         """Cancel the job, cool the lamps (unless ``leave_lit``, for the next start), and close everything."""
         self.jobs.close(END_WORK_S)
-        cooled = [one for one in self.devices.projectors if self.cools is None or one.name in self.cools]
+        cooled = [one for one in self.devices.projectors if self.cools_at_end is None or one.name in self.cools_at_end]
         if cooled and not leave_lit:
-            if self.cools is None:
+            if self.cools_at_end is None:
                 self.player.want = BLACK
             for projector in cooled:
                 projector.want_lit = False

@@ -241,7 +241,7 @@ class StageKiosk(AttachedKiosk):
             service = self._service
             if service is not None:
                 after = check_stage(self.stage, drivers=self._world.drivers).stage.tables
-                service.cools = settings_change.change(self._in_use, after).lamps
+                service.cools_at_end = settings_change.change(self._in_use, after).lamps
             self.reload.set()
 
     def diagnostics(self) -> Path:
@@ -274,7 +274,7 @@ class StageKiosk(AttachedKiosk):
         if not found.restarts:
             service.use(checked)
             return
-        service.cools = found.lamps
+        service.cools_at_end = found.lamps
         self.reload.set()
 
     def _idle(self) -> contextlib.AbstractContextManager[None]:

@@ -87,7 +87,7 @@ class Reconciler:
         self._plan = Plan(None)
         self._since_s = monotonic()
         self._attempts, self._missing, self._silent = 0, frozenset[str](), frozenset[str]()
-        self._lit_until_s, self._lit_closed = float("-inf"), False
+        self._lit_until_s, self._lit_while_closed = float("-inf"), False
 
     # -- commands and questions
 
@@ -186,7 +186,7 @@ class Reconciler:
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:
         """Keep the lamps lit, even with nothing to play, while open or ``closed_too``. 0 or ``shut`` ends it."""
         with self._lock:
-            self._lit_until_s, self._lit_closed = self._monotonic() + seconds, closed_too
+            self._lit_until_s, self._lit_while_closed = self._monotonic() + seconds, closed_too
 
     def submit(self, *requests: Request) -> None:
         """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
@@ -232,7 +232,7 @@ class Reconciler:
             open_now = self._content.something(wanted_open)
             if not wanted_open:
                 self._live.end()
-            lit_anyway = (wanted_open or self._lit_closed) and self._monotonic() < self._lit_until_s
+            lit_anyway = (wanted_open or self._lit_while_closed) and self._monotonic() < self._lit_until_s
             light = open_now or lit_anyway or self._queue.needs_light
             self._move(views, light, open_now)
             cooling = self.machine.state in (State.COOLING, State.OFF)
