@@ -1,7 +1,7 @@
 """How tests are spread over workers: by file, long files first, users of the finished demo when it is there.
 
 A file is run as a whole by one worker, for what its tests share. Two kinds of long files are divided: those whose tests
-share nothing, and those that hold two things.
+share nothing, and those that hold two things. Files that share a machine are run as one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NEEDS_THE_DEMO: Final = (
 )
 """Meanwhile their workers would only wait: they have other tests first, and these at once when it is there."""
 LONGEST_FIRST: Final = (
-    "tests/booted/test_kiosk.py",
+    "tests/booted/",
     MAKES_THE_DEMO,
     "tests/end_to_end/test_going_on.py",
     "tests/end_to_end/test_drift.py",
@@ -61,13 +61,17 @@ SHARES_NOTHING: Final = (
 PARTS: Final[Mapping[str, tuple[str, ...]]] = {
     "tests/real_kernel/test_on_kernel.py": ("::test_keys_",),
 }
-"""Words in the ids of tests that are a file of their own: another machine is booted for them. The booted Debians stay
-together: two at once share a control group, and systemd of one then fails to signal its services."""
+"""Words in the ids of tests that are a file of their own: another machine is booted for them."""
+MACHINES: Final[Mapping[str, tuple[str, ...]]] = {"tests/booted/": ("bookworm", "trixie")}
+"""Folders whose files share machines, each booted once: the words in the ids of the tests on each."""
 
 
 def scope_of(test: str) -> str:
-    """What one worker runs as a whole: a file, a part of it, or this one test; ``test``: its id."""
+    """What one worker runs as a whole: a file, a part of it, all on one machine, or this one test; ``test``: its id."""
     file = file_of(test)
+    for folder, machines in MACHINES.items():
+        if file.startswith(folder):
+            return next((f"{folder}::{machine}" for machine in machines if machine in test), file)
     if file in SHARES_NOTHING:
         return test
     return next((f"{file}::{part}" for part in PARTS.get(file, ()) if part in test), file)

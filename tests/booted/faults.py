@@ -1,4 +1,6 @@
-"""What is hard to do to a computer without doing it to this one, too: a full disk, and a clock that nobody set."""
+"""What is hard to do to a computer without doing it to this one, too: a full disk, and a clock that nobody set; and a
+damaged file.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from controller.bundle.format import FIRST_BLOB
 from tests.booted.machine import STAGE, Machine
 
 DAY_S: Final = 86_400
@@ -35,6 +40,14 @@ int clock_gettime(clockid_t which, struct timespec *at)
 }}
 """
 """The computer's clock is this computer's, too, so one service alone reads another. libfaketime breaks its sleep."""
+
+
+def spoil(bundle: Path) -> None:
+    """Damage the frames of a bundle, and nothing else of it; that needs no space."""
+    most = bundle.stat().st_size * 8 // 10
+    with bundle.open("r+b") as file:
+        file.seek(FIRST_BLOB)
+        file.write(np.random.default_rng(3).bytes(most - FIRST_BLOB))
 
 
 class Disk:

@@ -26,19 +26,19 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.kiosk_places import RUNTIME
 from controller.kiosk.api.control import NAME as SOCKET
 from controller.kiosk.decide.hours import WEEKDAYS
-from controller.kiosk.install.steps import PYTHON
 from controller.kiosk.panel_address import FIRST_LOGIN
 from tests.booted.machine import STAGE, Machine
-from tests.booted.trees import ROOT, built_packages, tree
+from tests.booted.trees import ROOT, built_packages, put_kernels, tree
 from tests.controller.play.wire import Frames, noise, same
-from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
 OUTPUTS: Final = [(name, 280, 210) for name in ("P1", "P2", "P3")]
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
+PICTURE_S: Final = 60.0
+"""From the boot of a bare Debian with the package to a picture."""
 APPEARANCE: Final = "1"
-FIRST, DAMAGED_LATER, AGAIN = "first.vel", "damaged.vel", "again.vel"
+FIRST, SECOND, THIRD, FOURTH = _BUNDLES = ("first.vel", "second.vel", "third.vel", "fourth.vel")
 _SEED, OTHER_SEED = 1, 2
-"""Of the noise that the first bundle and the third show, and the second."""
+"""Of the noise that the first bundle and the third show, and that of the second and the fourth."""
 _HOURS: Final = STAGE / "schedule.toml"
 _DEVICES_FIRST: Final = Path("/etc/systemd/system/bench.service.d/first.conf")
 _UNTIL_THERE: Final = f"""
@@ -180,10 +180,15 @@ class Kiosk:
     def remove_hours(self) -> None:
         self.machine.call("rm", _HOURS)
 
-    def install_bundle(self, name: str) -> Path:
-        """Install one of the stage's bundles; where it lies then, on this computer."""
+    def install_bundle(self, name: str) -> None:
+        """Install one of the stage's bundles."""
         self.machine.call("velatura", "bundle", "install", STAGE / name, STAGE, user="velatura")
-        return self.machine.at(STAGE / "bundles" / "current").resolve()
+
+    @property
+    def bundle(self) -> Path:
+        """Where the file of the installed bundle lies on this computer."""
+        installed = self.machine.seen_here(STAGE / "bundles" / "current").readlink()
+        return self.machine.at(STAGE / "bundles" / installed)
 
     def answers(self) -> bool:
         """Whether a command reaches the service, and not the folder alone."""
@@ -244,28 +249,25 @@ def installed(suite: str, folder: Path, *, versions: Sequence[str] = ("1",)) -> 
         dry = machine.call("/opt/velatura/bin/velatura", "kiosk", "install", "--dry-run")
         assert not machine.at(STAGE).exists()
         told = machine.call("/opt/velatura/bin/velatura", "kiosk", "install")
-        _compile_kernels(machine, suite)
+        _put_kernels(machine, suite)
         yield Kiosk(machine, dry, told, packages)
 
 
-def _compile_kernels(machine: Machine, suite: str) -> None:
-    """What `python -m hal.runtime.kernels compile` does in minutes: the set-up's machine code fits the same Python."""
-    if PYTHON[suite] == f"{sys.version_info.major}.{sys.version_info.minor}":
-        kernels = STAGE.parent / ".cache" / "velatura" / "kernels"
-        machine.at(kernels).mkdir(parents=True)
-        kernels_of_the_tables(machine.at(kernels), shutil.copy)
-        machine.call("chown", "--recursive", "velatura:velatura", STAGE.parent / ".cache")
-        machine.call("chmod", "--recursive", "u+rwX,go=", STAGE.parent / ".cache")
+def _put_kernels(machine: Machine, suite: str) -> None:
+    cache = STAGE.parent / ".cache"
+    put_kernels(suite, machine.at(cache / "velatura" / "kernels"))
+    machine.call("chown", "--recursive", "velatura:velatura", cache)
+    machine.call("chmod", "--recursive", "u+rwX,go=", cache)
 
 
 def prepared_stage(folder: Path) -> Path:
-    """The demo's stage for projectors at an X server, with three bundles beside it, the first for ``put_stage``."""
+    """The demo's stage for projectors at an X server, with four bundles beside it, the first for ``put_stage``."""
     words = ["demo", "--prepare-only", "--room", "dark", "--out", str(folder / "out")]
     subprocess.run([sys.executable, "-m", "controller", *words], check=True, cwd=ROOT, capture_output=True)
     stage = folder / "out" / "stage"
     described = stage / "stage.toml"
     described.write_text(re.sub(r"^frames = .*\n", "", described.read_text(), flags=re.MULTILINE))
-    for revision, (name, seed) in enumerate(((FIRST, _SEED), (DAMAGED_LATER, OTHER_SEED), (AGAIN, _SEED))):
+    for revision, name in enumerate(_BUNDLES):
         write_bundle(
             stage / name,
             stage="demo small",
@@ -273,7 +275,7 @@ def prepared_stage(folder: Path) -> Path:
             created_unix_s=revision,
             outputs=OUTPUTS,
             revision=revision,
-            appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, seed))],
+            appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, (_SEED, OTHER_SEED)[revision % 2]))],
             key=load_signing_key(stage / "keys" / "stage.key"),
         )
     return stage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -18,11 +19,14 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from tests.booted.control_groups import ControlGroups
+
 STAGE: Final = Path("/var/lib/velatura/stage")
 LONGEST_S: Final = 300.0
 """Far beyond what anything here takes, for machines that do much else meanwhile."""
 ADDRESS: Final = "192.0.2.7"
 """Of the machine in a network where it is alone."""
+_NUMBERS: Final = itertools.count()
 _PATH: Final = "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _SCREEN: Final = """
 Section "Device"
@@ -132,6 +136,7 @@ class Machine:
         (wants / "lonely-network.service").symlink_to("/etc/systemd/system/lonely-network.service")
         self._container: subprocess.Popen[bytes] | None = None
         self._init = 0
+        self._groups = ControlGroups(f"velatura-{os.getpid()}-{next(_NUMBERS)}")
 
     def at(self, path: Path) -> Path:
         """Where a path of the machine's disk lies here; /tmp and /run of a machine that runs are in its memory."""
@@ -170,11 +175,11 @@ class Machine:
             settings["SYSTEMD_NSPAWN_TMPFS_TMP"] = "0"
         with (self._folder / "console").open("ab") as console:
             self._container = subprocess.Popen(
-                [
+                self._groups.entered([
                     "systemd-nspawn", "--quiet", "--boot", "--private-network", "--register=no", "--keep-unit",
                     "--console=pipe", f"--machine=velatura-{os.getpid()}", f"--directory={self._root}",
                     *options,
-                ],
+                ]),
                 stdin=subprocess.DEVNULL, stdout=console, stderr=console, env=settings,
             )  # fmt: skip
         self.wait_for(lambda: self._find_init() != 0)
@@ -197,6 +202,7 @@ class Machine:
             os.kill(self._init or self._container.pid, signal.SIGKILL)
             self._container.wait()
             self._container, self._init = None, 0
+            self._groups.remove()
 
     def called(self, *words: str | Path, user: str | None = None) -> subprocess.CompletedProcess[str]:
         """Run a program on the machine, as root if no other ``user`` is named."""

@@ -1,12 +1,14 @@
 """Debian as it is after its installation, with the Debian packages that Velatura needs: made once, kept in its cache.
 
-``python -m tests.booted.trees`` (`make test-setup`) makes what is missing, and loads what Velatura's package is made
-of, where a Debian can be booted.
+Where a Debian can be booted, ``python -m tests.booted.trees`` (`make test-setup`) makes what is missing, loads what
+Velatura's package is made of, and compiles its kernels.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -15,8 +17,12 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from controller.kiosk.install.steps import DEBIAN, PACKAGES
+from controller.kiosk.install.steps import DEBIAN, PACKAGES, PYTHON
 from hal.runtime.caches import cache_folder
+from hal.runtime.compute import digest_of
+from hal.runtime.kernels import TABLES
+from tests.booted.control_groups import ControlGroups
+from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
 ROOT: Final = Path(__file__).parents[2]
 BOOTED: Final = (
@@ -70,6 +76,49 @@ def _bootstrap(suite: str, folder: Path) -> None:
     )
 
 
+def put_kernels(suite: str, to: Path) -> None:
+    """Put the kernels' machine code for this Debian's Python, which a kiosk compiles in minutes, into the new folder
+    ``to``. Raises CalledProcessError.
+    """
+    to.parent.mkdir(parents=True)
+    if PYTHON[suite] == f"{sys.version_info.major}.{sys.version_info.minor}":
+        to.mkdir()
+        kernels_of_the_tables(to, shutil.copy)
+    else:
+        shutil.copytree(_compiled(suite), to)
+
+
+def _compiled(suite: str) -> Path:
+    """The kernels, compiled by this Debian's Python; made if the sources are others."""
+    digest = hashlib.sha256((ROOT / "requirements-kiosk.lock").read_bytes())
+    for table in TABLES:
+        digest.update(table.read_bytes())
+        for module in sorted(json.loads(table.read_text())):
+            digest.update(digest_of(ROOT.joinpath(*module.split(".")).with_suffix(".py")).encode())
+    folder = cache_folder() / "tests" / f"compiled-{suite}-{digest.hexdigest()[:12]}"
+    if not folder.exists():
+        (packages,) = (cache_folder() / "packages").glob(f"{suite}-*")
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as part:
+            _compile(tree(suite), packages, Path(part))
+            with contextlib.suppress(OSError):  # another checkout was faster
+                Path(part, "kernels").rename(folder)
+    return folder
+
+
+def _compile(debian: Path, packages: Path, to: Path) -> None:
+    groups = ControlGroups(f"velatura-compiling-{os.getpid()}")
+    container = [
+        "systemd-nspawn", "--quiet", "--register=no", "--keep-unit", "--console=pipe", "--volatile=overlay",
+        f"--directory={debian}", f"--machine=velatura-{os.getpid()}", f"--bind-ro={ROOT}:/source",
+        f"--bind-ro={packages}:/packages", f"--bind={to}:/kept", "--setenv=VELATURA_CACHE=/kept",
+        "--setenv=PYTHONPATH=/source:/packages", "python3", "-m", "hal.runtime.kernels", "compile",
+    ]  # fmt: skip
+    try:
+        subprocess.run(groups.entered(container), check=True, stdin=subprocess.DEVNULL)
+    finally:
+        groups.remove()
+
+
 def built_packages(suite: str, out: Path, *versions: str) -> list[Path]:
     """Velatura's Debian package, as it is released but not compressed, in each version. Raises CalledProcessError."""
     told = _package_script(suite, "--out", str(out), *(f"--version={one}" for one in versions), "--fast")
@@ -85,5 +134,7 @@ if __name__ == "__main__":
     if (why := obstacle()) is None:
         for name in DEBIAN:
             _package_script(name)
+            with tempfile.TemporaryDirectory() as scratch:
+                put_kernels(name, Path(scratch, "kept", "kernels"))
     else:
         print(f"The tests that boot a Debian are skipped: {why}.")

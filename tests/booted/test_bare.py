@@ -1,0 +1,68 @@
+"""A kiosk on a bare Debian, without a stage: installed, booted, and the way to its panel shown."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+from tests.booted.kiosk import PICTURE_S, SERVICES, Kiosk
+from tests.booted.machine import ADDRESS, STAGE
+
+
+def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -> None:
+    address = bare.read_code()
+    assert address == f"https://{ADDRESS}:8377/"
+    assert 'name="password"' in bare.machine.fetched(f"{address}login")
+
+
+def test_an_address_that_changes_is_shown_and_reaches_the_panel(bare: Kiosk) -> None:
+    machine, other = bare.machine, "198.51.100.7"
+    change = "ip address add {}/24 dev net0; ip address del {}/24 dev net0"
+    machine.call("sh", "-c", change.format(other, ADDRESS))
+    machine.wait_for(lambda: bare.read_code() == f"https://{other}:8377/")
+    assert 'name="password"' in machine.fetched(f"https://{other}:8377/login")
+    machine.call("sh", "-c", change.format(ADDRESS, other))
+    machine.wait_for(lambda: bare.read_code() == f"https://{ADDRESS}:8377/")
+
+
+def test_the_set_up_page_can_ask_which_projectors_there_are(bare: Kiosk) -> None:
+    machine = bare.machine
+    process = machine.call("systemctl", "show", "--value", "--property=MainPID", "velatura-controller").strip()
+    settings = machine.read(Path(f"/proc/{process}/environ")).decode().split("\0")
+    display = [one for one in settings if one.startswith(("DISPLAY=", "XAUTHORITY="))]
+    inside = ["nsenter", f"--target={process}", "--mount", "runuser", "-u", "velatura", "--"]
+    assert "DUMMY0 connected" in machine.call(*inside, "env", *display, "xrandr")
+
+
+def test_the_first_password_is_told_once_and_not_in_the_journal(bare: Kiosk) -> None:
+    program = (
+        "import sys; from pathlib import Path; from controller.kiosk.store.accounts import stage_accounts;"
+        "sys.exit(stage_accounts(Path(sys.argv[1])).verify('technician', sys.argv[2]) is None)"
+    )
+    bare.machine.call("/opt/velatura/bin/python", "-c", program, STAGE, bare.password, user="velatura")
+    assert bare.password not in bare.machine.call("journalctl", "--no-pager")
+    assert bare.machine.called("test", "-e", "/run/velatura/first-login").returncode == 1
+
+
+def test_a_dry_run_tells_what_is_done(bare: Kiosk) -> None:
+    done = [line for line in bare.told.splitlines() if line.startswith(("write", "useradd", "usermod", "make"))]
+    later = ("/etc/X11/xorg.conf.d/20-velatura-outputs.conf", "/var/lib/velatura/player.options")
+    assert [line for line in done if not line.endswith(later)] == [
+        line for line in bare.dry.splitlines() if line.startswith(("write", "useradd", "usermod", "make"))
+    ]
+
+
+def test_installing_again_changes_nothing(bare: Kiosk) -> None:
+    before = [bare.machine.call("systemctl", "show", "--property=MainPID", *SERVICES)]
+    again = bare.machine.call("velatura", "kiosk", "install")
+    assert not re.search("write|restart|useradd|usermod|openssl|apt-get", again)
+    assert [bare.machine.call("systemctl", "show", "--property=MainPID", *SERVICES)] == before
+
+
+def test_a_boot_without_a_stage_leads_to_the_panel_within_a_minute(bare: Kiosk) -> None:
+    began_s = bare.boot()
+    bare.machine.wait_for(lambda: bare.read_code() == f"https://{ADDRESS}:8377/")
+    took_s = time.monotonic() - began_s
+    print(f"{took_s:.1f} s from the boot to the set-up picture")
+    assert took_s < PICTURE_S

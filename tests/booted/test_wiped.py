@@ -1,0 +1,72 @@
+"""A kiosk that is uninstalled, and a blank Debian that becomes the kiosk of a backup."""
+
+from __future__ import annotations
+
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tests.booted.kiosk import Kiosk
+from tests.booted.machine import STAGE
+
+RESTORED_S = 900.0
+"""From a blank Debian with the package to the picture of a backup."""
+
+
+def test_uninstalling_leaves_the_stage_and_nothing_that_starts(playing: Kiosk) -> None:
+    machine = playing.machine
+    machine.call("velatura", "kiosk", "uninstall")
+    left = machine.call("find", "/etc", "/run", "-name", "*velatura*", "-not", "-path", "/etc/velatura*")
+    assert [line for line in left.splitlines() if "/run/systemd" not in line] == []
+    assert machine.at(STAGE / "stage.toml").exists()
+    running = machine.call("sh", "-c", "cat /proc/[0-9]*/cmdline | tr '\\0' ' '")
+    assert "emulate" in running
+    assert not re.search("serve|controller.play|Xorg :0", running)
+
+
+def lit(screen: npt.NDArray[np.uint8] | None) -> bool:
+    return screen is not None and bool(screen.any())
+
+
+def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playing: Kiosk) -> None:
+    machine = playing.machine
+    began_s = time.monotonic()
+    # What stands outside the computer: the devices, and the stick with the backup.
+    machine.call("systemctl", "stop", "bench")
+    machine.call(
+        "sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer && touch /opt/told"
+    )
+    machine.call("/opt/velatura/bin/velatura", "backup", STAGE)
+    machine.call("sh", "-c", f"mv $(ls -t {STAGE}/kiosk/archives/backup-* | head -n 1) /opt/velatura-20260504.tar.gz")
+    machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
+    assert not machine.at(STAGE).exists()
+    assert machine.called("getent", "passwd", "velatura").returncode != 0
+    command = "/opt/velatura/bin/velatura kiosk restore /opt/velatura-20260504.tar.gz < /opt/answer > /opt/told 2>&1"
+    with ThreadPoolExecutor(1) as pool:
+        restoring = pool.submit(machine.called, "sh", "-c", command)
+        # The pipe has to be open at both ends before the command starts.
+        machine.call("sh", "-c", "sleep infinity > /opt/answer 2> /dev/null < /dev/null & echo $! > /opt/holder")
+        try:
+            machine.wait_for(lambda: b"Type those of" in machine.read(Path("/opt/told")) or restoring.done())
+            screen = machine.screen()
+            code = playing.read_code()
+        finally:  # or the command waits for an answer, and the test for the command
+            machine.call("sh", "-c", "echo '- - -' > /opt/answer; kill $(cat /opt/holder)")
+        done = restoring.result()
+    told = machine.read(Path("/opt/told")).decode()
+    assert done.returncode == 0, told
+    assert told.count("Type those of") == 1
+    assert lit(screen)
+    assert code == "", "the projectors show numbers, not the way to the panel"
+    machine.call("sh", "-c", f"cp -a /opt/devices/bench* {STAGE}; chown -R velatura:velatura {STAGE}/bench*")
+    machine.call("systemctl", "restart", "bench")
+    machine.wait_for(playing.answers)
+    machine.wait_for(lambda: playing.status()["playing"] in ("1", "board"))
+    if playing.status()["playing"] == "1":
+        machine.wait_for(playing.shows)
+    # where this Debian was calibrated, `board` plays into the file that the bench's camera sees, not on X
+    assert time.monotonic() - began_s < RESTORED_S
