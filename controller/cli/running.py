@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from controller.cli import console
-from controller.cli.sections import Sections, show_version
+from controller.cli.sections import Commands, Sections, show_version
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -79,7 +79,7 @@ def group(name: str, summary: str, commands: Iterable[Callable[..., Any]], *, wh
     completion in the user's shell.
     """
     app = typer.Typer(
-        name=name, cls=Sections if whole else None, help=summary, add_completion=whole,
+        name=name, cls=Sections if whole else Commands, help=summary, add_completion=whole,
         pretty_exceptions_enable=False, rich_markup_mode=None,
     )  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any, Final
 
@@ -30,22 +30,31 @@ LONGEST_SENTENCE: Final = 200
 """Characters, far more than any first sentence has."""
 
 
-class Sections(TyperGroup):
-    """Lists its commands by ``SECTIONS``; what is in none of them comes last."""
+class Commands(TyperGroup):
+    """Lists its commands with the first sentence of their help, whole: half a sentence tells nothing."""
+
+    def sections(self, ctx: Any) -> Mapping[str, Sequence[str]]:
+        """The names of its commands by the title under which they stand."""
+        return {"Commands": self.list_commands(ctx)}
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        names = self.list_commands(ctx)
-        listed = {name for section in SECTIONS.values() for name in section}
-        for title, section in {**SECTIONS, OTHERS: tuple(name for name in names if name not in listed)}.items():
-            rows = [(name, self._about(ctx, name)) for name in section if name in names]
+        for title, names in self.sections(ctx).items():
+            rows = [
+                (name, command.get_short_help_str(LONGEST_SENTENCE))
+                for name in names
+                if (command := self.get_command(ctx, name)) is not None
+            ]
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
-    def _about(self, ctx: Any, name: str) -> str:
-        """The first sentence of its help, whole: half a sentence tells nothing."""
-        command = self.get_command(ctx, name)
-        return "" if command is None else command.get_short_help_str(LONGEST_SENTENCE)
+
+class Sections(Commands):
+    """Lists its commands by ``SECTIONS``; what is in none of them comes last."""
+
+    def sections(self, ctx: Any) -> Mapping[str, Sequence[str]]:
+        listed = {name for section in SECTIONS.values() for name in section}
+        return {**SECTIONS, OTHERS: [name for name in self.list_commands(ctx) if name not in listed]}
 
 
 def show_version(asked: bool) -> None:

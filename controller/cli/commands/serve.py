@@ -123,7 +123,7 @@ def schedule(
         list[str] | None,
         typer.Option(help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY is mon, mon-fri, daily, or a date."),
     ] = None,
-    drift_check: Annotated[str | None, typer.Option(help="HH:MM of the nightly check;  for none.")] = None,
+    drift_check: Annotated[str | None, typer.Option(help='HH:MM of the nightly check; "" for no check.')] = None,
     as_json: Json = False,
 ) -> None:
     """Show the opening hours, or change them."""
