@@ -15,17 +15,19 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks import Row, at_most
+from benchmarks import Row, at_least, at_most
 from benchmarks._judge import map_errors
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
 from benchmarks._truth import Truth
 from controller.artefacts.grade import worst_of
+from controller.core.errors import VelaturaError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.services.calibrate import calibrate
 from controller.stage.bench import BenchProcess
 from controller.stage.check import check_stage
 from controller.stage.session import OwnSession
+from hal.errors import DeviceError
 from plugins.emulated.optics.bumps import Bump, write_bumps
 
 MISCONVERGED_PX: Final = 0.3
@@ -45,19 +47,31 @@ def measure(size: str) -> list[Row]:
 
 def _of_room(size: str, room: str, stages: int) -> Iterator[Row]:
     found: dict[tuple[str, str], list[float]] = {}
+    failed: list[str] = []
     for seed in range(FIRST_SEED, FIRST_SEED + stages):
-        with prepared_stage(size, seed, room=room) as stage:
-            names = check_stage(stage).names
-            write_bumps(stage, *[Bump("projector", name, misconverged_px=MISCONVERGED_PX) for name in names])
-            with BenchProcess(stage, cancel=threading.Event()):
-                for which in SETS:
-                    for figure, values in _calibrated(stage, which).items():
-                        found.setdefault((which, figure), []).extend(values)
+        try:
+            for which, figure, values in _of_stage(size, seed, room):
+                found.setdefault((which, figure), []).extend(values)
+        except (VelaturaError, DeviceError) as error:
+            failed.append(f"seed {seed}: {error.what}")
+    done = stages - len(failed)
+    yield at_least(f"{room}: stages calibrated", done, stages, unit=f"of {stages}", how="; ".join(failed))
     for (which, figure), values in found.items():
         goal = {"photographs a projector": MOST.get(which), "grade": GRADE, "in focus": IN_FOCUS}.get(figure)
         unit = {"photographs a projector": "", "grade": "% rms", "off by more than 1 px": "%"}.get(figure, "px rms")
         finite = [value for value in values if np.isfinite(value)]
         yield at_most(f"{room}, {which}: {figure}", max(finite), goal, unit=unit, how=over(finite))
+
+
+def _of_stage(size: str, seed: int, room: str) -> Iterator[tuple[str, str, Sequence[float]]]:
+    """Set, figure and values, as they are measured."""
+    with prepared_stage(size, seed, room=room) as stage:
+        names = check_stage(stage).names
+        write_bumps(stage, *[Bump("projector", name, misconverged_px=MISCONVERGED_PX) for name in names])
+        with BenchProcess(stage, cancel=threading.Event()):
+            for which in SETS:
+                for figure, values in _calibrated(stage, which).items():
+                    yield which, figure, values
 
 
 def _calibrated(stage: Path, which: str) -> dict[str, Sequence[float]]:
