@@ -28,9 +28,10 @@ from controller.simulate.happen.commands import arguments_of, believe, whole
 from controller.simulate.happen.draw import draw, setting
 from controller.simulate.happen.script import Item, Setting
 from controller.simulate.jobs import SimulatedJobs
+from controller.simulate.judge.after_the_end import after_the_end
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.promises import Broken
-from controller.simulate.judge.witness import Witness, after_the_end
+from controller.simulate.judge.witness import Witness
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
 from controller.simulate.stage import make_stage
 from controller.simulate.world import SimulatedWorld
