@@ -23,23 +23,25 @@ class Snapshots:
     def __init__(self, stage: Path, world: World) -> None:
         self._stage, self._world = stage, world
         self._grades: tuple[float, tuple[Grade, ...]] = (0.0, ())
+        self._bundle: Path | None = None
         self._places: tuple[Place, ...] = ()
         self._drifts: tuple[DriftCheck, ...] = ()
         self._since = ("", 0.0)
 
     def of(self, service: Service, revision: int) -> KioskState:
-        """The state now; the grades come from the disk and may be some seconds old."""
+        """The state now; the grades come from the disk and may be some seconds old, but not older than the bundle."""
         shown, wanted = service.player.view.shown, service.player.want
         job = self._job(service)
         state, reason = self._state(service, job)
         if self._since[0] != state:
             self._since = (state, self._world.wall())
+        bundle = service.bundles.bundle()
         at_s, grades = self._grades
-        if self._world.monotonic() - at_s > GRADES_EVERY_S or not at_s:
+        if self._world.monotonic() - at_s > GRADES_EVERY_S or not at_s or bundle != self._bundle:
             grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
-            self._grades = self._world.monotonic(), grades
+            self._grades, self._bundle = (self._world.monotonic(), grades), bundle
             self._places, self._drifts = places(self._stage), runs.drifts(self._stage)
-        index = service.bundles.index(bundle := service.bundles.bundle())
+        index = service.bundles.index(bundle)
         identity = None
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
