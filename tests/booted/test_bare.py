@@ -6,8 +6,13 @@ import re
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.booted.kiosk import PICTURE_S, SERVICES, Kiosk
 from tests.booted.machine import ADDRESS, STAGE
+
+EXPOSED_TENTHS = 30
+"""Of systemd's measure of what a service could do; 100 is everything."""
 
 
 def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -> None:
@@ -43,6 +48,12 @@ def test_the_first_password_is_told_once_and_not_in_the_journal(bare: Kiosk) -> 
     bare.machine.call("/opt/velatura/bin/python", "-c", program, STAGE, bare.password, user="velatura")
     assert bare.password not in bare.machine.call("journalctl", "--no-pager")
     assert bare.machine.called("test", "-e", "/run/velatura/first-login").returncode == 1
+
+
+@pytest.mark.parametrize("service", ["velatura-player", "velatura-controller"])
+def test_a_service_that_is_broken_into_can_do_little_on_this_debian(bare: Kiosk, service: str) -> None:
+    most = f"--threshold={EXPOSED_TENTHS}"
+    print(bare.machine.call("systemd-analyze", "security", "--no-pager", most, service).splitlines()[-1])
 
 
 def test_a_dry_run_tells_what_is_done(bare: Kiosk) -> None:

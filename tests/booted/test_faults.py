@@ -7,42 +7,48 @@ import time
 
 import pytest
 
+from controller.bundle.starts import NAME as COUNT
+from controller.core.kiosk_places import RUNTIME
 from tests.booted.faults import Disk, clock_of_its_own, disk_of_its_own, spoil
-from tests.booted.kiosk import OTHER_SEED, SECOND, SERVICES, THIRD, Kiosk
-from tests.booted.machine import ADDRESS
+from tests.booted.kiosk import FOURTH, OTHER_SEED, SECOND, SERVICES, THIRD, Kiosk
+from tests.booted.machine import ADDRESS, STAGE
 from tests.campaigns.power_cuts import kept, lost
 
 
-def test_a_disk_that_is_read_only_from_the_boot_on_is_told_and_the_picture_is_there(playing: Kiosk) -> None:
+def gave_way(playing: Kiosk) -> bool:
+    """Whether the bundle before plays, and that is said."""
+    return playing.shows() and any("the previous one" in warning for warning in playing.status()["warnings"])
+
+
+def test_on_a_disk_that_is_read_only_from_the_boot_on_it_plays_and_a_damaged_bundle_gives_way(playing: Kiosk) -> None:
     machine, before = playing.machine, kept(playing)
+    playing.install_bundle(SECOND)
+    machine.wait_for(lambda: playing.shows(OTHER_SEED))
+    number = playing.events()[-1]["number"]
+    damaged = playing.bundle
     playing.boot(read_only=True)
     try:
-        machine.wait_for(playing.shows)
+        machine.wait_for(lambda: playing.shows(OTHER_SEED))
         # The devices begin anew, too.
         machine.wait_for(lambda: set(playing.problems()) == {"disk"} and "disk" in playing.status()["reason"])
         assert "can't be written to" in playing.problems()["disk"]
         assert 'name="password"' in machine.fetched(f"https://{ADDRESS}:8377/login")
         assert {machine.restarts(name) for name in SERVICES} == {0}
-        assert playing.shows()
+        assert playing.shows(OTHER_SEED)
+        spoil(damaged)
+        machine.call("systemctl", "kill", "--signal=KILL", "velatura-player")
+        machine.wait_for(lambda: gave_way(playing))
+        assert playing.bundle == damaged, "no link can be changed there"
+        machine.call("test", "-s", RUNTIME / COUNT)
     finally:
         playing.boot()
-    machine.wait_for(playing.shows)
-    machine.wait_for(lambda: playing.state == "playing")
-    assert lost(playing, before) == []
-
-
-def test_a_bundle_that_was_damaged_gives_way_to_the_one_before_and_that_is_said(playing: Kiosk) -> None:
-    machine, number = playing.machine, playing.events()[-1]["number"]
-    playing.install_bundle(SECOND)
-    machine.wait_for(lambda: playing.shows(OTHER_SEED))
-    spoil(playing.bundle)
-    machine.call("systemctl", "kill", "--signal=KILL", "velatura-player")
-    machine.wait_for(playing.shows)
-    machine.wait_for(lambda: any("the previous one" in warning for warning in playing.status()["warnings"]))
+    machine.wait_for(lambda: gave_way(playing) and playing.state == "playing")
+    assert playing.bundle != damaged
     assert "bundle-older-plays" in playing.codes(number)
     playing.install_bundle(THIRD)
     machine.wait_for(lambda: not playing.status()["warnings"] and playing.state == "playing")
     assert playing.shows()
+    assert lost(playing, before) == []
 
 
 def told_full(playing: Kiosk, disk: Disk) -> bool:
@@ -75,8 +81,18 @@ def test_a_full_disk_is_told_once_and_the_picture_stays(playing: Kiosk) -> None:
         disk.clear()
         machine.wait_for(lambda: playing.problems() == {})
         assert lost(playing, before) == []
-    machine.wait_for(playing.shows)
+        playing.install_bundle(FOURTH)
+        machine.wait_for(lambda: playing.shows(OTHER_SEED))
+        disk.fill()
+        spoil(machine.seen_here(STAGE / "bundles" / playing.bundle.name))
+        machine.call("systemctl", "kill", "--signal=KILL", "velatura-player")
+        machine.wait_for(lambda: gave_way(playing))
+        disk.clear()
+        machine.wait_for(lambda: playing.problems() == {})
     machine.wait_for(playing.answers)
+    # It was counted in memory, and this is another disk.
+    playing.install_bundle(THIRD)
+    machine.wait_for(playing.shows)
     machine.wait_for(lambda: playing.state == "playing")
 
 

@@ -36,6 +36,29 @@ def works(status: dict[str, Any], name: str) -> bool:
     return str(job.get("name", "")).startswith(name) and bool(job["steps"]) and not job["ended"]
 
 
+def test_a_closed_stage_that_computes_says_so_and_not_only_that_it_is_closed(playing: Kiosk) -> None:
+    machine, number = playing.machine, playing.events()[-1]["number"]
+    machine.call("velatura", "stop", STAGE, user="velatura")
+    machine.wait_for(lambda: playing.state == "off")
+    playing.begin_appearance("dark", 5)
+    seen: list[tuple[str, str]] = []
+
+    def published() -> bool:
+        status = playing.status()
+        job = status["job"] or {}
+        if job.get("name") == "New appearance dark" and not job["ended"]:
+            seen.append((status["state"], status["reason"]))
+        return "published" in playing.codes(number)
+
+    machine.wait_for(published)
+    assert len(seen) > 3
+    assert set(seen) == {("solving", "New appearance dark. The stage is closed, and the lamps are off.")}
+    machine.wait_for(lambda: playing.state == "off")
+    machine.call("velatura", "start", STAGE, user="velatura")
+    machine.wait_for(lambda: playing.state == "playing")
+    machine.wait_for(playing.shows_installed)
+
+
 def test_power_cuts_while_it_calibrates_and_publishes_leave_the_picture_and_are_told(playing: Kiosk) -> None:
     machine = playing.machine
     calibrated = len(list(machine.at(STAGE / "runs").iterdir()))
