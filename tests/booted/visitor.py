@@ -22,9 +22,12 @@ ip netns add visitor
 ip link add port0 type veth peer name eth0 netns visitor
 ip link set port0 master net0 up
 ip -n visitor address add 192.0.2.8/24 dev eth0
-ip -n visitor link set eth0 up
+ip -n visitor link set eth0 addrgenmode none up
 """
-"""From a network with another computer alone in it to the machine's; the machine's net0 is a switch."""
+"""From a network with another computer alone in it to the machine's; the machine's net0 is a switch.
+
+No address comes by itself: Chromium gives up a page when one does, a second after the cable is in.
+"""
 _FETCH: Final = """async ([path, authorization]) => {
   const answer = await fetch(path, {headers: {authorization}, credentials: "omit"});
   return [answer.status, await answer.text()];
