@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import gaussian_blur
 from controller.core.channels import finite
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
@@ -119,9 +120,8 @@ def refusal(
 
 def smoothed(image: FloatImage, mask: Mask, sigma_px: float) -> FloatImage:
     """Gaussian means over the pixels of ``mask`` alone, (rows, columns, 3); 0 where none is near."""
-    weight = mask.astype(np.float32)
-    total = cv2.GaussianBlur(np.where(mask[..., None], image, 0).astype(np.float32), (0, 0), sigma_px)
-    near = cv2.GaussianBlur(weight, (0, 0), sigma_px)[..., None]
+    total = gaussian_blur(np.where(mask[..., None], image, 0).astype(np.float32), sigma_px)
+    near = gaussian_blur(mask.astype(np.float32), sigma_px)[..., None]
     return np.asarray(np.divide(total, near, out=np.zeros_like(total), where=near > 1e-4), np.float32)
 
 

@@ -31,6 +31,9 @@ MOST_BYTES: Final = 1 << 30
 TRIES: Final = 20
 KEPT: Final = 32
 POLL_S: Final = 0.004
+QUIET_POLL_S: Final = 0.02
+"""Where nothing has changed for ``QUIET_S``: of several sets within this time, all but the last are missed then."""
+QUIET_S: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +121,7 @@ class VisibleFrames:
         self._reader = FrameReader(path)
         self._latency_s = latency_s
         self._lock = threading.Lock()
+        self._changed_s = time.monotonic()
         self._history: deque[tuple[float, VisibleFrameSet | None]] = deque([(0.0, None)], maxlen=KEPT)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._poll, name="outputs", daemon=True)
@@ -137,7 +141,8 @@ class VisibleFrames:
             found = self._reader.latest()
             _, newest = self._history[-1]
             if found is not newest:
-                at = time.monotonic() if found is None else found.presented_at_s
+                self._changed_s = time.monotonic()
+                at = self._changed_s if found is None else found.presented_at_s
                 self._history.append((max(at + self._latency_s, self._history[-1][0]), found))
 
     def during(self, start_s: float, end_s: float) -> list[tuple[float, VisibleFrameSet | None]]:
@@ -158,5 +163,9 @@ class VisibleFrames:
         return shares
 
     def _poll(self) -> None:
-        while not self._stopped.wait(POLL_S):
+        while not self._stopped.wait(self._pause_s()):
             self.update()
+
+    def _pause_s(self) -> float:
+        """Until the next look. A bench often stands by for hours, beside much other work."""
+        return POLL_S if time.monotonic() < self._changed_s + QUIET_S else QUIET_POLL_S

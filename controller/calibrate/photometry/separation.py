@@ -22,6 +22,7 @@ from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PHASE_STEPS, Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import gaussian_blur
 from controller.core.channels import every, finite
 from controller.core.jit import compiled
 
@@ -225,11 +226,14 @@ def _mean_of_like(
 
 def _filled(share: FloatImage, known: Mask) -> FloatImage:
     """Shares where nothing is known, from what is around; 0 where nothing is near."""
-    out, left = np.where(known[..., None], share, np.float32(0)), ~known
+    own, left = np.where(known[..., None], share, np.float32(0)), ~known
+    out = own.copy()
     have = known.astype(np.float32)
     for sigma in FILL_PX:
-        weight = cv2.GaussianBlur(have, (0, 0), sigma)
-        around = cv2.GaussianBlur(np.where(known[..., None], share, np.float32(0)), (0, 0), sigma)
+        if not left.any():
+            break
+        weight = gaussian_blur(have, sigma)
+        around = gaussian_blur(own, sigma)
         now = left & (weight > 0.02)
         out[now] = around[now] / weight[now][:, None]
         left &= ~now
