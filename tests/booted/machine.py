@@ -101,10 +101,10 @@ while not select.select([sys.stdin], [], [], 0.02)[0]:
     if not x.XGetSubImage(display, root, *part, ctypes.c_void_p(image), 0, 0):
         sys.exit("X does not answer any more")
     seen = pixels()
-    now = "black" if not any(seen) else hashlib.sha256(seen).hexdigest()
-    if now != before:
-        print(time.monotonic(), now, flush=True)
-        before = now
+    if seen != before:
+        at_s, before = time.monotonic(), seen
+        now = "black" if not any(seen) else hashlib.sha256(seen).hexdigest()
+        print(at_s, now, flush=True)
 """
 _FETCH: Final = """
 import ssl, sys, urllib.request
