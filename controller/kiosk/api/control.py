@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-import os
 import pwd
 import socket
 import struct
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError
+from controller.core.sockets import listening
 from controller.core.storage import runtime_path
 from controller.kiosk.operations.dispatch import CALLER
 from hal.errors import DeviceError
@@ -36,14 +36,7 @@ class ControlServer:
         self._path = path
         self._ended = threading.Event()
         self._places = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        path.unlink(missing_ok=True)  # the stage's lock ensures that this is the only server
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        before = os.umask(0o177)
-        try:
-            self._listener.bind(str(path))
-        finally:
-            os.umask(before)
-        self._listener.listen(MOST_CONNECTIONS)
+        self._listener = listening(path, MOST_CONNECTIONS)  # the stage's lock ensures that this is the only server
         self._thread = threading.Thread(target=self._accept, name="control", daemon=True)
         self._thread.start()
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Final, Self
 
 from controller.core.errors import UsageError, WorkError
+from controller.core.sockets import LONGEST_PATH_BYTES, listening
 from controller.core.storage import exclusive
 from controller.play.control.protocol import MAX_LINE_BYTES, InvalidRequest, error_line
 
 MAX_CLIENTS: Final = 16
 _BACKLOG: Final = 64
-_MAX_PATH_BYTES: Final = 107
 _MAX_UNSENT_BYTES: Final = 1024 * 1024
 _RECEIVE_BYTES: Final = 64 * 1024
 
@@ -48,17 +48,16 @@ class Server:
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        if len(os.fsencode(self.path)) > _MAX_PATH_BYTES:
+        if len(os.fsencode(self.path)) > LONGEST_PATH_BYTES:
             raise UsageError(
                 "socket-path-long",
-                what=f"The socket's path {self.path} is longer than {_MAX_PATH_BYTES} bytes.",
+                what=f"The socket's path {self.path} is longer than {LONGEST_PATH_BYTES} bytes.",
                 remedy="Use a shorter path, for instance below /run.",
             )
         with self._stack as stack:
             lock = self.path.with_name(self.path.name + ".lock")
             stack.enter_context(exclusive(lock, what_is_running="A player"))
-            self._listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
-            self._bind()
+            self._listener = stack.enter_context(self._bound())
             stack.callback(self.path.unlink, missing_ok=True)
             self._woken, self._waker = (stack.enter_context(end) for end in socket.socketpair())
             for end in (self._listener, self._woken, self._waker):
@@ -73,7 +72,7 @@ class Server:
             client.connection.close()
         self._stack.close()
 
-    def _bind(self) -> None:
+    def _bound(self) -> socket.socket:
         # The lock is ours, so whatever socket lies here belongs to a player that is dead.
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISSOCK(self.path.lstat().st_mode):
@@ -82,19 +81,14 @@ class Server:
                     what=f"{self.path} already exists and is not a socket.",
                     remedy="Remove it, or give the player another path.",
                 )
-            self.path.unlink()
-        before = os.umask(0o177)
         try:
-            self._listener.bind(str(self.path))
+            return listening(self.path, _BACKLOG)
         except OSError as error:
             raise WorkError(
                 "socket-not-made",
                 what=f"The socket {self.path} could not be created: {error.strerror}.",
                 remedy="Check that its folder exists and that you may write to it.",
             ) from error
-        finally:
-            os.umask(before)
-        self._listener.listen(_BACKLOG)
 
     def wake(self) -> None:
         """End a ``poll`` that is waiting, now. A full pipe means that it is ending already."""
