@@ -1,129 +1,28 @@
-"""Random lives of a lamp: whatever happens, and whatever fails, no rule is broken."""
+"""Random lives of a lamp: whatever happens, and whatever fails, no rule is broken (tests/campaigns/lamp_lives.py)."""
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable
-
 import pytest
 
-from controller.core.errors import WorkError
 from controller.rig.lamp_guard import LampGuard
-from hal.errors import DeviceError
-from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import ROUNDING_S, RULES, Killed, Lamp, Shelf, World, soon
+from tests.campaigns.lamp_lives import lived
 
-
-class Life:
-    """One lamp through a random life; every step may break a rule, and says so."""
-
-    def __init__(self, seed: int) -> None:
-        self.random = random.Random(seed)
-        self.world, self.shelf = World(), Shelf()
-        self.lamp = Lamp(self.world, tells_cooling=self.random.random() < 0.7)
-        self.guard = self.restarted()
-
-    def restarted(self) -> LampGuard:
-        return LampGuard("left", self.lamp, self.shelf, clock=self.world)
-
-    def step(self) -> None:
-        choose = self.random.random
-        self.lamp.trouble = self.random.choice(TROUBLES) if choose() < 0.2 else ""
-        self.lamp.reports = (
-            ProjectorStatus(self.random.choice([Power.UNKNOWN, Power.FAULT])) if choose() < 0.05 else None
-        )
-        self.shelf.full = choose() < 0.1
-        act = self.random.choices(ACTS, WEIGHTS)[0]
-        try:
-            act(self)
-        except (DeviceError, WorkError):
-            return
-        except Killed:
-            self.guard = self.restarted()
-
-    def on(self) -> None:
-        self.guard.switch_on(deadline=soon())
-
-    def off(self) -> None:
-        self.guard.switch_off(deadline=soon())
-
-    def look(self) -> None:
-        self.guard.status(deadline=soon())
-
-    def wait(self) -> None:
-        self.world.time_s += self.random.choice([0.1, 1.0, 3.0, 5.0, 8.0, 11.0])
-
-    def kill(self) -> None:
-        self.guard = self.restarted()
-
-    def projector_loses_power(self) -> None:
-        self.lamp.go_dark()
-
-    def everything_loses_power(self) -> None:
-        self.lamp.go_dark()
-        self.world.time_s += self.random.choice([0.5, 20.0])
-        self.world.reboot()
-        self.guard = self.restarted()
-
-    def remote_control(self) -> None:
-        """Somebody else presses the key, while the guard looks on."""
-        self.lamp.trouble, self.lamp.reports, self.shelf.full = "", None, False
-        self.look()
-        if self.lamp.lit_at_s is None:
-            self.lamp.strike(sin=False)
-        else:
-            self.lamp.go_dark()
-        self.look()
-
-    def cut_the_mains(self) -> None:
-        if self.guard.may_open_mains(deadline=soon()):
-            if self.lamp.lit_at_s is not None or self.cooled_s() < RULES.cool_down_s - ROUNDING_S:
-                self.lamp.sins.append("the mains of a hot lamp were cut")
-            self.lamp.go_dark()
-
-    def cooled_s(self) -> float:
-        return self.world.time_s - self.lamp.off_at_s
-
-    def measure(self) -> None:
-        self.guard.require_stable(deadline=soon())
-        if self.lamp.lit_at_s is None or self.world.time_s - self.lamp.lit_at_s < RULES.stable_s - ROUNDING_S:
-            self.lamp.sins.append("measured in unsteady light")
-
-
-TROUBLES = ["silent", "lost", "late", "refuse", "gone", "killed before", "killed after"]
-ACTS: list[Callable[[Life], None]] = [
-    Life.on,
-    Life.off,
-    Life.look,
-    Life.wait,
-    Life.kill,
-    Life.projector_loses_power,
-    Life.everything_loses_power,
-    Life.remote_control,
-    Life.cut_the_mains,
-    Life.measure,
-]
-WEIGHTS = [8, 4, 2, 8, 2, 1, 1, 1, 3, 3]
+SHORT = 10_000
+"""Fifty times as many as find a guard without a rest."""
 
 
 def test_no_random_life_breaks_a_rule() -> None:
     strikes = refusals = 0
-    for seed in range(100_000):
-        life = Life(seed)
-        for _ in range(25):
-            life.step()
+    for seed in range(SHORT):
+        life = lived(seed)
         assert not life.lamp.sins, (seed, life.lamp.sins)
         strikes += life.lamp.strikes
         refusals += life.guard.rest_left_s() > 0
     # The rules must not hold because nothing ever happens.
-    assert strikes > 100_000
-    assert refusals > 5_000
+    assert strikes > SHORT
+    assert refusals > SHORT / 20
 
 
 def test_the_random_lives_would_find_a_guard_that_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LampGuard, "rest_left_s", lambda self: 0.0)
-    lives = [Life(seed) for seed in range(200)]
-    for life in lives:
-        for _ in range(25):
-            life.step()
-    assert any(life.lamp.sins for life in lives)
+    assert any(lived(seed).lamp.sins for seed in range(200))
