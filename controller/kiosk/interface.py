@@ -15,28 +15,30 @@ from pathlib import Path
 from typing import Protocol
 
 from controller.kiosk.changes.values import Change, Changes
-from controller.kiosk.values import (
-    Achieved,
-    Aiming,
-    Appearance,
+from controller.kiosk.state import (
     BundleIdentity,
-    Comparison,
     DeviceRow,
     DriftCheck,
     EventLevel,
     EventRow,
-    Finding,
-    Fit,
-    FoundDevice,
     Grade,
     Job,
     JobStep,
     KioskState,
     Lamp,
-    LampDay,
     LiveValue,
     NextEvent,
     Place,
+)
+from controller.kiosk.values import (
+    Achieved,
+    Aiming,
+    Appearance,
+    Comparison,
+    Finding,
+    Fit,
+    FoundDevice,
+    LampDay,
     ProjectorAim,
     Reach,
     RecalibrationKind,

@@ -19,7 +19,8 @@ from controller.kiosk.changes.inventory import Inventory
 from controller.kiosk.changes.watch import InventoryWatch
 from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request
-from controller.kiosk.decide.reconciler import Limits, Reconciler
+from controller.kiosk.decide.reconciler import Reconciler
+from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of

@@ -13,7 +13,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import json_path, read_json
 from controller.core.arrays import Float64
 from controller.core.errors import VelaturaError
-from controller.kiosk.values import Place
+from controller.kiosk.state import Place
 from controller.stage.calibrations import finished_calibrations
 
 ASIDE_DEG: Final = 12.0

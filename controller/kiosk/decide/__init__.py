@@ -1,3 +1,3 @@
-"""What the kiosk does next: `reconciler` compares the wanted state with the actual one. Schedule, clock, job
-queue and overrides are its inputs.
+"""What the kiosk does next: `reconciler` compares the wanted state with the actual one, `stage_states` moves the state
+machine. Schedule, clock, job queue and overrides are their inputs.
 """

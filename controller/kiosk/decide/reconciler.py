@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from controller.core.errors import WorkError
@@ -18,7 +17,6 @@ from controller.kiosk.decide.content_selector import ContentSelector
 from controller.kiosk.decide.interfaces import (
     BLACK,
     Bundles,
-    Condition,
     Jobs,
     PlayerPort,
     PlayerView,
@@ -31,24 +29,15 @@ from controller.kiosk.decide.job_queue import JobQueue
 from controller.kiosk.decide.live_changes import LiveChanges, LiveChangesKept
 from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
+from controller.kiosk.decide.stage_states import LightNeed, Limits, StageStates
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.state_machine import Event, Machine, State
 
 BRIGHTNESS_FADE_S: Final = 0.25
 """As long as the player's supervisor waits between two looks, so that a slow change has no steps to see."""
-RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
-"""Between attempts to leave FAULT."""
 _SHOWING: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED, State.FAULT)
 """In a fault, too: a lamp whose control line is dead may be lit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Deadlines of the states, in seconds."""
-
-    power_up_s: float = 1800.0
-    cool_down_s: float = 900.0
 
 
 class Reconciler:
@@ -79,17 +68,20 @@ class Reconciler:
         self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
         self._limits = limits or Limits()
         self._queue = JobQueue(jobs, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
-        self.machine = Machine(self._changed)
+        self._states = StageStates(log, self._limits, monotonic)
         self.overrides = OperatorOverrides(log, without_time=without_time)
         self._live = LiveChangesKept(log)
         self._content = ContentSelector(bundles, self.overrides, self._live, self._queue, log)
         self._lock = threading.RLock()
         self._plan = Plan(None)
-        self._since_s = monotonic()
-        self._attempts, self._missing, self._silent = 0, frozenset[str](), frozenset[str]()
         self._lit_until_s, self._lit_while_closed = float("-inf"), False
 
     # -- commands and questions
+
+    @property
+    def machine(self) -> Machine:
+        """The state that the stage is in."""
+        return self._states.machine
 
     @property
     def plan(self) -> Plan:
@@ -116,7 +108,7 @@ class Reconciler:
         """Play until the next scheduled change."""
         with self._lock:
             self.overrides.override(True, self._plan)
-            self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
+            self._states.retry_now()
 
     def shut(self) -> None:
         """Stop, and cool the lamps, until the next scheduled change."""
@@ -234,7 +226,8 @@ class Reconciler:
                 self._live.end()
             lit_anyway = (wanted_open or self._lit_while_closed) and self._monotonic() < self._lit_until_s
             light = open_now or lit_anyway or self._queue.needs_light
-            self._move(views, light, open_now)
+            need = LightNeed(light, open_now, self._queue.needs_light)
+            self._states.follow(views, self._player.view.problem, need)
             cooling = self.machine.state in (State.COOLING, State.OFF)
             for supervisor in self._supervisors:
                 if supervisor.want_lit is not (wanted := light and not cooling):
@@ -253,7 +246,7 @@ class Reconciler:
         finished = self._queue.take_finished()
         if finished is not None and self.machine.state is State.CALIBRATING:
             event = Event.CANCEL if finished.failed else Event.CALIBRATED
-            self._go(event, finished.outcome.reason)
+            self._states.go(event, finished.outcome.reason)
 
     def _begin_work(self, views: Sequence[ProjectorView]) -> None:
         head = self._queue.head
@@ -265,104 +258,9 @@ class Reconciler:
         if (request := self._queue.ready(views)) is None:
             return
         if request.light:
-            self._go(Event.RECALIBRATE, f"{request.kind} starts")
+            self._states.go(Event.RECALIBRATE, f"{request.kind} starts")
             self._player.want = None
         self._queue.begin()
-
-    # -- states
-
-    def _move(self, views: Sequence[ProjectorView], light: bool, open_now: bool) -> None:
-        state = self.machine.state
-        if state is State.OFF:
-            if light:
-                self._go(Event.START, "light is needed")
-        elif state is State.COOLING:
-            self._cool(views)
-        elif state is State.FAULT:
-            self._recover(views, light)
-        elif state is State.CALIBRATING:
-            return
-        elif not light:
-            self._go(Event.STOP, "closed" if not open_now else "nothing to do")
-        elif state in (State.POWERING, State.WARMING):
-            self._power(views, state)
-        else:
-            self._keep_playing(views, state, open_now)
-
-    def _power(self, views: Sequence[ProjectorView], state: State) -> None:
-        shining = [view for view in views if view.shines]
-        coming = [view for view in views if view.coming]
-        late = self._monotonic() - self._since_s > self._limits.power_up_s
-        if (coming and not late) or not views:
-            return
-        if not shining:
-            self._go(Event.FAIL, _reasons(views) or "No lamp gave light in time.")
-        elif state is State.POWERING:
-            self._go(Event.LAMPS_LIT, _reasons(views))
-        elif late or all(view.stable_left_s <= 0 for view in shining if view.condition is Condition.LIT):
-            self._go(Event.LAMPS_STABLE, _reasons(views))
-
-    def _keep_playing(self, views: Sequence[ProjectorView], state: State, open_now: bool) -> None:
-        shining = [view.name for view in views if view.shines]
-        reasons = _reasons(views)
-        if self._player.view.problem is not None:
-            reasons = f"{self._player.view.problem.reason} {reasons}".strip()
-        self._missing = frozenset(view.name for view in views if not view.shines)
-        if not shining and not any(view.coming for view in views):
-            self._go(Event.FAIL, reasons or "No lamp gives light.")
-        elif state is State.DEGRADED:
-            if not reasons and not self._missing:
-                self._go(Event.RECOVERED, "every projector gives light again")
-        elif reasons or self._missing:
-            self._go(Event.DEGRADE, reasons or f"{', '.join(sorted(self._missing))} gives no light.")
-        elif state is State.READY and open_now and not self._queue.needs_light:
-            self._go(Event.PLAY, "open")
-        elif state is State.PLAYING and not open_now:
-            self._go(Event.PAUSE, "closed")
-
-    def _cool(self, views: Sequence[ProjectorView]) -> None:
-        lit = [view for view in views if view.condition is Condition.LIT or view.maybe_lit or not view.looked]
-        if not lit:
-            self._go(Event.COOLED, "every lamp is off or cooling by itself")
-        elif self._monotonic() - self._since_s > self._limits.cool_down_s:
-            names = ", ".join(view.name for view in lit)
-            self._go(Event.FAIL, f"The lamp of {names} could not be switched off. Use its remote control.")
-
-    def _recover(self, views: Sequence[ProjectorView], light: bool) -> None:
-        if not light:
-            # The lamps are wanted dark in this state, too: it ends when they are.
-            if not any(view.condition is Condition.LIT or view.maybe_lit for view in views):
-                self._go(Event.STOP, "closed")
-        elif self._answers_again(views):
-            self._go(Event.START, "a projector answers again")
-        elif any(view.condition is Condition.LIT for view in views) or self._waited(
-            RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
-        ):
-            self._attempts += 1
-            self._go(Event.START, "trying again")
-
-    def _answers_again(self, views: Sequence[ProjectorView]) -> bool:
-        """Whether one does that was silent in this fault: after a power cut, projectors boot longer than computers."""
-        silent = frozenset(view.name for view in views if view.condition is Condition.LOST)
-        back, self._silent = self._silent - silent, silent
-        return bool(back)
-
-    def _waited(self, seconds: float) -> bool:
-        return self._monotonic() - self._since_s >= seconds
-
-    def _go(self, event: Event, reason: str) -> None:
-        self._since_s, self._silent = self._monotonic(), frozenset()
-        self.machine.handle(event, reason)
-        if event in (Event.PLAY, Event.COOLED):
-            self._attempts = 0
-
-    def _changed(self, change: object) -> None:
-        machine = self.machine
-        bad = machine.state in (State.FAULT, State.DEGRADED)
-        remedy = "See the devices for what to do." if bad else ""
-        text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
-        level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
-        self._log.add(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
 
     # -- the player
 
@@ -371,7 +269,7 @@ class Reconciler:
         if state is State.CALIBRATING:
             return
         # If every lamp is dark, no projector can replace another.
-        missing = frozenset[str]() if len(self._missing) == len(views) else self._missing
+        missing = frozenset[str]() if len(self._states.missing) == len(views) else self._states.missing
         want = self._content.of(self._plan, missing) if open_now and state in _SHOWING else BLACK
         self._player.want = want
         shown = self._player.view.shown
@@ -386,11 +284,6 @@ class Reconciler:
 
 def _same_picture(one: Showing, other: Showing) -> bool:
     return (one.bundle, one.appearance, one.brightness) == (other.bundle, other.appearance, other.brightness)
-
-
-def _reasons(views: Sequence[ProjectorView]) -> str:
-    # One reason that all have is said once.
-    return " ".join(dict.fromkeys(view.problem.text for view in views if view.problem is not None))
 
 
 _NOTHING_PLAYS: Final = WorkError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from controller.kiosk.values import LiveValue
+from controller.kiosk.state import LiveValue
 from controller.panel.words import figures
 from controller.panel.words.language import gettext
 from controller.panel.words.language import mark as _

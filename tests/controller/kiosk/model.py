@@ -8,7 +8,8 @@ from pathlib import Path
 
 from controller.kiosk.decide.clock import TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing, Turn
-from controller.kiosk.decide.reconciler import Limits, Reconciler
+from controller.kiosk.decide.reconciler import Reconciler
+from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.jobs.job_runner import TITLES
 from controller.kiosk.roles import Role
+from controller.kiosk.state import LiveValue
 from controller.kiosk.supervisors.devices import DARK_ENOUGH, TOO_BRIGHT
-from controller.kiosk.values import LiveValue
 from controller.panel.words import figures, spoken
 from controller.panel.words.language import COOKIE, LANGUAGES, chosen, gettext, ngettext, speaking
 from controller.steps.appearance.requests import TITLES as SOURCE_TITLES
