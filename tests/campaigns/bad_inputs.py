@@ -24,13 +24,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from tests.campaigns.bad_files import Case, cases
+from tests.campaigns import bad_files, bad_stages
+from tests.campaigns.bad_cases import Case
 
 LONGEST_S: Final = 30.0
 """Of one command, on a machine that does much else meanwhile."""
 CODES: Final = (0, 1, 2, 3, 130)
 MOST: Final = 100_000
 ROOT: Final = Path(__file__).parents[2]
+
+
+def cases() -> list[Case]:
+    """All of them, always in the same order."""
+    return [*bad_stages.cases(), *bad_files.cases()]
 
 
 @dataclass(frozen=True, slots=True)

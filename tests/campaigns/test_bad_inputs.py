@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaigns.bad_files import Case, cases
-from tests.campaigns.bad_inputs import LONGEST_S, judged, run
+from tests.campaigns.bad_cases import Case
+from tests.campaigns.bad_inputs import LONGEST_S, cases, judged, run
 
 
 @pytest.mark.timeout(900)

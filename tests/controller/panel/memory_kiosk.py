@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from PIL import Image, ImageDraw, ImageOps
+from PIL import Image
 
 from controller.blender.job import BUILTIN
 from controller.core.errors import UsageError, WorkError
@@ -21,11 +21,8 @@ from controller.kiosk.interface import (
     Achieved,
     Aiming,
     Appearance,
-    BundleIdentity,
-    Change,
     Changes,
     Comparison,
-    DeviceRow,
     DriftCheck,
     EventLevel,
     EventRow,
@@ -36,42 +33,24 @@ from controller.kiosk.interface import (
     Job,
     JobStep,
     KioskState,
-    Lamp,
     LampDay,
-    LiveValue,
-    NextEvent,
-    Place,
-    ProjectorAim,
     Reach,
     RecalibrationKind,
     Results,
     Scene,
     Schedule,
     ScheduleRow,
-    Sharpness,
     TriedDevice,
     Unsubscribe,
 )
 from controller.kiosk.store import settings, targets
 from controller.kiosk.store.schedule_file import check
 from tests.controller.kiosk.vase import TEXT
+from tests.controller.panel import example_values as examples
+from tests.controller.panel.example_values import BORN, OUTPUTS
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
-OUTPUTS = ("left", "middle", "right")
-BORN = 1_767_600_000.0
 TOML = TEXT.replace("The vase", "Head of a boy")
-
-
-def devices() -> tuple[DeviceRow, ...]:
-    lamp = (LiveValue.said("Lamp", "lit"), LiveValue.said("Hours", "{0} h with Velatura, {1} strikes", 1204, 88))
-    lost = "It has not answered for 12 s."
-    return (
-        DeviceRow("left", "projector", "serial", lamp),
-        DeviceRow("middle", "projector", "pjlink", lamp),
-        DeviceRow("right", "projector", "serial", lamp[:1], lost, "Check its mains plug and the serial cable."),
-        DeviceRow("camera", "camera", "ptp", (LiveValue("Model", "EOS R5"), LiveValue.said("Battery", "{0} %", 87))),
-        DeviceRow("display", "display", "player", ()),
-    )
 
 
 class MemoryKiosk:
@@ -102,23 +81,7 @@ class MemoryKiosk:
         }
         self._results: dict[str, Results] = {}
         self._comparisons: dict[str, Comparison] = {}
-        self._state = KioskState(
-            revision=1,
-            stage="Head of a boy",
-            state="playing",
-            reason="Everything is well but one projector, whose part the others took over.",
-            since_unix_s=BORN,
-            devices=devices(),
-            playing=names[0],
-            next_event=NextEvent("Closes", BORN + 7200),
-            bundle=BundleIdentity(17, "9f2c" * 16, BORN),
-            lamps=(Lamp("left", 1204.0, 88, True, 3000), Lamp("right", 3120.0, 203, False, 3000)),
-            places=(
-                Place("left", "left", -32.0, 4.0),
-                Place("middle", "above", 3.0, 25.0),
-                Place("right", "right", 35.0, 0.0),
-            ),
-        )
+        self._state = examples.state(names[0])
         self.change(
             dose_klx_h=12.34,
             drifts=tuple(DriftCheck(f"night-{n}", BORN - n * 86400, "nothing", 0.04 + 0.01 * n) for n in range(5)),
@@ -144,14 +107,7 @@ class MemoryKiosk:
 
     def _drawn(self, name: str, shade: int = 120) -> Path:
         file = self._folder / f"{next(self._drawings)}.png"
-        # A ball in soft light, of another colour for each name.
-        light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
-        ball = Image.new("L", (240, 160))
-        ImageDraw.Draw(ball).ellipse((50, 10, 190, 150), fill=255)
-        tint = sum(name.encode()) % 3
-        channels = [light, light.point(lambda value: value * shade // 255), light.point(lambda value: value // 3)]
-        picture = Image.merge("RGB", channels[tint:] + channels[:tint])
-        Image.composite(picture, Image.new("RGB", (240, 160), (10, 9, 8)), ball).save(file)
+        examples.draw_ball(file, name, shade)
         return file
 
     def snapshot(self) -> KioskState:
@@ -166,7 +122,9 @@ class MemoryKiosk:
         return lambda: self._callbacks.remove(callback) if callback in self._callbacks else None
 
     def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
-        if projector is not None and projector not in [row.name for row in devices() if row.kind == "projector"]:
+        if projector is not None and projector not in [
+            row.name for row in examples.devices() if row.kind == "projector"
+        ]:
             raise UsageError("projector-unknown", what=f"There is no projector {projector}.", remedy="Choose another.")
         return self._begin(f"Recalibration ({kind})", "calibrating", lambda run: self._finish(run, kind))
 
@@ -367,9 +325,7 @@ class MemoryKiosk:
         del self._appearances[name]
 
     def lamp_history(self) -> Sequence[LampDay]:
-        days = ("2026-01-02", "2026-01-03", "2026-01-05")
-        left = [LampDay("left", day, 1190.0 + 7 * at, 84 + at) for at, day in enumerate(days)]
-        return [*left, LampDay("right", days[0], 3120.0, 203)]
+        return examples.lamp_history()
 
     def schedule(self) -> Schedule:
         return self._schedule
@@ -390,10 +346,7 @@ class MemoryKiosk:
         self.change(failures=tuple(row for row in self._state.failures if number is not None and row.number > number))
 
     def doctor(self) -> Sequence[Finding]:
-        return [
-            Finding("error", "Projector right", "It does not answer.", "Check its mains plug."),
-            Finding("warning", "Disk", "It is 91 % full.", "Remove old runs."),
-        ]
+        return examples.findings()
 
     def backup(self) -> Path:
         file = self._folder.parent / "backup.velatura"
@@ -416,12 +369,7 @@ class MemoryKiosk:
         raise UsageError("backup-nowhere", what="stage.toml names no place for backups.", remedy="Add one.")
 
     def changes(self) -> Changes:
-        change = Change(
-            "kernel", "", "6.1.0-28-amd64", "6.1.0-37-amd64",
-            "The kernel was 6.1.0-28-amd64, and is now 6.1.0-37-amd64.",
-            "If the picture is worse than before, install the version of before.", BORN,
-        )  # fmt: skip
-        return Changes(BORN, "20260101-100000-calibrate", (change,), ("The camera",))
+        return examples.changes()
 
     def settings(self) -> str:
         return self._toml
@@ -455,26 +403,13 @@ class MemoryKiosk:
         return file
 
     def aiming(self) -> Aiming:
-        aims = (ProjectorAim("left", 0.82, 0.9), ProjectorAim("middle", 0.9, 0.7), ProjectorAim("right", 0.4, 0.2))
-        hints = ("Turn right's focus ring; its pixels are soft.",)
-        focus = ({"left": 0.5, "right": 0.1}, {"left": 0.8, "right": 0.2}, {"left": 0.9, "middle": 0.7, "right": 0.2})
-        history = tuple(Sharpness(BORN - 60 * (2 - n), 0.6 + 0.1 * n, one) for n, one in enumerate(focus))
-        levels = tuple(abs(15 - n) / 240 for n in range(32))
-        return Aiming(aims, 0.77, 0.04, 0.06, 0.8, 0.93, hints, "test shots", BORN, self._drawn("aiming"), True, 0.002,
-                      levels, history)  # fmt: skip
+        return examples.aiming(self._drawn("aiming"))
 
     def test_shots(self) -> Job:
         return self._begin("Test shots", "calibrating", lambda run: None)
 
     def find_devices(self) -> Sequence[FoundDevice]:
-        tables = TEXT.partition("[[projectors]]")[2].partition("[[appearances]]")[0]
-        projector, _, rest = tables.partition("[camera]")
-        camera, _, display = rest.partition("[display]")
-        return [
-            FoundDevice("tty0", "projector", "serial", "Optoma on ttyUSB0", f"[[projectors]]{projector}"),
-            FoundDevice("usb", "camera", "ptp", "Canon EOS R5 on USB", f"[camera]{camera}"),
-            FoundDevice("screen", "display", "player", "One output of the graphics card", f"[display]{display}"),
-        ]
+        return examples.found_devices()
 
     def try_device(self, key: str) -> TriedDevice:
         if key not in [one.key for one in self.find_devices()]:
