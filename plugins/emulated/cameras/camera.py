@@ -9,7 +9,6 @@ import struct
 import threading
 import time
 import uuid
-from types import TracebackType
 from typing import Final, Literal, Self
 
 from hal.errors import DeviceError
@@ -38,6 +37,7 @@ from plugins.emulated.cameras.wire import (
     send,
     send_data,
 )
+from plugins.emulated.switched import Switched
 
 Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
 BODIES: Final = {
@@ -57,7 +57,7 @@ NAMES: Final = {
 _TAKEOVER_S: Final = 0.5
 
 
-class EmulatedPtpCamera:
+class EmulatedPtpCamera(Switched):
     """Serves one camera from ``start`` to ``stop``; also a context.
 
     Parameters
@@ -167,14 +167,6 @@ class EmulatedPtpCamera:
         for connection in ending:
             if connection is not None:
                 _end(connection)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def _listen(self, port: int, *, late: bool = False) -> socket.socket:
         """``late``: the port is taken, but refuses connections until ``_open_late``."""

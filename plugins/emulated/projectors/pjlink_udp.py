@@ -8,16 +8,16 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from types import TracebackType
 from typing import Final
 
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
+from plugins.emulated.switched import Switched
 
 _TICK_S: Final = 0.02
 _POWER: Final = {LampPhase.STANDBY: 0, LampPhase.LIT: 1, LampPhase.COOLING: 2, LampPhase.WARMING: 3}
 
 
-class EmulatedPjLinkUdp:
+class EmulatedPjLinkUdp(Switched):
     """The UDP side of a projector, on loopback. ``start`` and ``stop`` it, or use it in a ``with`` statement.
 
     Parameters
@@ -54,15 +54,6 @@ class EmulatedPjLinkUdp:
         self._stop.set()
         self._thread.join(timeout=2.0)
         self._socket.close()
-
-    def __enter__(self) -> EmulatedPjLinkUdp:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def select_input(self, name: str) -> None:
         """Somebody chose another input by the projector's own keys."""

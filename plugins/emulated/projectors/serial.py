@@ -12,7 +12,6 @@ import time
 import tty
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Protocol
 
 from hal.errors import DeviceError
@@ -21,6 +20,7 @@ from plugins.emulated.faults import Faults
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.optoma import OptomaBoard, OptomaQuirks
 from plugins.emulated.scenario import ScenarioPlayer
+from plugins.emulated.switched import Switched
 
 _TICK_S: Final = 0.02
 
@@ -35,7 +35,7 @@ class Board(Protocol):
         """Lines that are due now, unasked."""
 
 
-class EmulatedSerialProjector:
+class EmulatedSerialProjector(Switched):
     """A projector on a pty, reached by the symlink ``port`` as a real one is by ``/dev/serial/by-id/...``.
 
     Parameters
@@ -100,15 +100,6 @@ class EmulatedSerialProjector:
             self._thread.join(timeout=2.0)
             self._thread = None
         self.unplug()
-
-    def __enter__(self) -> EmulatedSerialProjector:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     @property
     def address(self) -> str:

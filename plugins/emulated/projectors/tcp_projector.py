@@ -7,20 +7,20 @@ import errno
 import socket
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from hal.errors import DeviceError
 from plugins.emulated.faults import Faults
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.scenario import ScenarioPlayer
+from plugins.emulated.switched import Switched
 
 _TICK_S: Final = 0.02
 
 
-class TcpProjector(ABC):
+class TcpProjector(Switched):
     """Listens on ``port``, 0 for any free one (see ``address`` once started).
 
     ``wedges_below_s``: asked twice within this time while its lamp warms or cools, it hangs: ``wedged`` is true.
@@ -76,15 +76,6 @@ class TcpProjector(ABC):
             self._listener.close()
             self._listener = None
 
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
     def _accept(self, listener: socket.socket) -> None:
         while not self._stop.is_set():
             self._tick()
@@ -92,7 +83,7 @@ class TcpProjector(ABC):
                 client, _ = listener.accept()
                 self._accepted(client)
 
-    def _tick(self) -> None:  # noqa: B027 - few need it
+    def _tick(self) -> None:
         """Called often while it listens."""
 
     def _accepted(self, client: socket.socket) -> None:
