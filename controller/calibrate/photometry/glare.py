@@ -13,12 +13,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.calibrate.photometry.reflectance import own_reflectance
+from controller.calibrate.photometry.reflectance import own_reflectance, subset, subset_of
 from controller.calibrate.values import Calibration, Geometry
 from controller.core.arrays import Float64, FloatImage, Mask
 
-SOME_PIXELS: Final = 400_000
-"""So many stand for a larger picture."""
 BLOCK_PX: Final = 24
 """Of the thinned picture."""
 WHOLE: Final = 0.9
@@ -45,8 +43,7 @@ def veiling_glare(calibration: Calibration, geometry: Geometry | None) -> float:
     parts = calibration.projectors
     if geometry is None or not parts or len(geometry.projectors) != len(parts):
         return 0.0
-    step = max(1, int(np.sqrt(calibration.object_mask.size / SOME_PIXELS)))
-    thin = np.s_[::step, ::step]
+    thin = subset(calibration.object_mask)
     thrown = [part.indirect[thin] for part in parts if part.indirect is not None]
     if len(thrown) < len(parts):
         return 0.0
@@ -56,7 +53,7 @@ def veiling_glare(calibration: Calibration, geometry: Geometry | None) -> float:
         black=calibration.black[thin],
         object_mask=calibration.object_mask[thin],
     )
-    shape = replace(geometry, points_m=geometry.points_m[thin], normals=geometry.normals[thin])
+    shape = subset_of(geometry, thin)
     paint, indirect = own_reflectance(few, shape), np.sum(thrown, axis=0)
     veil = _spread(np.asarray(indirect + np.sum([part.white for part in few.projectors], axis=0), np.float32))
     known: Mask = np.asarray(few.object_mask & np.isfinite(paint).all(axis=2))

@@ -6,12 +6,11 @@ what the surface mirrors of one of them alone.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from controller.calibrate.photometry.reflectance import falling_light
+from controller.calibrate.photometry.reflectance import falling_light, subset, subset_of
 from controller.calibrate.values import Calibration, Geometry
 from controller.core.arrays import Float64, FloatImage, Mask
 
@@ -20,8 +19,6 @@ SHARPNESS: Final = 25.0
 STEEPEST: Final = 0.3
 """Of the light that falls where most does: less comes at grazing angles, where the shape is not known well enough."""
 DARKEST: Final = 0.1
-SOME_PIXELS: Final = 400_000
-"""So many stand for a larger picture."""
 FEWEST_PIXELS: Final = 2000
 NAMED: Final = 0.01
 """Strength from which gloss is named: stages without any have at most 0.003."""
@@ -38,8 +35,8 @@ def gloss_strength(calibration: Calibration, geometry: Geometry | None) -> float
     parts = calibration.projectors
     if geometry is None or len(parts) < 2 or len(geometry.projectors) != len(parts):
         return 0.0
-    thin = np.s_[:: (step := max(1, int(np.sqrt(calibration.object_mask.size / SOME_PIXELS)))), ::step]
-    shape = replace(geometry, points_m=geometry.points_m[thin], normals=geometry.normals[thin])
+    thin = subset(calibration.object_mask)
+    shape = subset_of(geometry, thin)
     falling, whites = np.stack(falling_light(shape)), np.stack([part.white[thin] for part in parts])
     use = _known(calibration.object_mask[thin], falling, whites)
     if np.count_nonzero(use) < FEWEST_PIXELS:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from controller.calibrate.values import Calibration, Geometry
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 
 BRIGHT: Final = 0.3
 """Of a projector's strongest light: pixels that compare the strengths of projectors."""
 FAINTEST: Final = 0.1
 """Of the median light of all projectors: below it, at grazing edges, reflectance is not known."""
 WHITEST: Final = 99.0
+ENOUGH_PIXELS: Final = 400_000
+"""So many stand for a larger picture."""
 
 
 def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> FloatImage:
@@ -48,6 +51,17 @@ def falling_light(geometry: Geometry) -> list[FloatImage]:
             cosine = (towards * geometry.normals).sum(axis=2) / distance
             shapes.append(np.nan_to_num(np.maximum(cosine, 0) / distance**2, posinf=0.0).astype(np.float32))
     return shapes
+
+
+def subset(mask: Mask) -> tuple[slice, slice]:
+    """Every so many rows and columns of a picture like ``mask``, about ``ENOUGH_PIXELS`` together."""
+    step = max(1, int(np.sqrt(mask.size / ENOUGH_PIXELS)))
+    return np.s_[::step, ::step]
+
+
+def subset_of(geometry: Geometry, pixels: tuple[slice, slice]) -> Geometry:
+    """The same surface, known on these camera pixels alone."""
+    return replace(geometry, points_m=geometry.points_m[pixels], normals=geometry.normals[pixels])
 
 
 def _strengths(whites: FloatImage, shapes: FloatImage) -> FloatImage:
