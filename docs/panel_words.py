@@ -12,6 +12,7 @@ from babel.messages.extract import extract_from_dir
 from babel.messages.mofile import write_mo
 from babel.messages.pofile import read_po, write_po
 
+from controller.calibrate.verify import error_causes
 from controller.kiosk.operations.table import OPERATIONS
 from controller.panel.pages.forms import LEADS_TO
 from controller.panel.words.language import LANGUAGES
@@ -26,7 +27,7 @@ OPTIONS: Final = {"templates/**.html": {"trimmed": "true", "silent": "false", "e
 
 
 def words() -> Catalog:
-    """All that the panel says: in its templates and code, and the sentences of the operations that have a form."""
+    """All that the panel says: in its templates and code, the operations with a form, and the causes of errors."""
     found = Catalog(project="Velatura", charset="utf-8", fuzzy=False)
     for file, _, message, _, context in extract_from_dir(PANEL, METHODS, OPTIONS, KEYWORDS):
         found.add(message, None, [(file, 0)], context=context)
@@ -35,6 +36,8 @@ def words() -> Catalog:
             for sentence in (operation.said, operation.asks):
                 if sentence:
                     found.add(sentence, None, [("operations", 0)])
+    for name, _, _ in error_causes.WORDS.values():
+        found.add(name, None, [("error_causes", 0)])
     return found
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from controller.calibrate.values import Calibration
 from controller.calibrate.verify.drift import TransportModel
+from controller.calibrate.verify.error_causes import COLOURS, WORDS, ErrorCause
 from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.core.lettering import write
 
@@ -33,64 +33,6 @@ INDIRECT_SHARE = 0.15
 """More indirect light than this share of what is seen, and an error no larger than it, is taken for the reason."""
 UNDECODED_SHARE = 0.02
 """Of the brightest white: light without shares beyond it is missed."""
-
-
-class ErrorCause(enum.IntEnum):
-    """Codes of the label map; the first that holds is taken, in this order, INDIRECT before DIMMED."""
-
-    FINE = 0
-    SATURATED = 1
-    UNDECODED = 2
-    EDGE = 3
-    MOVED = 4
-    DIMMED = 5
-    DARK = 6
-    GRAZING = 7
-    DEFOCUS = 8
-    UNEXPLAINED = 9
-    INDIRECT = 10
-
-
-WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
-    ErrorCause.SATURATED: ("saturated", "the photograph is saturated", "shorten the exposure or cover what glares"),
-    ErrorCause.UNDECODED: (
-        "not decoded", "the projector lights it but its patterns could not be read",
-        "a shiny, very dark or barely lit surface; make it matt, or add light from another side",
-    ),
-    ErrorCause.EDGE: (
-        "edge of two surfaces", "camera pixels see two surfaces at once at a depth edge",
-        "`velatura calibrate --mode auto` measures such edges with dots",
-    ),
-    ErrorCause.MOVED: ("moved", "the pattern lies elsewhere than predicted", "something moved: run `velatura drift`"),
-    ErrorCause.DIMMED: ("brightness", "it is evenly brighter or darker than predicted",
-                    "let the lamps warm up longer, keep other light out, and calibrate again"),
-    ErrorCause.DARK: ("too dark", "it is too dark for the camera: the error is noise",
-                  "usually no action is needed; more light or a lighter surface would help"),
-    ErrorCause.GRAZING: ("grazing light", "the light falls at a grazing angle",
-                     "turn the object, or move a projector towards that side"),
-    ErrorCause.DEFOCUS: ("out of focus", "the projector is out of focus there", "focus the projector on this depth"),
-    ErrorCause.INDIRECT: (
-        "indirect light", "much of the light comes by way of other surfaces, and varies more than the model of it",
-        "darken what stands around the object, or use targets that are less dark there",
-    ),
-    ErrorCause.UNEXPLAINED: ("unexplained", "no simple reason was found",
-                         "glossy or translucent surfaces and reflections between surfaces can cause this"),
-}  # fmt: skip
-"""Short name, description, remedy."""
-
-COLOURS: Final[dict[ErrorCause, tuple[int, int, int]]] = {
-    ErrorCause.SATURATED: (240, 228, 66),
-    ErrorCause.UNDECODED: (0, 0, 0),
-    ErrorCause.EDGE: (0, 114, 178),
-    ErrorCause.MOVED: (213, 94, 0),
-    ErrorCause.DIMMED: (230, 159, 0),
-    ErrorCause.DARK: (86, 180, 233),
-    ErrorCause.GRAZING: (0, 158, 115),
-    ErrorCause.DEFOCUS: (204, 121, 167),
-    ErrorCause.INDIRECT: (146, 73, 0),
-    ErrorCause.UNEXPLAINED: (255, 255, 255),
-}
-"""Okabe and Ito's palette and a brown, which people with any colour vision tell apart."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 
+from controller.calibrate.verify import error_causes
 from controller.core.errors import UsageError
 from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
 from controller.kiosk.decide.days import grouped
@@ -26,6 +27,8 @@ from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
 from controller.panel.pages.lamp_days import lamp_reports
 from controller.panel.words.language import language, mark
 
+_CAUSES: Final = [(cause.name.lower(), name) for cause, (name, _, _) in error_causes.WORDS.items()]
+"""The classes of the style sheet, with the words of the legend."""
 GROUPS: Final = (mark("Show"), mark("Calibration"), mark("System"))
 NAVIGATION: Final = (
     ("/", mark("Now"), Role.VIEWER, "Show"),
@@ -260,7 +263,8 @@ class Pages:
         runs = list(self._panel.kiosk.runs())
         name = request.path_params.get("run") or (runs[0] if runs else None)
         compared = self._panel.kiosk.comparisons()
-        return {"runs": runs, "compared": compared, "results": self._panel.kiosk.results(name) if name else None}
+        results = self._panel.kiosk.results(name) if name else None
+        return {"runs": runs, "compared": compared, "results": results, "causes": _CAUSES}
 
     def _events(self, request: Request) -> dict[str, Any]:
         level = request.query_params.get("level", "")

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 
 from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
-from controller.calibrate.verify.error_attribution import (
-    COLOURS,
-    ErrorCause,
-    attribute_error,
-    attribution_picture,
-    ranked,
-)
+from controller.calibrate.verify.error_attribution import attribute_error, attribution_picture, ranked
+from controller.calibrate.verify.error_causes import COLOURS, ErrorCause
 from controller.capture.patterns import Pattern, PatternKind, frame
 from controller.core.arrays import FloatImage, Mask
 

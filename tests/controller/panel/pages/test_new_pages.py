@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from controller.calibrate.verify.error_attribution import COLOURS, WORDS
+from controller.calibrate.verify.error_causes import COLOURS, WORDS
 from controller.kiosk.interface import Aiming, EventRow, ProjectorAim
 from controller.kiosk.store.accounts import Role
 from tests.controller.panel.memory_kiosk import MemoryKiosk
