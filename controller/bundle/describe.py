@@ -150,4 +150,4 @@ def differences_as_text(found: Mapping[str, Any]) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(f"{output['name']} {output['width_px']}x{output['height_px']}" for output in value)
-    return "nobody" if value is None else str(value)
+    return "none" if value is None else str(value)

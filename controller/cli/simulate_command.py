@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    seed: Annotated[int, typer.Option(help="What happens, and whose turn it is, follows from it.", min=0)] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of the events and of their order.", min=0)] = 1,
     years: Annotated[float, typer.Option(help="Years of a kiosk, in lives of 14 days.", min=0.001)] = 0.1,
     keep: Annotated[Path | None, typer.Option(help="File for the shortened script of what broke a promise.")] = None,
     as_json: Json = False,

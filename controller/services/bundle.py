@@ -65,7 +65,7 @@ def build(
             hints_ms=hints_ms(folder),
             check=lambda: _check(cancel),
         )
-    signed = "nobody" if key is None else str(key)
+    signed = "not signed" if key is None else str(key)
     return {"file": str(path), "revision": index.revision, "appearances": ", ".join(chosen), "signed_with": signed}
 
 
@@ -191,7 +191,7 @@ def _identity(file: Path, trust: Trust) -> dict[str, Any]:
     with Bundle.open_trusted(file, ANY_SIGNER) as bundle:
         return {
             "revision": bundle.index.revision,
-            "signed_by": "nobody" if bundle.signed_by is None else bundle.signed_by.hex(),
+            "signed_by": "not signed" if bundle.signed_by is None else bundle.signed_by.hex(),
             "appearances": ", ".join(appearance.name for appearance in bundle.index.appearances),
             **_warning(bundle.signed_by, trust),
         }

@@ -70,7 +70,7 @@ def _box(crop: str) -> CameraBox:
     except ValueError:
         raise UsageError(
             "crop-wrong",
-            what=f"{crop!r} is no part of a picture.",
+            what=f"{crop!r} is not an area of the picture.",
             remedy="Give --crop X,Y,WIDTH,HEIGHT in whole camera pixels.",
         ) from None
     return CameraBox(top, left, top + height, left + width)

@@ -40,7 +40,7 @@ def dot_options(mode: str, spacing: str | None) -> DotOptions:
     if known is None:
         raise UsageError(
             "calibration-mode-unknown",
-            what=f"There is no way to calibrate called {mode}.",
+            what=f"There is no calibration mode called {mode}.",
             remedy=f"Choose one of {', '.join(MODES)}.",
         )
     if spacing is not None and known == "fast":

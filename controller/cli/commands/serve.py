@@ -110,7 +110,7 @@ def events(
     from controller.kiosk.api.offline_dispatch import LEVELS, call
 
     if level not in LEVELS:
-        raise UsageError("wrong-use", what=f"There is no level {level}.", remedy=f"One of {', '.join(LEVELS)}.")
+        raise UsageError("wrong-use", what=f"There is no level {level}.", remedy=f"Choose one of {', '.join(LEVELS)}.")
     rows = [row for row in call(stage, "events", after=after) if LEVELS.index(row["level"]) >= LEVELS.index(level)]
     lines = [f"{row['number']:>7} {_local(row['unix_s'])} {row['level']:<7} {printable(row['text'])}" for row in rows]
     console.show_result({"events": rows} if as_json else "\n".join(lines), as_json=as_json)

@@ -146,7 +146,7 @@ def _asked(
                 pairs = zip(left, words, strict=True)
                 return {one.output: numbers[word] for one, word in pairs if word != "-"}
             say(f"That is not {len(left)} different ones of {', '.join(numbers)}.")
-    raise WorkError("outputs-not-named", what="Which projector is at which output stays unknown.",
+    raise WorkError("outputs-not-named", what="It is still unknown which projector is at which output.",
                     remedy="Type the same command again.")  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def _with_size(path: Path, vertices: Floats, faces: npt.NDArray[np.int32]) -> Fl
     if not (np.isfinite(area) and SMALLEST < size < LARGEST and area > 1e-9 * size**2):
         raise DeviceError(
             "object-no-size",
-            what=f"The faces of {path} have no area, or are too small or too large to count with.",
+            what=f"The faces of {path} have no area, or are too small or too large to calculate with.",
             remedy="Export the object as a surface, in metres, centimetres or millimetres.",
         )
     return vertices

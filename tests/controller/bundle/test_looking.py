@@ -88,7 +88,7 @@ def test_other_outputs_and_signers_are_told(tmp_path: Path, unsigned: Path, key:
     )  # fmt: skip
     with Bundle.open_trusted(unsigned, ANY_SIGNER) as one, Bundle.open_trusted(small, ANY_SIGNER) as other:
         text = differences_as_text(differences(one, other))
-    assert "- signed_by nobody" in text
+    assert "- signed_by none" in text
     assert f"+ signed_by {bytes(key.verify_key).hex()}" in text
     assert "+ outputs left 4x4" in text
 

@@ -139,7 +139,7 @@ def test_displays_that_nothing_tells_apart_are_asked_for_at_once(debian: Path, t
 def test_after_three_wrong_answers_nothing_is_there_and_it_can_be_repeated(debian: Path, tmp_path: Path) -> None:
     file = backup(tmp_path, stage_text("DP-1", "DP-2", "DP-3"))
     now = told_by_x(*((f"HDMI-{n}", edid("SAME")) for n in (1, 2, 3)))
-    with pytest.raises(WorkError, match="stays unknown"):
+    with pytest.raises(WorkError, match="still unknown"):
         restored_on(debian, file, now, lambda _: "7")
     assert not (debian / STAGE.relative_to("/") / "stage.toml").exists()
     assert not list((debian / STAGE.parent.relative_to("/")).glob("restore-*"))
