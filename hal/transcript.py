@@ -30,7 +30,7 @@ HEADER: Final = "velatura transcript 1"
 _LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<way>[<>|]) (?P<data>[ -~]*)", re.ASCII)
 
 
-class Way(Enum):
+class Direction(Enum):
     """The direction of an entry."""
 
     SENT = ">"
@@ -43,7 +43,7 @@ class Entry:
     """One line of a transcript; ``at_s`` in seconds since it began."""
 
     at_s: float
-    way: Way
+    way: Direction
     data: bytes
 
 
@@ -68,13 +68,13 @@ class Transcript:
             return tuple(self._entries)
 
     def sent(self, data: bytes) -> None:
-        self._add(Way.SENT, data)
+        self._add(Direction.SENT, data)
 
     def received(self, data: bytes) -> None:
-        self._add(Way.RECEIVED, data)
+        self._add(Direction.RECEIVED, data)
 
     def remark(self, text: str) -> None:
-        self._add(Way.REMARK, text.encode("ascii", "backslashreplace"))
+        self._add(Direction.REMARK, text.encode("ascii", "backslashreplace"))
 
     def close(self) -> None:
         with self._lock:
@@ -83,7 +83,7 @@ class Transcript:
                     self._file.close()
                 self._file = None
 
-    def _add(self, way: Way, data: bytes) -> None:
+    def _add(self, way: Direction, data: bytes) -> None:
         entry = Entry(time.monotonic() - self._began, way, data)
         with self._lock:
             self._entries.append(entry)
@@ -113,7 +113,7 @@ def parse_transcript(text: str) -> tuple[Entry, ...]:
         match = _LINE.fullmatch(line)
         if match is None:
             raise _not_a_transcript(f"line {number} is not one")
-        entries.append(Entry(float(match["at"]), Way(match["way"]), unescaped(match["data"])))
+        entries.append(Entry(float(match["at"]), Direction(match["way"]), unescaped(match["data"])))
     return tuple(entries)
 
 
@@ -134,7 +134,9 @@ class ReplayLink:
     """
 
     def __init__(self, entries: Iterable[Entry]) -> None:
-        self._script = [(entry.way, entry.data) for entry in entries if entry.way is not Way.REMARK and entry.data]
+        self._script = [
+            (entry.way, entry.data) for entry in entries if entry.way is not Direction.REMARK and entry.data
+        ]
         self._buffer = bytearray()
         self._advance()
 
@@ -165,7 +167,7 @@ class ReplayLink:
                     remedy="Compare the driver with the transcript, or record a new one.",
                     theirs=False,
                 )
-            self._script[0] = (Way.SENT, expected[common:])
+            self._script[0] = (Direction.SENT, expected[common:])
             data = data[common:]
             self._advance()
 
@@ -176,9 +178,9 @@ class ReplayLink:
         """Nothing to close."""
 
     def _advance(self) -> None:
-        while self._script and (self._script[0][0] is Way.RECEIVED or not self._script[0][1]):
+        while self._script and (self._script[0][0] is Direction.RECEIVED or not self._script[0][1]):
             way, data = self._script.pop(0)
-            if way is Way.RECEIVED:
+            if way is Direction.RECEIVED:
                 self._buffer += data
 
     def _take(self, count: int) -> bytes:

@@ -52,7 +52,7 @@ class _Identifies(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class OutputOwner:
     """The projector that shows an output, or None if no shutter removed the light."""
 
     output: str
@@ -96,7 +96,7 @@ def show_numbers(rig: Rig, reporter: Reporter, deadline: Deadline, seconds: floa
     deadline.sleep(seconds)
 
 
-def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]:
+def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[OutputOwner]:
     """Light one output after the other, and find the shutter that removes the light."""
     look = _Camera(rig, folder, deadline)
     exposure_s = look.exposure_s()
@@ -110,11 +110,11 @@ def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Shown]
         owner = next(
             (suspect.name for suspect in suspects if look.goes_dark(suspect, frames, bright, exposure_s)), None
         )
-        shown.append(Shown(projector.output, owner))
+        shown.append(OutputOwner(projector.output, owner))
     return shown
 
 
-def judge(projectors: Sequence[RigProjector], shown: Sequence[Shown]) -> list[Finding]:
+def judge(projectors: Sequence[RigProjector], shown: Sequence[OutputOwner]) -> list[Finding]:
     """Problems with the cables, by output."""
     findings = []
     for projector, output in zip(projectors, shown, strict=True):

@@ -17,8 +17,8 @@ from controller.plan.values import Illumination, Placement, PlanGoal, Surface
 
 
 @dataclass(frozen=True, slots=True)
-class Together:
-    """What projectors do together at each of N points, each where it is of use.
+class CombinedLight:
+    """What projectors light together at each of N points, each where it is of use.
 
     ``lux`` (N,): the sum of them; ``detail_mm`` (N,): of the finest, infinite where there is none; ``count`` (N,)
     """
@@ -28,9 +28,9 @@ class Together:
     count: npt.NDArray[np.int64]
 
 
-def together(lit: Sequence[Illumination], useful: Mask) -> Together:
+def combined_light(lit: Sequence[Illumination], useful: Mask) -> CombinedLight:
     """``useful`` (projectors, N) bool: where each of ``lit`` is of use."""
-    return Together(
+    return CombinedLight(
         np.where(useful, [one.lux for one in lit], 0.0).sum(axis=0),
         np.where(useful, [one.detail_mm for one in lit], np.inf).min(axis=0),
         useful.sum(axis=0),
@@ -45,7 +45,7 @@ CAMERA_BLUR_PX: Final = 0.25
 def figures_of(best: Chosen, surface: Surface, goal: PlanGoal) -> dict[str, Any]:
     """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
     weight = surface.area_m2 / surface.area_m2.sum()
-    found = together([one.lit for one in best.candidates], np.stack([one.useful for one in best.candidates]))
+    found = combined_light([one.lit for one in best.candidates], np.stack([one.useful for one in best.candidates]))
     lux, detail, count = found.lux, found.detail_mm, found.count
     return {
         "quality": best.quality,

@@ -17,7 +17,7 @@ ANSWER_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Darkness:
+class AmbientLightLimit:
     """A light sensor at the object, and the maximum illuminance in lux for a calibration."""
 
     sensor: LightSensor
@@ -50,7 +50,7 @@ class LightWatch:
 
     The sensor at the object measures both. The minimum during one picture counts as that picture's own
     light; anything above it is room light. Constant room light is therefore noticed only when the
-    picture changes; for calibrations, ``Darkness`` checks it.
+    picture changes; for calibrations, ``AmbientLightLimit`` checks it.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class LightWatch:
         self._in_a_row = 0
         self._bright = False
 
-    def saw(self, lux: float, scene: str | None) -> str | None:
+    def observe(self, lux: float, scene: str | None) -> str | None:
         """A warning while there is room light; ``scene`` names the picture shown, None: none that stays."""
         if scene is None:
             self._in_a_row, self._bright = 0, False
@@ -80,27 +80,27 @@ class LightWatch:
         return f"The room is not dark: {room:.1f} lux at the object do not come from the projectors."
 
 
-def dark_before(darkness: Darkness | None) -> list[Step]:
+def dark_before(ambient_limit: AmbientLightLimit | None) -> list[Step]:
     """The step that refuses a bright room; it runs before the lamps are struck, so that their light does not count."""
-    if darkness is None:
+    if ambient_limit is None:
         return []
 
     def check(context: Context) -> Sequence[Path]:
-        lux = darkness.require(deadline=context.deadline)
+        lux = ambient_limit.require(deadline=context.deadline)
         context.reporter.say(f"The room is dark: {lux:.2f} lux at the object.")
         return ()
 
     return [Step(StepId("dark-before"), check, title="Checking that the room is dark", weight=0.1, always=True)]
 
 
-def dark_after(darkness: Darkness | None, display: Display) -> list[Step]:
+def dark_after(ambient_limit: AmbientLightLimit | None, display: Display) -> list[Step]:
     """The step that warns of light switched on meanwhile; the projectors show black for it."""
-    if darkness is None:
+    if ambient_limit is None:
         return []
 
     def check(context: Context) -> Sequence[Path]:
         display.show({}, deadline=context.deadline.within(ANSWER_S))
-        if (warning := darkness.warning(deadline=context.deadline)) is not None:
+        if (warning := ambient_limit.warning(deadline=context.deadline)) is not None:
             context.reporter.say(warning, Level.WARNING)
         return ()
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.capture.acquire import Acquirer
 from controller.core.arrays import ByteImage
-from controller.rig.ambient_light import Darkness
+from controller.rig.ambient_light import AmbientLightLimit
 from controller.rig.lamp_faults import AGAIN, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
@@ -44,7 +44,7 @@ class Rig:
     display: Display
     acquirer: Acquirer
     circuits: tuple[Circuit, ...] = ()
-    darkness: Darkness | None = None
+    ambient_limit: AmbientLightLimit | None = None
 
     @property
     def guards(self) -> tuple[LampGuard, ...]:

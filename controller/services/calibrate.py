@@ -112,7 +112,7 @@ def calibrating(
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
         *steps,
         verify_step(calibrated or Calibrated(run, checked.names), [step.id for step in steps], scale),
-        *dark_after(rig.darkness, rig.display),
+        *dark_after(rig.ambient_limit, rig.display),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]
 

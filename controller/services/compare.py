@@ -52,7 +52,7 @@ def photograph(
         drawn = picture_steps(calibrated, found.names)
         # Each with its pictures at once, so that a stopped run has a report of its photographs.
         both = [step for pair in zip(taken, drawn, strict=True) for step in pair]
-        return [*both, *dark_after(rig.darkness, rig.display)]
+        return [*both, *dark_after(rig.ambient_limit, rig.display)]
 
     run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
     html = comparison_report(run, checked)

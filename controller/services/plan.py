@@ -14,7 +14,7 @@ from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.plan.drawing import layout, value_map
-from controller.plan.figures import figures_of, together
+from controller.plan.figures import combined_light, figures_of
 from controller.plan.optics import lit_by
 from controller.plan.plan_file import EXAMPLE, PlanTables, read_plan
 from controller.plan.search import Chosen, candidates_of, chosen
@@ -147,7 +147,7 @@ def _maps(
     view = seen_from(target_object, eye, rows=VIEW_ROWS)
     lit = [lit_by(placement, view.surface, target_object) for placement in placements]
     useful = np.stack([values.useful(goal.steepest_degrees) for values in lit])
-    found = together(lit, useful)
+    found = combined_light(lit, useful)
     reached = found.count > 0
     finest = np.where(reached, found.detail_mm, np.nan)
     sharp = np.where(reached, np.where(useful, [values.blur_px for values in lit], np.inf).min(axis=0), np.nan)

@@ -97,7 +97,7 @@ def recalibrate(
         return [
             marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
             *repeated,
-            *dark_after(rig.darkness, rig.display),
+            *dark_after(rig.ambient_limit, rig.display),
             _take_over_step(worst_grade(checked), reporter, accept_grade=accept_grade),
             marker("recalibrated", "Recalibrated", leave=Event.CALIBRATED),
         ]

@@ -74,7 +74,7 @@ def refine(
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         nonlocal opened
         opened = True
-        return [*refine_steps(rig, calibrated, left, options), *dark_after(rig.darkness, rig.display)]
+        return [*refine_steps(rig, calibrated, left, options), *dark_after(rig.ambient_limit, rig.display)]
 
     try:
         if left:

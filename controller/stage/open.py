@@ -16,7 +16,7 @@ from controller.config import Stage
 from controller.config.models import OpenConfigTable
 from controller.core import kiosk_places
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
-from controller.rig.ambient_light import Darkness
+from controller.rig.ambient_light import AmbientLightLimit
 from controller.rig.doused import DousedProjector
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
@@ -46,7 +46,7 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
     stage = checked.stage
     with contextlib.ExitStack() as stack:
         context = open_context(stage.folder, runtime=stack.enter_context(used_runtime_folder(stage.folder)))
-        darkness = light_sensor(checked, context, stack, deadline)
+        ambient_limit = light_sensor(checked, context, stack, deadline)
         circuits = mains_circuits(checked, context, stack, deadline)
         close_circuits(circuits, deadline=deadline)
         guards = []
@@ -66,7 +66,7 @@ def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iter
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
         _closed_by(stack, display)
-        yield replace(rig_of(stage, guards, camera, display), circuits=circuits, darkness=darkness)
+        yield replace(rig_of(stage, guards, camera, display), circuits=circuits, ambient_limit=ambient_limit)
 
 
 @contextlib.contextmanager
@@ -113,13 +113,13 @@ def mains_circuits(
 
 def light_sensor(
     checked: Checked, context: OpenContext, stack: contextlib.ExitStack, deadline: Deadline
-) -> Darkness | None:
+) -> AmbientLightLimit | None:
     table = checked.stage.tables.light_sensor
     if table is None or checked.light_sensor is None:
         return None
     sensor = cast("LightSensor", open_device(table, *checked.light_sensor, context, deadline))
     _closed_by(stack, sensor)
-    return Darkness(sensor, table.most_lux)
+    return AmbientLightLimit(sensor, table.most_lux)
 
 
 def open_device(

@@ -101,7 +101,7 @@ class OwnSession(StageSession):
         ):
             clear_unfinished_writes(journal.folder)
             machine = Machine(journal.record_change)
-            first = dark_before(rig.darkness) if dark else []
+            first = dark_before(rig.ambient_limit) if dark else []
             power = power_steps(rig, power_up_s=safety.power_up_s)
             steps = [*first, *before(rig), *power, *compiled, *make_steps(rig, journal.folder)]
             with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
@@ -140,7 +140,7 @@ class BorrowedSession(StageSession):
             raise ValueError("this session has no devices")
         with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, name)) as journal:
             clear_unfinished_writes(journal.folder)
-            first = dark_before(self.rig.darkness) if dark else []
+            first = dark_before(self.rig.ambient_limit) if dark else []
             steps = [*first, *compiled, *make_steps(self.rig, journal.folder)]
             Runner(steps, journal, reporter=reporter).run(name, deadline=in_seconds(LONGEST_RUN_S, cancel))
             return journal.folder

@@ -70,7 +70,7 @@ class IndirectLight:
         direct = wanted
         size = max(float(np.abs(wanted).max(initial=0)), 1e-30)
         for _ in range(ROUNDS):
-            after = np.where(lit, wanted - self.forward(shown(direct, reach)), 0)
+            after = np.where(lit, wanted - self.forward(displayable(direct, reach)), 0)
             change = float(np.abs(after - direct).max(initial=0))
             direct = after.astype(np.float32, copy=False)
             if change < CONVERGED * size:
@@ -83,7 +83,7 @@ class IndirectLight:
         return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape}
 
 
-def shown(direct: FloatImage, reach: FloatImage | None = None) -> FloatImage:
+def displayable(direct: FloatImage, reach: FloatImage | None = None) -> FloatImage:
     """What can be shown of a direct image: no less than none, and no more than ``reach``."""
     return np.maximum(direct, 0) if reach is None else np.clip(direct, 0, reach)
 

@@ -13,7 +13,7 @@ from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import IndirectLight, down, up
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
-from controller.transport.indirect_weights import Part, Shown, Term, fit_weights, shown
+from controller.transport.indirect_weights import BlockLight, Part, Term, block_light, fit_weights
 
 NEAR_BLOCKS: Final = (1.0, 3.0)
 """Standard deviations of near light, in blocks: what spreads under the surface, or between neighbours."""
@@ -45,7 +45,7 @@ def fit_indirect(
         kinds.append(form_factors(points_m, normals, grid, side))
     whole = np.sum(indirect, axis=0)
     whites = [
-        shown(part.white, down(image, grid, side), whole, lit, grid, side)
+        block_light(part.white, down(image, grid, side), whole, lit, grid, side)
         for part, image in zip(calibration.projectors, indirect, strict=True)
     ]
     stripes = [one for part in calibration.projectors for one in _striped(part, whole, lit, grid, side)]
@@ -64,7 +64,9 @@ def fit_indirect(
     return IndirectLight(own, scale.astype(np.float32), lit, grid, side, room)
 
 
-def _striped(part: ProjectorCalibration, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int) -> list[Shown]:
+def _striped(
+    part: ProjectorCalibration, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int
+) -> list[BlockLight]:
     """What a projector's coarse stripes throw back."""
     if part.stripes is None or part.phase_map is None:
         return []
@@ -74,7 +76,7 @@ def _striped(part: ProjectorCalibration, whole: FloatImage, lit: Mask, grid: tup
     for pattern, seen in zip(coarse_stripes(plan_patterns((columns, rows))), part.stripes, strict=True):
         light, dark = stripe_parts(pattern, (columns, rows), at)
         direct = white * light[..., None]
-        found.append(shown(direct, seen, few, lit[::stride, ::stride], grid, side // stride, dark))
+        found.append(block_light(direct, seen, few, lit[::stride, ::stride], grid, side // stride, dark))
     return found
 
 

@@ -33,7 +33,7 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class BlockLight:
     """A picture of one projector, by blocks: what it lights, and the indirect light that is seen.
 
     ``own``, ``room`` (blocks, 3): direct light on the object, and on what is none of it
@@ -52,10 +52,10 @@ class Shown:
         return self.own + self.room if part == "all" else self.own if part == "object" else self.room
 
 
-def shown(
+def block_light(
     direct: FloatImage, seen: FloatImage, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int,
     dark: Mask | None = None,
-) -> Shown:  # fmt: skip
+) -> BlockLight:  # fmt: skip
     """A picture from its ``direct`` light and that of all whites that is indirect, (rows, columns, 3).
 
     ``lit`` (rows, columns): on the object; ``dark``: the pixels that ``seen`` (blocks, 3) is the sum of, None: all
@@ -64,14 +64,14 @@ def shown(
     room = down(direct, grid, side) - own
     if dark is None:
         every = down(np.ones((*lit.shape, 1), np.float32), grid, side)[:, 0]
-        return Shown(own, room, seen, down(whole, grid, side), every)
+        return BlockLight(own, room, seen, down(whole, grid, side), every)
     covered = down(dark[..., None].astype(np.float32), grid, side)[:, 0]
-    return Shown(own, room, seen, down(np.where(dark[..., None], whole, np.float32(0)), grid, side), covered)
+    return BlockLight(own, room, seen, down(np.where(dark[..., None], whole, np.float32(0)), grid, side), covered)
 
 
 def fit_weights(
-    terms: Sequence[Term], whites: Sequence[Shown], stripes: Sequence[Shown], grid: tuple[int, int], side: int,
-    shape: tuple[int, ...],
+    terms: Sequence[Term], whites: Sequence[BlockLight], stripes: Sequence[BlockLight], grid: tuple[int, int],
+    side: int, shape: tuple[int, ...],
 ) -> FloatImage:  # fmt: skip
     """The factor (terms,) >= 0 of each term that tells pictures' indirect light apart best.
 
@@ -108,7 +108,7 @@ def fit_weights(
 
 
 def _falling(
-    terms: Sequence[Term], pictures: Sequence[Shown], across: Callable[[FloatImage], FloatImage]
+    terms: Sequence[Term], pictures: Sequence[BlockLight], across: Callable[[FloatImage], FloatImage]
 ) -> FloatImage:
     """(pictures, terms, blocks, 3): what each term makes of each picture's direct light."""
     found = []
@@ -141,7 +141,7 @@ def _root(products: Float64) -> Float64:
     return np.asarray(np.sqrt(np.maximum(values, 0))[:, None] * vectors.T)
 
 
-def _part(one: Shown) -> tuple[FloatImage, FloatImage]:
+def _part(one: BlockLight) -> tuple[FloatImage, FloatImage]:
     """(blocks, 3): a picture's share of all whites' indirect light, and 1 where that is known."""
     known = ((one.covered[:, None] > LEAST_DARK) & (one.whole > 0)).astype(np.float32)
     return np.divide(one.seen, one.whole, out=np.zeros_like(one.whole), where=one.whole > 0), known

@@ -29,7 +29,7 @@ LOCK: Final = "lock"
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredFolder:
     """A folder outside the stage: its content, its bytes, and whether a running program uses it."""
 
     path: Path
@@ -91,17 +91,17 @@ def temporary(base: Path | None = None) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def kept() -> list[Kept]:
+def kept() -> list[StoredFolder]:
     """All existing folders."""
     found = []
     for path, what in _places():
         with contextlib.suppress(OSError):
             if path.is_dir() and not path.is_symlink() and path.stat().st_uid == os.getuid():
-                found.append(Kept(path, what, _size(path), in_use(path)))
+                found.append(StoredFolder(path, what, _size(path), in_use(path)))
     return found
 
 
-def remove() -> list[Kept]:
+def remove() -> list[StoredFolder]:
     """Remove the folders that no running program uses; returns the removed ones."""
     removed = [folder for folder in kept() if not folder.in_use]
     for folder in removed:
@@ -145,7 +145,7 @@ def _size(folder: Path) -> int:
     return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def summary(found: Sequence[Kept]) -> list[str]:
+def summary(found: Sequence[StoredFolder]) -> list[str]:
     """One sentence for each kind of folder, with its path if there is only one."""
     lines = []
     for what in dict.fromkeys(folder.what for folder in found):

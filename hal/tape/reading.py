@@ -14,12 +14,12 @@ from hal.errors import ProtocolError
 from hal.escapes import unescaped
 from hal.runtime.files import require_regular
 from hal.tape.recorder import HEADER, MOST_BYTES, PACKED
-from hal.transcript import Entry, Way
+from hal.transcript import Direction, Entry
 
 LARGEST_PIECE: Final = 256 << 20
 MOST_TRACKS: Final = 10_000
 _LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<mark>[+<>|{}]) (?P<track>\d{1,6}) (?P<text>[ -~]*)", re.ASCII)
-_WAYS: Final = {**{way.value: way for way in Way}, **{mark: way for way, mark in PACKED.items()}}
+_WAYS: Final = {**{way.value: way for way in Direction}, **{mark: way for way, mark in PACKED.items()}}
 
 
 @dataclass(frozen=True, slots=True)

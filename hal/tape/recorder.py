@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from hal.escapes import escaped
-from hal.transcript import Transcript, Way
+from hal.transcript import Direction, Transcript
 
 HEADER: Final = "velatura tape 1"
 MOST_BYTES: Final = 1 << 30
 """A tape ends at this size, so that it fills no disk."""
 PACK_FROM: Final = 200
 """Longer pieces are packed."""
-PACKED: Final = {Way.SENT: "}", Way.RECEIVED: "{"}
+PACKED: Final = {Direction.SENT: "}", Direction.RECEIVED: "{"}
 _PJLINK_GREETING: Final = re.compile(rb"PJLINK 1 [0-9A-Fa-f]{1,64}")
 _PJLINK_DIGEST: Final = re.compile(rb"\A(?:[0-9A-Fa-f]{64}|[0-9A-Fa-f]{32})(?=%)")
 
@@ -57,7 +57,7 @@ class Tape:
                     self._file.close()
                 self._file = None
 
-    def add(self, number: int, way: Way, data: bytes) -> None:
+    def add(self, number: int, way: Direction, data: bytes) -> None:
         """Write one piece of a track."""
         if way in PACKED and len(data) >= PACK_FROM:
             self._line(PACKED[way], number, base64.b64encode(zlib.compress(data, 1)).decode())
@@ -90,7 +90,7 @@ class TapeTrack(Transcript):
         self._kind = kind
         self._secrets = tuple(secret for secret in secrets if secret)
 
-    def _add(self, way: Way, data: bytes) -> None:
+    def _add(self, way: Direction, data: bytes) -> None:
         self._tape.add(self._number, way, self._without_secrets(data))
 
     def _without_secrets(self, data: bytes) -> bytes:

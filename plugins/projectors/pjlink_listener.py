@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Final
 
 from hal.codecs.projectors.pjlink import PORT
-from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Here, Notification, parse_datagram
+from hal.codecs.projectors.pjlink_udp import LONGEST_DATAGRAM, SEARCH, Notification, SearchAck, parse_datagram
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, ProtocolError
 
@@ -101,7 +101,7 @@ class PjLinkListener:
         while not patience.passed and len(found) < MOST_FOUND:
             patience.sleep(0)
             for heard in self._received(patience):
-                if isinstance(heard.notification, Here):
+                if isinstance(heard.notification, SearchAck):
                     found.setdefault(heard.notification.mac, FoundProjector(heard.host, heard.notification.mac))
                 elif len(self._kept) < MOST_FOUND:
                     self._kept.append(heard)

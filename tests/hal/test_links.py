@@ -17,7 +17,7 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import TcpLink, host_and_port
 from hal.serial_link import SerialLink
-from hal.transcript import Transcript, Way
+from hal.transcript import Direction, Transcript
 
 
 class Peer:
@@ -150,8 +150,8 @@ def test_every_byte_stands_in_the_transcript(peer: Peer) -> None:
     peer.link.write(b"question\r", deadline=in_seconds(20))
     peer.socket.sendall(b"answer\r")
     peer.link.read_until(b"\r", limit=10, deadline=in_seconds(20))
-    sent = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Way.SENT)
-    received = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Way.RECEIVED)
+    sent = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Direction.SENT)
+    received = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Direction.RECEIVED)
     assert (sent, received) == (b"question\r", b"answer\r")
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hal.deadline import in_seconds
 from hal.errors import DeviceTimeout, ProtocolError
 from hal.escapes import escaped, unescaped
-from hal.transcript import HEADER, Entry, ReplayLink, Transcript, Way, line_of, parse_transcript
+from hal.transcript import HEADER, Direction, Entry, ReplayLink, Transcript, line_of, parse_transcript
 
 
 @given(st.binary(max_size=200))
@@ -33,7 +33,9 @@ def test_no_text_is_read_as_bytes_by_mistake(text: str) -> None:
 
 @given(
     st.lists(
-        st.builds(Entry, st.integers(0, 10**6).map(lambda n: n / 64), st.sampled_from(Way), st.binary(max_size=30)),
+        st.builds(
+            Entry, st.integers(0, 10**6).map(lambda n: n / 64), st.sampled_from(Direction), st.binary(max_size=30)
+        ),
         max_size=10,
     )
 )
@@ -63,9 +65,9 @@ def test_a_file_holds_every_byte_at_once(tmp_path: Path) -> None:
     transcript.remark("unplugged")
     on_disk = parse_transcript((tmp_path / "t.txt").read_text())
     assert [(entry.way, entry.data) for entry in on_disk] == [
-        (Way.SENT, b"~00124 1\r"),
-        (Way.RECEIVED, b"OK\xff\\"),
-        (Way.REMARK, b"unplugged"),
+        (Direction.SENT, b"~00124 1\r"),
+        (Direction.RECEIVED, b"OK\xff\\"),
+        (Direction.REMARK, b"unplugged"),
     ]
     assert len(transcript.entries) == 1, "memory is bounded, the file is not"
     transcript.close()
@@ -73,12 +75,12 @@ def test_a_file_holds_every_byte_at_once(tmp_path: Path) -> None:
 
 
 RECORD = [
-    Entry(0.0, Way.SENT, b"ab"),
-    Entry(0.0, Way.SENT, b"c\r"),
-    Entry(0.1, Way.RECEIVED, b"one\rtw"),
-    Entry(0.2, Way.RECEIVED, b"o\r"),
-    Entry(0.3, Way.SENT, b"d\r"),
-    Entry(0.4, Way.RECEIVED, b"!"),
+    Entry(0.0, Direction.SENT, b"ab"),
+    Entry(0.0, Direction.SENT, b"c\r"),
+    Entry(0.1, Direction.RECEIVED, b"one\rtw"),
+    Entry(0.2, Direction.RECEIVED, b"o\r"),
+    Entry(0.3, Direction.SENT, b"d\r"),
+    Entry(0.4, Direction.RECEIVED, b"!"),
 ]
 
 

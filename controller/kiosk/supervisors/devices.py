@@ -20,7 +20,7 @@ from controller.kiosk.supervisors.light_dose import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import World
-from controller.rig.ambient_light import Darkness, LightWatch
+from controller.rig.ambient_light import AmbientLightLimit, LightWatch
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile
 from controller.rig.rig import Rig
@@ -141,7 +141,7 @@ class Devices:
             held = [guard for guard in guards if guard is not None]
             rig = rig_of(self._checked.stage, held, cast("Camera", camera), display)
             try:
-                yield replace(rig, darkness=self._darkness())
+                yield replace(rig, ambient_limit=self._ambient_limit())
             except DeviceGone as error:
                 # The job sees only a closed device; its supervisor knows the reason.
                 lost = any(
@@ -203,8 +203,8 @@ class Devices:
 
         def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
             lux = cast("LightSensor", device).illuminance_lux(deadline=deadline)
-            self._report_light(watch.saw(lux, self.scene()))
-            self._dose.saw(lux)
+            self._report_light(watch.observe(lux, self.scene()))
+            self._dose.add(lux)
             dark = DARK_ENOUGH if lux <= table.most_lux else TOO_BRIGHT
             return (LiveValue.said("Light", dark, lux, digits=2),)
 
@@ -218,11 +218,11 @@ class Devices:
         elif room is None and before is not None:
             self._tell(Decision("room-dark", "The room is dark again."))
 
-    def _darkness(self) -> Darkness | None:
+    def _ambient_limit(self) -> AmbientLightLimit | None:
         table = self._checked.stage.tables.light_sensor
         if table is None or self.sensor is None or self.sensor.device is None:
             return None
-        return Darkness(cast("LightSensor", self.sensor.device), table.most_lux)
+        return AmbientLightLimit(cast("LightSensor", self.sensor.device), table.most_lux)
 
     def _mains_supervisor(self) -> MainsSupervisor | None:
         if not self._checked.relays:

@@ -36,7 +36,7 @@ class LightDose:
         with self._lock:
             return self._lux_s / 3600
 
-    def saw(self, lux: float) -> None:
+    def add(self, lux: float) -> None:
         """Add the light since the reading before, taken as bright as the brighter of both; saved every ten minutes."""
         now_s, lux = self._monotonic(), max(lux, 0.0) if math.isfinite(lux) else 0.0
         with self._lock:

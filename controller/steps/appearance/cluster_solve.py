@@ -14,7 +14,7 @@ from controller.solve.request import AppearanceResult, SolveOptions
 from controller.steps.appearance.solving import Answering, AppearanceRequest
 
 
-class Spreading:
+class ClusterSolve:
     """Solves like ``steps.appearance.solving``; the first request also submits those that follow.
 
     Requests with a step before their solving (Blender's) are submitted when it is their turn.
@@ -60,7 +60,7 @@ def answering_on(
         yield None
         return
     with connected(scheduler) as cluster:
-        spreading = Spreading(cluster, calibrated, requests)
+        spreading = ClusterSolve(cluster, calibrated, requests)
         try:
             yield spreading
         finally:

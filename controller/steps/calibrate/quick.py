@@ -41,7 +41,7 @@ from controller.steps.calibrate.grade import verification_photographs_step, veri
 from controller.steps.capture.photographs import Planned, take_all
 
 
-class Way(enum.Enum):
+class Reuse(enum.Enum):
     """How a quick recalibration treats a step of the full one."""
 
     RUN = "run"
@@ -97,43 +97,43 @@ def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
     """The step, run, kept or corrected depending on the drift."""
 
     def run(context: Context) -> Sequence[Path]:
-        way = way_of(step.id, read_drift(context.folder), mode_of(last.folder))
-        if way is Way.RUN:
+        way = reuse_of(step.id, read_drift(context.folder), mode_of(last.folder))
+        if way is Reuse.RUN:
             return step.run(context)
         kept = copy_from_last(last.folder, step.id, context)
         if kept is None:  # the last calibration had no such step
             return step.run(context)
-        return kept if way is Way.KEEP else _correct(rig, last, step.id, kept, context)
+        return kept if way is Reuse.KEEP else _correct(rig, last, step.id, kept, context)
 
     return dataclasses.replace(step, run=run, after=(*step.after, StepId(StepKind.DRIFT)), weight=0.1 * step.weight)
 
 
-def way_of(step: StepId, drift: Drift, mode: str = "fast") -> Way:
+def reuse_of(step: StepId, drift: Drift, mode: str = "fast") -> Reuse:
     """How to treat a step of the full calibration. ``mode``: how the last one measured its metapixels."""
     if advice(drift) == "full":
-        return Way.RUN
+        return Reuse.RUN
     if drift.nothing:
-        return Way.KEEP
+        return Reuse.KEEP
     if step.kind == StepKind.BLACK:
-        return Way.RUN
+        return Reuse.RUN
     if step.kind == StepKind.GEOMETRY:
-        return Way.RUN if drift.moved else Way.KEEP
+        return Reuse.RUN if drift.moved else Reuse.KEEP
     for moved in drift.projectors:
         if step.projector == moved.name:
-            return _way_of(step.kind, moved, mode)
-    return Way.KEEP
+            return _reuse_of(step.kind, moved, mode)
+    return Reuse.KEEP
 
 
-def _way_of(kind: str, one: ProjectorDrift, mode: str) -> Way:
+def _reuse_of(kind: str, one: ProjectorDrift, mode: str) -> Reuse:
     if not one.known or (one.moved and not (one.turned_only and mode == "fast")):
-        return Way.RUN
+        return Reuse.RUN
     if kind == StepKind.RADIOMETRY:
-        return Way.CORRECT  # black has been photographed again
+        return Reuse.CORRECT  # black has been photographed again
     if kind == StepKind.LIGHT:
-        return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
+        return Reuse.CORRECT if one.moved or one.dimmed else Reuse.KEEP
     if kind == StepKind.INDIRECT:
-        return Way.CORRECT if one.moved or one.dimmed else Way.KEEP
-    return Way.CORRECT if kind == StepKind.PIXELS and one.moved else Way.KEEP
+        return Reuse.CORRECT if one.moved or one.dimmed else Reuse.KEEP
+    return Reuse.CORRECT if kind == StepKind.PIXELS and one.moved else Reuse.KEEP
 
 
 def copy_from_last(last: Path, step: StepId, context: Context) -> list[Path] | None:
@@ -205,4 +205,4 @@ def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
     return {name: image}
 
 
-__all__ = ["Way", "chosen", "copy_from_last", "quick_steps", "way_of"]
+__all__ = ["Reuse", "chosen", "copy_from_last", "quick_steps", "reuse_of"]

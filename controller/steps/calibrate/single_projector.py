@@ -22,7 +22,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.calibrate.grade import verification_photographs_step, verify_step
-from controller.steps.calibrate.quick import Way, copy_from_last
+from controller.steps.calibrate.quick import Reuse, copy_from_last
 from controller.steps.capture.patterns import capture_steps
 
 ANEW = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
@@ -44,7 +44,7 @@ def one_projector_steps(
     inputs = {"only": projector, "calibration": last.folder.name}
     steps = [
         dataclasses.replace(step, run=partial(_exposure, last, exposing) if step.id == EXPOSURE else step.run)
-        if (way := way_of(step.id, projector)) is Way.RUN
+        if (way := reuse_of(step.id, projector)) is Reuse.RUN
         else dataclasses.replace(step, run=partial(_kept, last, step, way), weight=0.01)
         for step in full
     ]
@@ -57,11 +57,11 @@ def one_projector_steps(
     return steps
 
 
-def way_of(step: StepId, projector: str) -> Way:
+def reuse_of(step: StepId, projector: str) -> Reuse:
     """How to treat a step of the full calibration."""
     if step.kind in ANEW or step == EXPOSURE or step.projector == projector:
-        return Way.RUN
-    return Way.CORRECT if step.kind == StepKind.RADIOMETRY else Way.KEEP
+        return Reuse.RUN
+    return Reuse.CORRECT if step.kind == StepKind.RADIOMETRY else Reuse.KEEP
 
 
 def _exposure(last: Calibrated, exposing: Step, context: Context) -> Sequence[Path]:
@@ -71,11 +71,11 @@ def _exposure(last: Calibrated, exposing: Step, context: Context) -> Sequence[Pa
     return [Exposures.write(context.folder, {**Exposures.read(last.folder), **found})]
 
 
-def _kept(last: Calibrated, step: Step, way: Way, context: Context) -> Sequence[Path]:
+def _kept(last: Calibrated, step: Step, way: Reuse, context: Context) -> Sequence[Path]:
     kept = copy_from_last(last.folder, step.id, context)
     if kept is None:  # the last calibration had no such step
         return step.run(context)
-    if way is Way.CORRECT:
+    if way is Reuse.CORRECT:
         name = step.id.projector
         assert name is not None
         # The room's light has been photographed again, and counts for every projector.
@@ -84,4 +84,4 @@ def _kept(last: Calibrated, step: Step, way: Way, context: Context) -> Sequence[
     return kept
 
 
-__all__ = ["one_projector_steps", "way_of"]
+__all__ = ["one_projector_steps", "reuse_of"]

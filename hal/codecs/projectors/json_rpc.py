@@ -18,7 +18,7 @@ OBJECT_END: Final = b"}"
 _LARGEST_NUMBER: Final = 1_000_000
 
 
-class Said(Enum):
+class MessageKind(Enum):
     """Meaning of an object. OTHER: a notification, or the answer to another message."""
 
     RESULT = auto()
@@ -30,7 +30,7 @@ class Said(Enum):
 class Message:
     """An object; ``text``: its result or its error as text."""
 
-    said: Said
+    said: MessageKind
     text: str = ""
 
 
@@ -60,11 +60,11 @@ def parse_message(data: bytes, sent: bytes) -> Message:
         )
     asked = _loaded(sent) or {}
     if "id" not in asked or str(message.get("id")) != str(asked["id"]):
-        return Message(Said.OTHER)
+        return Message(MessageKind.OTHER)
     if "error" in message and message["error"] is not None:
         error = message["error"]
-        return Message(Said.ERROR, _line(error.get("message", "") if isinstance(error, dict) else error))
-    return Message(Said.RESULT, _line(message.get("result")))
+        return Message(MessageKind.ERROR, _line(error.get("message", "") if isinstance(error, dict) else error))
+    return Message(MessageKind.RESULT, _line(message.get("result")))
 
 
 def _loaded(data: bytes) -> dict[str, Any] | None:

@@ -23,14 +23,14 @@ _MAC: Final = re.compile(r"[0-9a-f]{2}(?::[0-9a-f]{2}){5}|[0-9a-f]{12}")
 
 
 @dataclass(frozen=True, slots=True)
-class Here:
+class SearchAck:
     """A projector answers a search. ``mac`` as ``00:11:22:aa:bb:cc``."""
 
     mac: str
 
 
 @dataclass(frozen=True, slots=True)
-class CameUp:
+class LinkUp:
     """A projector has just started and accepts commands now."""
 
     mac: str
@@ -55,7 +55,7 @@ class InputChanged:
     input: str
 
 
-Notification = Here | CameUp | TroubleChanged | PowerChanged | InputChanged
+Notification = SearchAck | LinkUp | TroubleChanged | PowerChanged | InputChanged
 
 
 def parse_datagram(data: bytes) -> tuple[Notification, ...]:
@@ -87,7 +87,7 @@ def _parsed(line: bytes) -> Notification:
         return PowerChanged(parse_power(value))
     if name == b"INPT":
         return InputChanged(parse_input(value))
-    return Here(_mac(value)) if name == b"ACKN" else CameUp(_mac(value))
+    return SearchAck(_mac(value)) if name == b"ACKN" else LinkUp(_mac(value))
 
 
 def _mac(text: str) -> str:

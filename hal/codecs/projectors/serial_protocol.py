@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-from hal.codecs.projectors.json_rpc import Message, Said, json_bytes, parse_message
+from hal.codecs.projectors.json_rpc import Message, MessageKind, json_bytes, parse_message
 from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
 from hal.errors import ProtocolError
 from hal.escapes import escaped
@@ -125,9 +125,9 @@ def _shaped(table: SerialTable, query: Query, text: str, line: bytes) -> Answer 
 
 def _object(table: SerialTable, message: Message, query: Query | None, line: bytes) -> Answer | Reply:
     """Read a JSON object: only the answer to the message that was sent last means anything."""
-    if message.said is Said.OTHER:
+    if message.said is MessageKind.OTHER:
         return Reply.NOTHING
-    if message.said is Said.ERROR:
+    if message.said is MessageKind.ERROR:
         return _reply(table, message.text, ((table.cooling, Reply.COOLING),)) or Reply.REFUSED
     if query is None:
         return Reply.ACCEPTED

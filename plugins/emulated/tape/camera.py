@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from hal.tape.reading import Track
-from hal.transcript import Entry, Way
+from hal.transcript import Direction, Entry
 from plugins.emulated.cameras.body import CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome
@@ -76,14 +76,14 @@ def _acts(question: Hashable) -> bool:
 def _operations(entries: Iterable[Entry]) -> list[_Done]:
     found: list[_Done] = []
     for entry in entries:
-        if entry.way is Way.REMARK or len(entry.data) < _HEADER.size:
+        if entry.way is Direction.REMARK or len(entry.data) < _HEADER.size:
             continue
         _, kind, code, _ = _HEADER.unpack_from(entry.data)
         body = entry.data[_HEADER.size :]
         numbers = struct.unpack(f"<{len(body) // 4}I", body[: len(body) // 4 * 4]) if kind != _DATA else ()
         if kind == _COMMAND:
             found.append(_Done(code, numbers))
-        elif found and kind == _DATA and entry.way is Way.SENT:
+        elif found and kind == _DATA and entry.way is Direction.SENT:
             found[-1].sent = body
         elif found and kind == _DATA:
             found[-1].data = body

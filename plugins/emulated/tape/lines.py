@@ -16,7 +16,7 @@ from typing import Final
 
 from hal.pty_links import PtyLink
 from hal.tape.reading import Track
-from hal.transcript import Entry, Way
+from hal.transcript import Direction, Entry
 from plugins.emulated.tape.exchanges import Exchange, Replay
 
 _TICK_S: Final = 0.02
@@ -65,11 +65,11 @@ def _exchanges(entries: Iterable[Entry]) -> tuple[Pieces, list[Exchange[Pieces]]
     found: list[tuple[bytes, list[tuple[float, bytes]]]] = []
     answers, began_s, greeted = greeting, 0.0, False
     for entry in entries:
-        if entry.way is Way.REMARK:
+        if entry.way is Direction.REMARK:
             if entry.data == b"connected" or entry.data.startswith(b"opened "):
                 answers, began_s = ([] if greeted else greeting), entry.at_s
                 greeted = True
-        elif entry.way is Way.SENT and entry.data:
+        elif entry.way is Direction.SENT and entry.data:
             found.append((entry.data, []))
             answers, began_s = found[-1][1], entry.at_s
         elif entry.data:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from controller.core.errors import UsageError
-from controller.rig.ambient_light import Darkness, dark_after
+from controller.rig.ambient_light import AmbientLightLimit, dark_after
 from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
@@ -83,7 +83,7 @@ class Hall(Models):
                 self.sensor.lux = self.later_lux
                 return ()
 
-            return [Step(StepId("look"), look), *dark_after(rig.darkness, rig.display)]
+            return [Step(StepId("look"), look), *dark_after(rig.ambient_limit, rig.display)]
 
         checked = check_stage(self.folder, drivers=self.drivers)
         OwnSession(checked.stage.folder).run(
@@ -134,7 +134,7 @@ def test_light_that_came_on_meanwhile_is_a_warning(tmp_path: Path, later_lux: fl
     hall.later_lux = later_lux
     hall.work(dark=True)
     warnings = [text for level, text in hall.told.said if level is Level.WARNING]
-    expected = Darkness(hall.sensor, 2.0).warning(deadline=soon())
+    expected = AmbientLightLimit(hall.sensor, 2.0).warning(deadline=soon())
     assert warnings == ([] if later_lux < 2.0 else [expected])
     assert (expected is None) == (later_lux < 2.0)
 

@@ -16,7 +16,7 @@ from hal.registry import OpenContext
 from hal.tape import reading
 from hal.tape.reading import parse_tape, read_tape
 from hal.tape.recorder import HEADER, Tape
-from hal.transcript import Way
+from hal.transcript import Direction
 
 PIECES = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.binary(min_size=1, max_size=600)), max_size=20)
 
@@ -34,7 +34,7 @@ def test_every_piece_comes_back_in_order_on_its_track(
     found = read_tape(path)
     assert [(track.kind, track.address) for track in found] == [("serial", f"port \\ {number}") for number in range(3)]
     for number, track in enumerate(found):
-        wanted = [(Way.SENT if sent else Way.RECEIVED, data) for at, sent, data in pieces if at == number]
+        wanted = [(Direction.SENT if sent else Direction.RECEIVED, data) for at, sent, data in pieces if at == number]
         assert [(entry.way, entry.data) for entry in track.entries] == wanted
         assert all(early.at_s <= late.at_s for early, late in zip(track.entries, track.entries[1:], strict=False))
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from controller.rig.ambient_light import Darkness
+from controller.rig.ambient_light import AmbientLightLimit
 from hal.conformance import LightSensorConformance, PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
@@ -110,7 +110,7 @@ def test_the_sensor_sees_the_ambient_light_of_an_emulated_stage(bus: UsbBusProce
     bus.call("light", "follow", str(tmp_path))
     assert sensor.illuminance_lux(deadline=in_seconds(20)) == pytest.approx(50 * dark_lux, rel=0.02)
     with pytest.raises(DeviceRefused) as caught:
-        Darkness(sensor, 5.0).require(deadline=in_seconds(20))
+        AmbientLightLimit(sensor, 5.0).require(deadline=in_seconds(20))
     assert caught.value.code == "room-not-dark"
     sensor.close()
 

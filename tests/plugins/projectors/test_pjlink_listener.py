@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hal.codecs.projectors.pjlink_udp import CameUp, InputChanged, PowerChanged, TroubleChanged
+from hal.codecs.projectors.pjlink_udp import InputChanged, LinkUp, PowerChanged, TroubleChanged
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout
 from hal.values import Power
@@ -42,7 +42,7 @@ def test_a_projector_that_takes_its_time_is_found_and_the_deadline_is_kept(liste
 def test_changes_are_heard_in_order_though_a_search_ran_meanwhile(listener: PjLinkListener) -> None:
     lamp = EmulatedLamp(LampTiming(0.4, 0.4))
     with EmulatedPjLinkUdp(lamp, mac=MAC, controller=("127.0.0.1", listener.port)) as projector:
-        assert listener.heard(deadline=in_seconds(20)).notification == CameUp(MAC)
+        assert listener.heard(deadline=in_seconds(20)).notification == LinkUp(MAC)
         lamp.strike()
         listener.search(deadline=in_seconds(20), to=projector.address, patience_s=0.7)
         projector.select_input("32")

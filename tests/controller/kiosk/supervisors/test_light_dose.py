@@ -28,7 +28,7 @@ def test_an_hour_of_two_hundred_lux_is_two_hundred_lux_hours_also_after_a_restar
     clock = Clock()
     dose = LightDose(tmp_path, monotonic=clock)
     for _ in range(361):
-        dose.saw(200.0)
+        dose.add(200.0)
         clock.now_s += 10
     assert dose.lux_hours == pytest.approx(200)
     kept = LightDose(tmp_path, monotonic=clock).lux_hours
@@ -37,19 +37,19 @@ def test_an_hour_of_two_hundred_lux_is_two_hundred_lux_hours_also_after_a_restar
     again = LightDose(tmp_path, monotonic=clock)
     assert again.lux_hours == pytest.approx(200, abs=1e-3)
     clock.now_s = 5.0
-    again.saw(1000.0)
+    again.add(1000.0)
     assert again.lux_hours == pytest.approx(200, abs=1e-3), "what was between two services is not known"
 
 
 def test_a_gap_counts_as_the_brighter_end_and_a_long_one_not_at_all(tmp_path: Path) -> None:
     clock = Clock()
     dose = LightDose(tmp_path, monotonic=clock)
-    dose.saw(0.0)
+    dose.add(0.0)
     clock.now_s += LONGEST_GAP_S
-    dose.saw(90.0)
+    dose.add(90.0)
     assert dose.lux_hours == pytest.approx(90)
     clock.now_s += LONGEST_GAP_S + 1
-    dose.saw(90.0)
+    dose.add(90.0)
     assert dose.lux_hours == pytest.approx(90)
 
 
@@ -61,7 +61,7 @@ def test_it_never_falls_and_is_never_less_than_the_light(readings: list[tuple[fl
     previous = None
     for seconds, lux in readings:
         clock.now_s += seconds
-        dose.saw(lux)
+        dose.add(lux)
         steady = lux if 0 < lux < float("inf") else 0.0
         least += 0 if previous is None else seconds * min(previous, steady) / 3600
         previous = steady

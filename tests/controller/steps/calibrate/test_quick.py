@@ -20,7 +20,7 @@ from controller.run.journal import Journal
 from controller.run.runner import Context, Runner, Step
 from controller.run.step_id import StepId
 from controller.steps.calibrate import single_projector
-from controller.steps.calibrate.quick import Way, chosen, way_of
+from controller.steps.calibrate.quick import Reuse, chosen, reuse_of
 from hal.deadline import in_seconds
 from tests.controller.artefacts.names import projectors
 
@@ -48,36 +48,36 @@ def test_nothing_is_repeated_when_nothing_has_changed() -> None:
     found = drift(projector("b"))
     assert advice(found) == "nothing"
     assert {
-        way_of(step, found)
+        reuse_of(step, found)
         for step in (StepId("black"), StepId("light", "a"), StepId("pixels", "b"), StepId("geometry"))
-    } == {Way.KEEP}
+    } == {Reuse.KEEP}
 
 
 @pytest.mark.parametrize(
     ("bumped", "ways"),
     [
-        (projector("b", gain=0.9), {"light": Way.CORRECT, "indirect": Way.CORRECT, "pixels": Way.KEEP}),
-        (projector("b", MOVED), {"light": Way.CORRECT, "codes": Way.KEEP, "indirect": Way.CORRECT}),
-        (projector("b", MOVED, local_px=0.8), {"light": Way.RUN, "codes": Way.RUN, "pixels": Way.RUN}),
-        (projector("b", LOST), {"light": Way.RUN, "codes": Way.RUN, "pixels": Way.RUN}),
+        (projector("b", gain=0.9), {"light": Reuse.CORRECT, "indirect": Reuse.CORRECT, "pixels": Reuse.KEEP}),
+        (projector("b", MOVED), {"light": Reuse.CORRECT, "codes": Reuse.KEEP, "indirect": Reuse.CORRECT}),
+        (projector("b", MOVED, local_px=0.8), {"light": Reuse.RUN, "codes": Reuse.RUN, "pixels": Reuse.RUN}),
+        (projector("b", LOST), {"light": Reuse.RUN, "codes": Reuse.RUN, "pixels": Reuse.RUN}),
     ],
 )
-def test_only_the_projector_that_changed_is_repeated(bumped: ProjectorDrift, ways: dict[str, Way]) -> None:
+def test_only_the_projector_that_changed_is_repeated(bumped: ProjectorDrift, ways: dict[str, Reuse]) -> None:
     found = drift(bumped)
     assert advice(found) == "quick"
-    assert {kind: way_of(StepId(kind, "b"), found) for kind in ways} == ways
-    assert (way_of(StepId("light", "a"), found), way_of(StepId("codes", "a"), found)) == (Way.KEEP, Way.KEEP)
-    assert (way_of(StepId("geometry"), found) is Way.RUN) == bool(found.moved)
+    assert {kind: reuse_of(StepId(kind, "b"), found) for kind in ways} == ways
+    assert (reuse_of(StepId("light", "a"), found), reuse_of(StepId("codes", "a"), found)) == (Reuse.KEEP, Reuse.KEEP)
+    assert (reuse_of(StepId("geometry"), found) is Reuse.RUN) == bool(found.moved)
 
 
 def test_a_projector_measured_with_dots_gets_new_ones_when_it_moved() -> None:
-    assert way_of(StepId("pixels", "b"), drift(projector("b", MOVED)), "paper") is Way.RUN
+    assert reuse_of(StepId("pixels", "b"), drift(projector("b", MOVED)), "paper") is Reuse.RUN
 
 
 @pytest.mark.parametrize("culprit", [DriftCause.CAMERA, DriftCause.OBJECT, DriftCause.UNKNOWN])
 def test_all_is_repeated_when_camera_or_object_moved_and_it_is_said(culprit: DriftCause) -> None:
     found = drift(culprit=culprit, camera=MOVED)
-    assert way_of(StepId("codes", "a"), found) is Way.RUN
+    assert reuse_of(StepId("codes", "a"), found) is Reuse.RUN
     assert "full calibration" in sentences(found)[-1]
 
 
@@ -147,8 +147,8 @@ def test_exactly_the_projectors_that_moved_are_repeated_whatever_they_are_called
             Runner(steps, journal).run("recalibrate", deadline=in_seconds(60))
         assert set(done) == {StepId("black"), StepId("geometry"), *(StepId(k, name) for name in moved for k in KINDS)}
         for name in names:
-            way = way_of(StepId("radiometry", name), found)
-            assert way is (Way.RUN if name in moved else Way.CORRECT), "black is photographed again for all"
+            way = reuse_of(StepId("radiometry", name), found)
+            assert way is (Reuse.RUN if name in moved else Reuse.CORRECT), "black is photographed again for all"
         for number, step in enumerate(steps[1:]):
             assert (now / f"{number}.bin").samefile(last / f"{number}.bin") is (step.id not in done)
 
@@ -157,6 +157,6 @@ def test_exactly_the_projectors_that_moved_are_repeated_whatever_they_are_called
 def test_one_projector_is_recalibrated_and_no_other(names: list[str], data: st.DataObject) -> None:
     one = data.draw(st.sampled_from(names))
     for name in names:
-        ways = {kind: single_projector.way_of(StepId(kind, name), one) for kind in (*KINDS, "radiometry")}
-        kept = {**dict.fromkeys(KINDS, Way.KEEP), "radiometry": Way.CORRECT}
-        assert ways == (dict.fromkeys(ways, Way.RUN) if name == one else kept)
+        ways = {kind: single_projector.reuse_of(StepId(kind, name), one) for kind in (*KINDS, "radiometry")}
+        kept = {**dict.fromkeys(KINDS, Reuse.KEEP), "radiometry": Reuse.CORRECT}
+        assert ways == (dict.fromkeys(ways, Reuse.RUN) if name == one else kept)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.codecs.projectors import logins
-from hal.codecs.projectors.json_rpc import Message, Said, is_complete, json_bytes, parse_message
+from hal.codecs.projectors.json_rpc import Message, MessageKind, is_complete, json_bytes, parse_message
 from hal.codecs.projectors.logins import NtGreeting
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, ProtocolError
 
@@ -76,12 +76,12 @@ def test_only_the_answer_to_the_last_message_counts() -> None:
     assert json.loads(sent) == {
         "jsonrpc": "2.0", "method": "property.get", "params": {"property": "system.state"}, "id": 7,
     }  # fmt: skip
-    assert parse_message(b'{"jsonrpc":"2.0","id":7,"result":"on"}', sent) == Message(Said.RESULT, "on")
-    assert parse_message(b'{"jsonrpc":"2.0","id":"7","result":null}', sent) == Message(Said.RESULT, "")
-    assert parse_message(b'{"jsonrpc":"2.0","id":6,"result":"on"}', sent).said is Said.OTHER
-    assert parse_message(b'{"jsonrpc":"2.0","method":"property.changed"}', sent).said is Said.OTHER
-    assert parse_message(b'{"id":7,"error":{"code":-32601,"message":"no"}}', sent) == Message(Said.ERROR, "no")
-    assert parse_message(b'{"id":7,"error":"no"}', sent) == Message(Said.ERROR, "no")
+    assert parse_message(b'{"jsonrpc":"2.0","id":7,"result":"on"}', sent) == Message(MessageKind.RESULT, "on")
+    assert parse_message(b'{"jsonrpc":"2.0","id":"7","result":null}', sent) == Message(MessageKind.RESULT, "")
+    assert parse_message(b'{"jsonrpc":"2.0","id":6,"result":"on"}', sent).said is MessageKind.OTHER
+    assert parse_message(b'{"jsonrpc":"2.0","method":"property.changed"}', sent).said is MessageKind.OTHER
+    assert parse_message(b'{"id":7,"error":{"code":-32601,"message":"no"}}', sent) == Message(MessageKind.ERROR, "no")
+    assert parse_message(b'{"id":7,"error":"no"}', sent) == Message(MessageKind.ERROR, "no")
 
 
 @given(st.binary(max_size=40), st.integers(0, 60))

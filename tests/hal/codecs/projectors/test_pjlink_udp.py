@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.codecs.projectors.pjlink_udp import (
-    CameUp,
-    Here,
     InputChanged,
+    LinkUp,
     PowerChanged,
+    SearchAck,
     TroubleChanged,
     is_notification,
     parse_datagram,
@@ -22,9 +22,9 @@ from hal.values import Power
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b"%2ACKN=00:11:22:AA:BB:CC\r", Here("00:11:22:aa:bb:cc")),
-        (b"%2ACKN=001122aabbcc\r", Here("00:11:22:aa:bb:cc")),
-        (b"%2LKUP=00:11:22:AA:BB:CC\r\0\0\0", CameUp("00:11:22:aa:bb:cc")),
+        (b"%2ACKN=00:11:22:AA:BB:CC\r", SearchAck("00:11:22:aa:bb:cc")),
+        (b"%2ACKN=001122aabbcc\r", SearchAck("00:11:22:aa:bb:cc")),
+        (b"%2LKUP=00:11:22:AA:BB:CC\r\0\0\0", LinkUp("00:11:22:aa:bb:cc")),
         (b"%2ERST=020000\r", TroubleChanged(("lamp-failed",))),
         (b"%2ERST=000000\r", TroubleChanged(())),
         (b"%2POWR=3\r", PowerChanged(Power.WARMING)),

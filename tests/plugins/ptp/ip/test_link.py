@@ -16,7 +16,7 @@ import pytest
 
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
-from hal.transcript import Transcript, Way, parse_transcript
+from hal.transcript import Direction, Transcript, parse_transcript
 from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.ptp.ip.link import PtpIpLink
@@ -275,9 +275,9 @@ def test_a_transcript_holds_everything_but_the_pictures(camera: Scripted, tmp_pa
     link.close()
     record.close()
     entries = parse_transcript((tmp_path / "camera.txt").read_text())
-    sent = b"".join(entry.data for entry in entries if entry.way is Way.SENT)
+    sent = b"".join(entry.data for entry in entries if entry.way is Direction.SENT)
     assert packet(6, struct.pack("<IHII", 1, 0x1009, 0, 3)) in sent
-    assert b"".join(entry.data for entry in entries if entry.way is Way.RECEIVED).endswith(response())
+    assert b"".join(entry.data for entry in entries if entry.way is Direction.RECEIVED).endswith(response())
     assert not any(b"PICTURE" in entry.data for entry in entries)
     assert any(entry.data == b"700 bytes of data" for entry in entries)
 
