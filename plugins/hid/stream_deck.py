@@ -178,7 +178,10 @@ class StreamDeckPanel(WorkerLink[Any]):
         )
         if not done:
             raise ProtocolError(
-                "panel-picture", what="A picture could not be encoded.", remedy="Report this mistake to the maintainers.", theirs=False
+                "panel-picture",
+                what="A picture could not be encoded.",
+                remedy="Report this mistake to the maintainers.",
+                theirs=False,
             )
         return file.tobytes()
 
