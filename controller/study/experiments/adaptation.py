@@ -175,7 +175,8 @@ def _figures(subject: Subject, results: Sequence[AdaptationResult]) -> tuple[Fig
         Figure("photographs", "The target and photographs of each way, where a third and where half lacks light.",
                strip(panels, columns=3)),
         Figure("ghosting", "Ghosting in photographs, by how much of the object lacks light.",
-               plotted(lines, x="share of pixels that lack light", y="correlation with the object's pattern")),
+               plotted(lines, x="share of pixels that lack light", y="correlation with the object's pattern",
+                       y_range=(0, None))),
     )  # fmt: skip
 
 

@@ -182,7 +182,8 @@ def _figures(before: float, bumps: Sequence[BumpResult]) -> tuple[Figure, ...]:
     )
     return (
         Figure("drift", "Median CIEDE2000 of a photographed appearance after a bump, before and after recalibration.",
-               plotted(lines, x="moved by (pixels)", y="CIEDE2000", marks={"undisturbed": ("y", before)})),
+               plotted(lines, x="moved by (pixels)", y="CIEDE2000", marks={"undisturbed": ("y", before)},
+                       y_range=(0, None))),
     )  # fmt: skip
 
 

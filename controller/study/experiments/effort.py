@@ -113,9 +113,9 @@ def _figures(results: Sequence[EffortResult]) -> tuple[Figure, ...]:
     ]
     return (
         Figure("grade", "Error of a predicted random pattern, worst projector, by photographs a projector.",
-               plotted(lines, x="photographs a projector", y="error of the prediction (%)")),
+               plotted(lines, x="photographs a projector", y="error of the prediction (%)", y_range=(0, None))),
         Figure("error", "Median CIEDE2000 of a photographed appearance, by photographs a projector.",
-               plotted(errors, x="photographs a projector", y="CIEDE2000")),
+               plotted(errors, x="photographs a projector", y="CIEDE2000", y_range=(0, None))),
     )  # fmt: skip
 
 

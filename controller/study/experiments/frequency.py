@@ -9,7 +9,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.plan.optics import PIXEL_VARIANCE_PX2
 from controller.plan.resolution import FAINT, KEPT, MEAN, LineProjector, last_kept
 from controller.plan.resolution import kept_contrast as line_contrast
@@ -336,16 +336,27 @@ def _figures(
     matrix = subject.calibration.camera_to_xyz
     named: Sequence[tuple[str, FloatImage]] = [("target", wanted.radiance), *pictures.items()]
     panels = [LabelledPicture(name, screen(image, matrix, wanted.white, whole)) for name, image in named]
-    lines = [Line(f"{name}: F = {limit[name] * waves.pitch_px:.2f}", waves.frequency * waves.pitch_px, kept)
-             for name, kept in contrast.items()]  # fmt: skip
+    by_base = (HIGH, NARROWER, LOWER, LOW)
+    solved = [name for name in contrast if name not in by_base]
+
+    def curves(names: Sequence[str]) -> ByteImage:
+        lines = [Line(f"{name}: F = {limit[name] * waves.pitch_px:.2f}", waves.frequency * waves.pitch_px,
+                      contrast[name]) for name in names]  # fmt: skip
+        return plotted(
+            lines, x="cycles per pixel of one projector", y="contrast kept",
+            marks={"half": ("y", KEPT), "one projector's pixels end": ("x", 0.5)}, y_range=(-0.05, 1.1),
+        )  # fmt: skip
+
     return (
         Figure(
             "curves",
             "Contrast that the photograph keeps of the target's, by frequency; F is where it falls below a half.",
-            plotted(
-                lines, x="cycles per pixel of one projector", y="contrast kept",
-                marks={"half": ("y", KEPT), "one projector's pixels end": ("x", 0.5)}, y_range=(-0.1, 1.15),
-            ),
+            curves(solved),
+        ),
+        Figure(
+            "bases",
+            "The same for bases times scale, beside the full solve with all projectors.",
+            curves([solved[-1], *by_base]),
         ),
         Figure("photographs", "The target, frequency rising downwards, and the photographs.", strip(panels, columns=3)),
     )  # fmt: skip

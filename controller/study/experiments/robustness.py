@@ -13,11 +13,13 @@ from controller.core.errors import VelaturaError
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, StageControl, Subject
 from controller.study.lab.trial import Trial, photograph_frames, run_trial
-from controller.study.output.drawing import Line, plotted
+from controller.study.output.drawing import Line, SmallPlot, small_plots
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
 
 DOUBLED: Final = 2.0
 """An appearance counts as broken where its error is so many times the undisturbed one."""
+SHOWN: Final = 4.0
+"""Times the undisturbed error, up to which the plots go."""
 Frames = Sequence[FloatImage]
 Changes = Callable[[Subject, float], tuple[BenchChange, ...]]
 
@@ -27,14 +29,15 @@ class Disturbance:
     """A disturbance of growing strength.
 
     ``levels``: from weak to strong, as far as makes sense; ``limit``: the one of them that users meet, which must not
-    double the error; ``changes``: what is done to the stage before it is calibrated; ``after``: after the calibration,
-    without notice; ``frames``: what is done to the frames instead
+    double the error; ``undisturbed``: the level at which nothing is disturbed; ``changes``: what is done to the stage
+    before it is calibrated; ``after``: after the calibration, without notice; ``frames``: what is done to the frames
     """
 
     name: str
     unit: str
     levels: tuple[float, ...]
     limit: float
+    undisturbed: float = 0.0
     changes: Changes | None = None
     after: Changes | None = None
     frames: Callable[[Frames, float], Frames] | None = None
@@ -63,7 +66,7 @@ def quantised(frames: Frames, bits: float) -> Frames:
 
 
 DISTURBANCES: Final = (
-    Disturbance("camera noise", "times all noise", (3, 10, 30, 100), 3, changes=_one("camera", "noise")),
+    Disturbance("camera noise", "times all noise", (3, 10, 30, 100), 3, 1, changes=_one("camera", "noise")),
     Disturbance("defocus", "mm before it is calibrated", (100, 250, 500, 1000), 100, changes=_every("defocus_mm")),
     Disturbance("indirect light", "share that comes back", (0.05, 0.15, 0.3, 0.6), 0.15,
                 changes=_one("ambient", "indirect")),
@@ -72,12 +75,12 @@ DISTURBANCES: Final = (
                 changes=_every("white_segment")),
     Disturbance("misconvergence", "px", (0.25, 0.5, 1.0, 2.0, 3.0), 0.5, changes=_every("misconverged_px")),
     Disturbance("lamp flicker", "share of the light", (0.02, 0.05, 0.1, 0.3), 0.02, changes=_every("flicker")),
-    Disturbance("gamma error", "factor of the exponents, after calibration", (1.02, 1.05, 1.1, 1.2), 1.05,
+    Disturbance("gamma error", "factor of the exponents, after calibration", (1.02, 1.05, 1.1, 1.2), 1.05, 1,
                 after=_every("gamma")),
     Disturbance("focus lost", "mm after it is calibrated", (30, 100, 200, 400), 30, after=_every("defocus_mm")),
     Disturbance("a visitor's shadow", "of one projector's width, after calibration", (0.05, 0.15, 0.3, 0.6), 0.15,
                 after=_first("shadow")),
-    Disturbance("quantisation", "bits a channel", (7, 6, 5, 4, 3, 2), 7, frames=quantised),
+    Disturbance("quantisation", "bits a channel", (7, 6, 5, 4, 3, 2), 7, 8, frames=quantised),
 )  # fmt: skip
 
 
@@ -146,11 +149,11 @@ def doubles_at(base: Trial, results: Sequence[DisturbanceResult], measure: int) 
 
     ``measure``: 0 the median, 1 the 95 %; ``results``: of one disturbance, from weak to strong
     """
-    before: tuple[float, float] | None = None
+    before = results[0].disturbance.undisturbed, 1.0
     for result in results:
         times = result.times(base)[measure]
         if times > DOUBLED:
-            if before is None or not np.isfinite(times):
+            if not np.isfinite(times):
                 return result.level
             part = (DOUBLED - before[1]) / (times - before[1])
             return before[0] + part * (result.level - before[0])
@@ -220,21 +223,28 @@ def _table(base: Trial, results: Sequence[DisturbanceResult]) -> ResultTable:
 
 
 def _figures(base: Trial, results: Sequence[DisturbanceResult]) -> tuple[Figure, ...]:
-    return tuple(
-        Figure(name, f"{title} by level, over the undisturbed one; level 1 is the weakest, the table lists them all.",
-               plotted(_lines(base, results, measure), x="level (0: undisturbed)", y="times the undisturbed error",
-                       marks={"doubled": ("y", DOUBLED)}, log_y=True))
-        for measure, (name, title) in enumerate((("median", "Median CIEDE2000"), ("most", "CIEDE2000 of 95 %")))
+    return (
+        Figure(
+            "levels",
+            "CIEDE2000 of an appearance over the undisturbed one, by how strong a disturbance is: the median, and what"
+            f" 95 % of the pixels are within. Cut off at {SHOWN:g} times.",
+            small_plots([_plot(base, _of(results, one)) for one in DISTURBANCES], y="times the undisturbed error",
+                        y_range=(0.5, SHOWN)),
+        ),
     )  # fmt: skip
 
 
-def _lines(base: Trial, results: Sequence[DisturbanceResult], measure: int) -> list[Line]:
-    lines = []
-    for disturbance in DISTURBANCES:
-        some = [result for result in _of(results, disturbance) if result.found is not None]
-        times = [result.times(base)[measure] for result in some]
-        lines.append(Line(disturbance.name, [float(n) for n in range(len(some) + 1)], [1.0, *times]))
-    return lines
+def _plot(base: Trial, results: Sequence[DisturbanceResult]) -> SmallPlot:
+    one = results[0].disturbance
+    some = [result for result in results if result.found is not None]
+    unit = one.unit if len(some) == len(results) else f"{one.unit}; no calibration at {results[-1].level:g}"
+    levels = [one.undisturbed, *(result.level for result in some)]
+    lines = [
+        Line(name, levels, [1.0, *(result.times(base)[measure] for result in some)])
+        for measure, name in enumerate(("median", "95 % of the pixels"))
+    ]
+    marks = {"twice the undisturbed error": ("y", DOUBLED), "what users meet": ("x", one.limit)}
+    return SmallPlot(one.name, unit, lines, marks)
 
 
 TEXT = """\

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.core.lettering import write
@@ -19,6 +20,7 @@ LARGEST_BYTES = 190_000
 LABEL_PX = 22
 DPI = 110
 _BACKGROUND = (255, 255, 255)
+_MARKERS = "os^Dv<>PX*"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,46 +89,77 @@ def encoded_webp(picture: ByteImage, *, longest_px: int = 1400) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A curve: its name, positions and values; ``style`` as matplotlib's."""
+    """A curve: its name, positions and values; ``style`` as matplotlib's, or nothing: each line has its own marker."""
 
     name: str
     x: Sequence[float] | Float64
     y: Sequence[float] | Float64
-    style: str = "-o"
+    style: str = ""
+
+
+Marks = Mapping[str, tuple[str, float]]
+"""Label -> ("x" or "y", value): thin lines across."""
+Range = tuple[float | None, float | None]
+"""Least and most of an axis; None: as the values are."""
 
 
 def plotted(
-    lines: Sequence[Line],
-    *,
-    x: str,
-    y: str,
-    marks: Mapping[str, tuple[str, float]] | None = None,
-    log_y: bool = False,
-    y_range: tuple[float, float] | None = None,
+    lines: Sequence[Line], *, x: str, y: str, marks: Marks | None = None, y_range: Range | None = None
 ) -> ByteImage:
-    """Curves as a picture. ``marks``: label -> ("x" or "y", value), drawn as thin lines across."""
-    figure = figure_of((7.2, 4.0), dpi=DPI)
+    """Curves as a picture, with their names beside it, where they hide nothing."""
+    figure = figure_of((9.6, 4.0), dpi=DPI, constrained=True)
     axes = figure.add_subplot()
-    for line in lines:
-        axes.plot(line.x, line.y, line.style, label=line.name, markersize=3, linewidth=1.3)
-    for label, (axis, value) in (marks or {}).items():
+    _curves(axes, lines, marks or {}, y_range)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+    return picture_of(figure)
+
+
+@dataclass(frozen=True, slots=True)
+class SmallPlot:
+    """One of several plots side by side: its ``title``, what is along ``x``, and its own curves and marks."""
+
+    title: str
+    x: str
+    lines: Sequence[Line]
+    marks: Marks
+
+
+def small_plots(plots: Sequence[SmallPlot], *, y: str, y_range: Range, columns: int = 3) -> ByteImage:
+    """Plots of one y axis side by side. A name that several use is explained once."""
+    rows = -(-len(plots) // columns)
+    figure = figure_of((9.6, 2.3 * rows + 0.4), dpi=DPI, constrained=True)
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    named = {}
+    for place, axes in enumerate(grid.ravel()):
+        if place >= len(plots):
+            axes.axis("off")
+            continue
+        one = plots[place]
+        _curves(axes, one.lines, one.marks, y_range)
+        axes.set_title(one.title, fontsize=9)
+        axes.set_xlabel(one.x, fontsize=8)
+        axes.tick_params(labelsize=8)
+        named |= {name: drawn for drawn, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.supylabel(y, fontsize=9)
+    figure.legend(list(named.values()), list(named), loc="outside upper center", ncols=len(named), fontsize=8,
+                  frameon=False)  # fmt: skip
+    return picture_of(figure)
+
+
+def _curves(axes: Any, lines: Sequence[Line], marks: Marks, y_range: Range | None) -> None:
+    for number, line in enumerate(lines):
+        style = line.style or f"-{_MARKERS[number % len(_MARKERS)]}"
+        axes.plot(line.x, line.y, style, label=line.name, markersize=4, linewidth=1.3, alpha=0.9)
+    for number, (label, (axis, value)) in enumerate(marks.items()):
         draw = axes.axvline if axis == "x" else axes.axhline
-        draw(value, color="0.45", linewidth=0.8, linestyle="--", label=label)
-    if log_y:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        draw(value, color="0.35", linewidth=0.9, linestyle=("--", ":", "-.")[number % 3], label=label)
     if all(float(place).is_integer() for line in lines for place in line.x):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if y_range is not None:
         axes.set_ylim(*y_range)
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
     axes.grid(True, color="0.9", linewidth=0.6)
-    axes.legend(fontsize=8, frameon=False)
-    figure.tight_layout()
-    return picture_of(figure)
 
 
 def maps(
