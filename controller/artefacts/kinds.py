@@ -26,6 +26,7 @@ class StepKind(enum.StrEnum):
     DOTS = "dots"
     METAPIXELS = "metapixels"
     STUDY_DOTS = "study-dots"
+    STUDY_SHARES = "study-shares"
     EDGE_DOTS = "edge-dots"
     EDGES = "edges"
     EDGE_TERMS = "edge-terms"
@@ -53,7 +54,7 @@ class StepKind(enum.StrEnum):
 
 OF_PROJECTORS: Final = (
     StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT, StepKind.DOTS,
-    StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.EDGE_DOTS, StepKind.EDGES,
+    StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.STUDY_SHARES, StepKind.EDGE_DOTS, StepKind.EDGES,
 )  # fmt: skip
 """Kinds of which there is one step for each projector."""
 

@@ -28,7 +28,8 @@ from controller.stage.session import OwnSession
 from controller.steps import costs
 from controller.study.catalogue import EXPERIMENTS, SCENES, chosen
 from controller.study.lab.disturbance import RigStageControl, subject_of
-from controller.study.lab.photographing import RigPhotographer, dot_steps
+from controller.study.lab.dots import dot_steps
+from controller.study.lab.photographing import RigPhotographer
 from controller.study.lab.scenes import Scene
 from controller.study.lab.subject import SessionParts
 from controller.study.output.keeping import save_result
@@ -164,7 +165,7 @@ def opened(rig: Rig, run: Path, checked: Checked, *, dots: bool) -> Opened:
         longest_s,
         steps,
         (StepId(StepKind.GEOMETRY), *measured),
-        tuple(of_projectors(checked.names, StepKind.STUDY_DOTS)),
+        tuple(of_projectors(checked.names, StepKind.STUDY_SHARES)),
         costs.scale(projector.size_px for projector in rig.projectors),
     )
 

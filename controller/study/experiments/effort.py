@@ -33,7 +33,10 @@ class EffortResult:
 
 
 def effort(subject: Subject) -> Result:
-    """Calibrate again, with the fast mode and with dots at growing distances; photograph an appearance with each."""
+    """Calibrate again, with the fast mode and then with dots at growing distances; photograph an appearance with each.
+
+    What the fast mode photographs is photographed once: each of the others begins with it.
+    """
     spacings = (*SPACINGS_PX, WIDEST_PX) if subject.size != "small" else SPACINGS_PX
     hand: StageControl = subject.parts.hand
     ways: list[tuple[str, DotOptions]] = [(FAST, DotOptions())]
@@ -42,7 +45,7 @@ def effort(subject: Subject) -> Result:
     for number, (way, options) in enumerate(ways):
         subject.advance(number / len(ways), way)
         key = way.replace(", r = ", "-")
-        again = hand.again(key, options)
+        again = hand.again(key, options, beyond=FAST if way != FAST else None)
         made = run_trial(again.subject, key)
         projectors = len(subject.calibration.projectors)
         found = made.quality
@@ -120,12 +123,12 @@ def _figures(results: Sequence[EffortResult]) -> tuple[Figure, ...]:
 
 
 TEXT = """\
-The same stage is calibrated from the beginning several times: with the fast mode, and with dots r pixels apart. Dots
-need r x r photographs a projector in addition to those of the fast mode, which locate them. The grade is the error of
-a random pattern that was predicted and photographed. Photographs include all brackets. Dots that are too near to each
-other overlap where the picture is blurred; dots farther apart cost photographs. A fast calibration with fewer
-photographs is not shown: its patterns depend on each other, and none can be left out alone. That dots take more
-photographs is no criterion: they come on top of those of the fast mode."""
+The same stage is calibrated several times: with the fast mode, and with dots r pixels apart. Dots need r x r
+photographs a projector in addition to those of the fast mode, which locate them; all begin with the same ones of the
+fast mode. The grade is the error of a random pattern that was predicted and photographed. Photographs include all
+brackets. Dots that are too near to each other overlap where the picture is blurred; dots farther apart cost
+photographs. A fast calibration with fewer photographs is not shown: its patterns depend on each other, and none can be
+left out alone. That dots take more photographs is no criterion: they come on top of those of the fast mode."""
 
 EFFORT = Experiment(
     name="effort",

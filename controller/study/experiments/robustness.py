@@ -107,14 +107,30 @@ def robustness(subject: Subject) -> Result:
     base = run_trial(subject, "undisturbed")
     results: list[DisturbanceResult] = []
     for number, disturbance in enumerate(DISTURBANCES):
-        for place, level in enumerate(disturbance.levels):
-            share = (number + place / len(disturbance.levels)) / len(DISTURBANCES)
-            subject.advance(share, f"{disturbance.name}, {level:g} {disturbance.unit}")
-            results.append(_run_level(subject, base, disturbance, level))
-            if min(results[-1].times(base)) > DOUBLED and place >= disturbance.levels.index(disturbance.limit):
-                break
+        results += _until_doubled(subject, base, number, disturbance)
     return Result(_criteria(base, results), (_breaking(base, results), _table(base, results)),
                   _figures(base, results), TEXT)  # fmt: skip
+
+
+def _until_doubled(subject: Subject, base: Trial, number: int, disturbance: Disturbance) -> list[DisturbanceResult]:
+    """From weak to strong: what users meet, and more until both have doubled; less only where one has at that level."""
+    levels, limit = disturbance.levels, disturbance.levels.index(disturbance.limit)
+
+    def at(place: int) -> DisturbanceResult:
+        share = (number + place / len(levels)) / len(DISTURBANCES)
+        subject.advance(share, f"{disturbance.name}, {levels[place]:g} {disturbance.unit}")
+        return _run_level(subject, base, disturbance, levels[place])
+
+    found = [at(limit)]
+    for place in range(limit + 1, len(levels)):
+        if min(found[-1].times(base)) > DOUBLED:
+            break
+        found.append(at(place))
+    for place in reversed(range(limit)):
+        if max(found[0].times(base)) <= DOUBLED:
+            break
+        found.insert(0, at(place))
+    return found
 
 
 def _run_level(subject: Subject, undisturbed: Trial, disturbance: Disturbance, level: float) -> DisturbanceResult:

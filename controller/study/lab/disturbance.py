@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +56,8 @@ class RigStageControl:
         steps = quick_steps(self.rig, folder, self.calibrated, full, longest_exposure_s=self.longest_exposure_s)
         return self._again(folder, steps)
 
-    def again(self, name: str, options: DotOptions | None = None) -> Recalibration:
-        folder = self._folder(f"{name}-full")
+    def again(self, name: str, options: DotOptions | None = None, *, beyond: str | None = None) -> Recalibration:
+        folder = self._folder(f"{name}-full", beyond and f"{beyond}-full")
         full = self._full(options or DotOptions())
         scale = costs.scale(projector.size_px for projector in self.rig.projectors)
         calibrated = Calibrated(folder, self.calibrated.projectors)
@@ -68,8 +69,14 @@ class RigStageControl:
             *dot_steps(self.rig, options, longest_exposure_s=self.longest_exposure_s),
         ]
 
-    def _folder(self, name: str) -> Path:
-        folder = self.context.folder / FOLDER / f"{self.experiment}-{name}"
+    def _folder(self, name: str, start: str | None = None) -> Path:
+        """``start``: of which it is a copy when it is new."""
+        folder, first = (self.context.folder / FOLDER / f"{self.experiment}-{part}" for part in (name, start or name))
+        if not folder.exists() and first.exists():
+            copying = folder.with_name(f".{folder.name}.part")
+            shutil.rmtree(copying, ignore_errors=True)
+            shutil.copytree(first, copying)
+            copying.rename(folder)
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 

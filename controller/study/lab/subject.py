@@ -181,5 +181,8 @@ class StageControl(Protocol):
     def quickly(self, name: str) -> Recalibration:
         """Bring the calibration up to date, repeating only what has changed."""
 
-    def again(self, name: str, options: DotOptions | None = None) -> Recalibration:
-        """Calibrate from nothing."""
+    def again(self, name: str, options: DotOptions | None = None, *, beyond: str | None = None) -> Recalibration:
+        """Calibrate from nothing, or beyond what ``again`` of that name took, on the same stage: only what is new.
+
+        The photographs are counted with those that it began with.
+        """

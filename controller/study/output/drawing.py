@@ -131,7 +131,7 @@ def small_plots(plots: Sequence[SmallPlot], *, y: str, y_range: Range, columns: 
     rows = -(-len(plots) // columns)
     figure = figure_of((9.6, 2.3 * rows + 0.4), dpi=DPI, constrained=True)
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    named = {}
+    named: dict[str, Any] = {}
     for place, axes in enumerate(grid.ravel()):
         if place >= len(plots):
             axes.axis("off")

@@ -61,7 +61,8 @@ class Clumsy:
     def quickly(self, name: str) -> Recalibration:
         return self.again(name)
 
-    def again(self, name: str, options: DotOptions | None = None) -> Recalibration:
+    def again(self, name: str, options: DotOptions | None = None, *, beyond: str | None = None) -> Recalibration:
+        assert beyond is None or beyond in self.done
         self.done.append(name)
         if any(change.get("gloss", 0) > 0.02 for change in self.changes):
             raise CalibrationError("too-glossy", what="The object mirrors.", remedy="Dull it.")

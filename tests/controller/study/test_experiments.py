@@ -18,8 +18,8 @@ from controller.study.experiments import ablation, earlier, live
 from controller.study.experiments.earlier import feathered
 from controller.study.experiments.residual import BRIGHT, DIM, PAPER, ResidualResult, _criteria, residual
 from controller.study.experiments.sharpness import local_sharpness
+from controller.study.lab.dots import dots_as_shares
 from controller.study.lab.measuring import Quality, Variant, unbounded_inverse
-from controller.study.lab.photographing import dots_as_shares
 from controller.study.lab.subject import ReachableTarget
 from controller.study.output.words import description
 from controller.study.values import Experiment, column
