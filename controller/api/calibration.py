@@ -20,7 +20,7 @@ from controller.calibrate.correspondence import decode as correspondence_decode
 from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import indirect_share, shown_contrast
+from controller.calibrate.photometry.separation import indirect_share, shown_contrast, sinusoid_contrast
 from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
 from controller.capture.patterns import plan_patterns
 from controller.capture.profile import CameraProfile, load_profile
@@ -143,9 +143,10 @@ def _calibrated(
     if not indirect:
         return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
     plan, encoded_with = plan_patterns(captures.projector_px), radiometry.response
+    seen = sinusoid_contrast(captures.pictures, plan, white)
     for _ in range(PASSES):
-        contrast = shown_contrast(radiometry, encoded_with)
-        share = indirect_share(captures.pictures, plan, white, correspondence.projector_px, linearity=contrast)
+        linearity = shown_contrast(radiometry, encoded_with)
+        share = indirect_share(seen, white, correspondence.projector_px, linearity=linearity)
         known = KnownIndirect(share * white, radiometry)
         radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
     thrown = share * white

@@ -54,38 +54,52 @@ class Sinusoids:
     sigma: FloatImage
 
 
-def indirect_share(
-    captures: Captures,
-    plan: PatternPlan,
-    white: FloatImage,
-    position_px: FloatImage,
-    *,
-    linearity: Float64 | None = None,
-    noise: CameraNoise | None = None,
-) -> FloatImage:
-    """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1.
+@dataclass(frozen=True, slots=True)
+class SinusoidContrast:
+    """What the photographs show of the ``coarse`` and the ``fine`` sinusoids, whatever response they were shown by."""
+
+    coarse: Sinusoids
+    fine: Sinusoids
+
+
+def sinusoid_contrast(
+    captures: Captures, plan: PatternPlan, white: FloatImage, *, noise: CameraNoise | None = None
+) -> SinusoidContrast:
+    """Measure the contrast of a projector's sinusoids.
 
     Parameters
     ----------
     captures : linear photographs in one unit, ``completed``; needs ``black``, ``phase-*``, ``blur-x-*``, ``blur-y-*``
     white : (rows, columns, 3) less the black image, NaN where not known
-    position_px : (rows, columns, 2) where the camera pixels look in the projector's image, NaN where not known
-    linearity : (3,) contrast that sinusoids truly had, see ``shown_contrast``; 1 if omitted
     noise : of a camera sample, in the captures' unit, where the plan shows too few pictures to measure it
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
     black = coloured(captures, "black", white.shape[:2])
     noise = noise or CameraNoise()
-    coarse = _measured(captures, plan, COARSE, black, white, noise)
-    fine = _measured(captures, plan, FINE, black, white, noise)
+    return SinusoidContrast(
+        _measured(captures, plan, COARSE, black, white, noise), _measured(captures, plan, FINE, black, white, noise)
+    )
+
+
+def indirect_share(
+    seen: SinusoidContrast, white: FloatImage, position_px: FloatImage, *, linearity: Float64 | None = None
+) -> FloatImage:
+    """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1.
+
+    Parameters
+    ----------
+    white : as for ``sinusoid_contrast``
+    position_px : (rows, columns, 2) where the camera pixels look in the projector's image, NaN where not known
+    linearity : (3,) contrast that sinusoids truly had, see ``shown_contrast``; 1 if omitted
+    """
     full = np.ones(3) if linearity is None else linearity
     with np.errstate(invalid="ignore", divide="ignore"):
-        s = coarse.contrast / full.astype(np.float32)
-        f = np.clip(fine.contrast.mean(axis=2, keepdims=True) / np.float32(full.mean()), LEAST_FINE_CONTRAST, 1.0)
+        s = seen.coarse.contrast / full.astype(np.float32)
+        f = np.clip(seen.fine.contrast.mean(axis=2, keepdims=True) / np.float32(full.mean()), LEAST_FINE_CONTRAST, 1.0)
         f = np.where(np.isfinite(f), f, np.float32(1.0))
         share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
-    sigma = np.hypot(coarse.sigma, FLOOR).astype(np.float32)
+    sigma = np.hypot(seen.coarse.sigma, FLOOR).astype(np.float32)
     known = np.isfinite(share).all(axis=2) & (sigma.max(axis=2) < WORST_SIGMA)
     known &= (white > FAINTEST * _bright(white)).all(axis=2)
     smooth = _smoothed(np.where(known[..., None], share, 0).astype(np.float32), sigma, known, position_px)

@@ -16,7 +16,12 @@ from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pi
 from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import indirect_figures, indirect_share, shown_contrast
+from controller.calibrate.photometry.separation import (
+    indirect_figures,
+    indirect_share,
+    shown_contrast,
+    sinusoid_contrast,
+)
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -50,10 +55,11 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     noise = noise_of(taken[plan.sinusoids("phase-x")[0].name])
     known_px = used.known_px(folder, name)
     radiometry = light.radiometry
+    seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
     for number in range(PASSES):
         context.advance(number / PASSES)
-        contrast = shown_contrast(radiometry, light.response)
-        share = indirect_share(captures, plan, light.white, pixels.projector_px, linearity=contrast, noise=noise)
+        linearity = shown_contrast(radiometry, light.response)
+        share = indirect_share(seen, light.white, pixels.projector_px, linearity=linearity)
         radiometry, _ = measure_radiometry(
             captures,
             plan,

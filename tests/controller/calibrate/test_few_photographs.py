@@ -19,7 +19,7 @@ from controller.calibrate.correspondence.known_map import check_map
 from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.metapixels.blur import measure_blur
 from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import indirect_share
+from controller.calibrate.photometry.separation import indirect_share, sinusoid_contrast
 from controller.calibrate.values import Correspondence, Radiometry
 from controller.capture.patterns import CELL_PX, Code, PatternKind, PatternPlan, device_frame, frame, plan_patterns
 from controller.capture.profile import CameraNoise
@@ -205,7 +205,7 @@ def test_indirect_light_is_told_from_direct(indirect: float) -> None:
     plan, captures = plan_of(scene), completed(photographed(scene), plan_of(scene))
     found = decode(captures, plan, noise=NOISE)
     white = captures["white"] - captures["black"]
-    share = indirect_share(captures, plan, white, found.projector_px, noise=NOISE)
+    share = indirect_share(sinusoid_contrast(captures, plan, white, noise=NOISE), white, found.projector_px)
     inside = found.valid
     assert np.abs(np.median(share[inside], axis=0) - indirect).max() < 0.012
     assert np.std(share[inside]) < 0.02

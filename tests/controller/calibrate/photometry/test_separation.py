@@ -7,7 +7,12 @@ import pytest
 
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import indirect_figures, indirect_share, shown_contrast
+from controller.calibrate.photometry.separation import (
+    indirect_figures,
+    indirect_share,
+    shown_contrast,
+    sinusoid_contrast,
+)
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternKind, device_frame, plan_patterns, tile_levels
 from controller.core.arrays import Float64, FloatImage
@@ -61,7 +66,9 @@ class Room:
 
     def found(self, *, white: FloatImage | None = None, linearity: Float64 | None = None) -> FloatImage:
         white = self.white if white is None else white
-        return indirect_share(self.captures(), PLAN, white, self.position_px, linearity=linearity)
+        return indirect_share(
+            sinusoid_contrast(self.captures(), PLAN, white), white, self.position_px, linearity=linearity
+        )
 
 
 @pytest.mark.parametrize("blur_px", [0.2, 0.7, 1.2])
@@ -120,7 +127,7 @@ def test_a_missing_photograph_is_told() -> None:
     captures = Room().captures()
     del captures["phase-y-1"]
     with pytest.raises(CalibrationError) as caught:
-        indirect_share(captures, PLAN, Room().white, Room().position_px)
+        sinusoid_contrast(captures, PLAN, Room().white)
     assert caught.value.code == "capture-missing"
 
 
