@@ -24,7 +24,8 @@ from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.panel_address import PanelAccess, addresses, keep_first_login
-from controller.kiosk.service import Service, serving
+from controller.kiosk.service import Service
+from controller.kiosk.serving import serving
 from controller.kiosk.store.accounts import FOLDER
 from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
@@ -83,40 +84,41 @@ def serve(
     protocols = _protocols(kiosk, reporter)
     notifier = Notifier()
     with contextlib.ExitStack() as stack:
+
+        def open_to_others() -> PanelAccess | None:
+            opened = _open_panel(stack, kiosk, panel, reporter)
+            stack.enter_context(building.serving(kiosk, protocols))
+            notifier.ready()
+            return opened
+
         stack.callback(_leave_runtime_folder, stage)
         stack.callback(notifier.stopping)
-        first, socket_served, entrance, told = True, False, None, ""
+        first, socket_served, entrance, reported = True, False, None, ""
         while not cancel.is_set():
             kiosk.reload.clear()
             try:
                 with serving(stage, cancel, leave_lit=leave_lit, alive=notifier.alive) as service:
-                    told = ""
+                    reported = ""
                     kiosk.attach(service)
                     if not socket_served:
                         socket_served = True
                         path = runtime_folder(stage) / NAME
                         stack.enter_context(ControlServer(path, socket_table(kiosk.holders())))
                     if first:
-                        entrance = _open_panel(stack, kiosk, panel, reporter)
-                        stack.enter_context(building.serving(kiosk, protocols))
+                        first, entrance = False, open_to_others()
                         reporter.say(f"The kiosk {stage.name} is running.")
-                        first = False
-                        notifier.ready()
                     _wait(kiosk, cancel, over=_Correction(kiosk, service))
                 kiosk.detach()
             except (VelaturaError, DeviceError) as error:
                 if first and not setup:
                     raise
                 missing = not (stage / FILE).exists()
-                before, told = told, f"{error.what} {error.remedy}"
-                kiosk.attach(None, "" if missing else told)
-                if told != before:  # it is tried again every few seconds
-                    reporter.say(told, Level.ERROR)
+                before, reported = reported, f"{error.what} {error.remedy}"
+                kiosk.attach(None, "" if missing else reported)
+                if reported != before:  # it is tried again every few seconds
+                    reporter.say(reported, Level.ERROR)
                 if first:
-                    entrance = _open_panel(stack, kiosk, panel, reporter)
-                    stack.enter_context(building.serving(kiosk, protocols))
-                    first = False
-                    notifier.ready()
+                    first, entrance = False, open_to_others()
                 again_s = time.monotonic() + RETRY_S
                 with _set_up_picture(kiosk, entrance):
                     _wait(kiosk, cancel, notifier.alive, partial(_may_begin, stage, missing=missing, again_s=again_s))

@@ -29,13 +29,8 @@ from controller.stage.check import Checked, check_stage
 from controller.stage.run import marker
 from controller.stage.session import OwnSession
 from controller.steps import costs
-from controller.steps.appearance.publishing import (
-    photograph_hdr,
-    photograph_step,
-    photographs_s,
-    playback_step,
-    publish_step,
-)
+from controller.steps.appearance.photographing import photograph_hdr, photograph_step, photographs_s, playback_step
+from controller.steps.appearance.publishing import publish_step
 from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import device_frames, options_of, solve_steps

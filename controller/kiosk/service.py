@@ -7,11 +7,10 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from controller.core import kiosk_places
-from controller.core.errors import UsageError, WorkError
+from controller.core.errors import WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.alerts.alerts import Alerts
 from controller.kiosk.backup.nightly import NightlyBackup
@@ -24,10 +23,9 @@ from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of
-from controller.kiosk.store import archive, settings_change
+from controller.kiosk.store import settings_change
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.journal import journal_of
 from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
 from controller.kiosk.store.schedule_file import ScheduleFile
 from controller.kiosk.supervisors.bundle_watch import BundleWatch
@@ -42,10 +40,8 @@ from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
 from controller.run.state_machine import State
 from controller.stage.calibrations import finished_calibrations, stage_trust
-from controller.stage.check import Checked, check_stage
+from controller.stage.check import Checked
 from controller.stage.open import player_settings, technicians_panel
-from controller.stage.run import stage_lock
-from hal.deadline import Stop
 from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25
@@ -331,59 +327,3 @@ class Service:
         # The log has the refusal; a key can't show it.
         with contextlib.suppress(WorkError):
             self.reconciler.submit(Request("quick", light=True))
-
-
-def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
-    """The stage's settings, or the last good ones and why. Raises what ``check_stage`` raises."""
-    try:
-        return check_stage(stage, drivers=world.drivers), None
-    except UsageError as error:
-        return settings_change.last_good(stage, error, world.drivers)
-
-
-@contextlib.contextmanager
-def serving(
-    stage: Path,
-    cancel: threading.Event,
-    *,
-    leave_lit: bool = False,
-    alive: Callable[[], None] = lambda: None,
-    world: World | None = None,
-    jobs: MakeJobs = JobHandlers.table,
-) -> Iterator[Service]:
-    """A started service, its loop in a thread; ended, with the lamps cooled, on leaving. ``alive``: as ``Service``'s.
-
-    Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
-    """
-    world = world or World()
-    if (stage / archive.RESTORING).exists():
-        with stage_lock(stage):
-            archive.finish_restore(stage)
-    checked, problem = _usable(stage, world)
-    if checked.stage.tables.display.driver != "player":
-        raise UsageError(
-            "display-plays-no-bundles",
-            what="A kiosk needs the player as its display.",
-            remedy='Use the driver "player" under [display] in stage.toml.',
-        )
-    with stage_lock(checked.stage.folder):
-        archive.clear_cut_off(checked.stage.folder)
-        file = checked.stage.folder / EventLog.FILE
-        log = EventLog(file, wall=world.wall, monotonic=world.monotonic, connect=world.connect,
-                       also=journal_of(checked.stage.tables.stage.name))  # fmt: skip
-        with contextlib.closing(log):
-            service = Service(checked, log, problem, world, jobs)
-            service.alive = alive
-            ended = world.event()
-            loop = world.thread(partial(service.run, ended), "reconciler")
-            try:
-                service.start()
-                loop.start()
-                if problem is None:
-                    settings_change.keep_good(checked)
-                yield service
-            finally:
-                ended.set()
-                if loop.is_alive():
-                    loop.join(10.0)
-                service.end(leave_lit=leave_lit or (isinstance(cancel, Stop) and cancel.restarting))

@@ -20,7 +20,8 @@ from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.dispatch import socket_table
-from controller.kiosk.service import Service, serving
+from controller.kiosk.service import Service
+from controller.kiosk.serving import serving
 from controller.run.state_machine import State
 from controller.simulate.disk import STAGE, watched
 from controller.simulate.happen import happenings

@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import json
 import os
 import secrets
-import shlex
 import signal
 import socket
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +20,7 @@ from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from hal.runtime.files import read_text
 from hal.tape.reading import read_tape
+from plugins.emulated.bench_output import OutputLines
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
@@ -101,7 +99,7 @@ class EmulatedBench:
 
         ``scenario``: a script of faults, instead of the one in bench.toml; relative to the working folder.
         """
-        out = _OutputLines(json_lines)
+        out = OutputLines(json_lines)
         stopped = threading.Event()
         with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
             try:
@@ -119,7 +117,7 @@ class EmulatedBench:
 
     def replay(self, tape: Path, *, json_lines: bool) -> int:
         """See ``hal.interfaces.Bench``."""
-        out = _OutputLines(json_lines)
+        out = OutputLines(json_lines)
         stopped = threading.Event()
         with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
             try:
@@ -141,54 +139,8 @@ class _Interrupted(Exception):
     """A signal came before everything was up."""
 
 
-class _OutputLines:
-    """Tells a person, or a machine, what is served."""
-
-    def __init__(self, json_lines: bool) -> None:
-        self._json = json_lines
-        self._reported_percent = -1
-
-    def say(self, record: Mapping[str, Any], sentence: str) -> None:
-        # A reader that went away must not take the bench with it.
-        with contextlib.suppress(BrokenPipeError):
-            sys.stdout.write((json.dumps(record) if self._json else sentence) + "\n")
-            sys.stdout.flush()
-
-    def progress(self, share: float) -> None:
-        if (percent := int(100 * share) // 10 * 10) > self._reported_percent:
-            self._reported_percent = percent
-            self.say({"progress": percent / 100, "what": "rays"}, f"Casting rays through the stage: {percent} %")
-
-    def served(self, device: str, kind: str, address: str) -> None:
-        self.say({"device": device, "kind": kind, "address": address}, f"{kind:<10} {device:<10} {address}")
-
-    def environment(self, variables: Mapping[str, str]) -> None:
-        words = " ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items())
-        self.say({"environment": dict(variables)}, f"To see the USB devices, begin commands with: {words}")
-
-    def mains(self, projector: str, on: bool, damages: int) -> None:
-        hurt = f" Its lamp was switched off hot, {damages} times so far." if damages else ""
-        self.say(
-            {"mains": projector, "on": on, "damages": damages},
-            f"Projector {projector} {'has' if on else 'has no'} mains.{hurt}",
-        )
-
-    def douser(self, projector: str, is_open: bool) -> None:
-        state = "opens" if is_open else "closes"
-        self.say({"douser": projector, "open": is_open}, f"The douser of projector {projector} {state}.")
-
-    def ready(self) -> None:
-        self.say({"ready": True}, "Ready. Ctrl-C ends.")
-
-    def failed(self, error: DeviceError) -> None:
-        if self._json:
-            self.say({"error": {"code": error.code, "what": error.what, "remedy": error.remedy}}, "")
-        else:
-            sys.stderr.write(f"velatura: {error.what}\n{error.remedy}\n")
-
-
 def _start(
-    stage: Path, out: _OutputLines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
+    stage: Path, out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
 ) -> World:
     """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
     # Not at the top: a stage that is only prepared casts no rays, and all that these need takes a second to import.
@@ -269,7 +221,7 @@ def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
     )
 
 
-def _follow_bumps(world: World, out: _OutputLines) -> None:
+def _follow_bumps(world: World, out: OutputLines) -> None:
     try:
         count = world.follow_bumps()
     except DeviceError as error:  # somebody is writing it, or wrote it wrongly: the stage stays as it was

@@ -20,7 +20,8 @@ from typing import Any, Final, Self
 from benchmarks.serve import install_grey
 from controller.kiosk import service as services
 from controller.kiosk.decide.stage_states import Limits
-from controller.kiosk.service import Service, serving
+from controller.kiosk.service import Service
+from controller.kiosk.serving import serving
 from controller.run.state_machine import State
 from plugins.emulated.cameras.body import CameraFaults, CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera

@@ -23,6 +23,7 @@ from controller.kiosk.interface import (
 )
 from controller.kiosk.store import archive, runs, settings
 from controller.kiosk.store.bundle_store import BundleStore
+from controller.kiosk.store.diagnostics import diagnostics
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.schedule_file import ScheduleFile, check
 from controller.kiosk.supervisors.lamp_history import LampHistory
@@ -118,7 +119,7 @@ class FolderKiosk:
         archive.restore(self.stage, backup)
 
     def diagnostics(self) -> Path:
-        return archive.diagnostics(self.stage, {"state": "no kiosk runs"})
+        return diagnostics(self.stage, {"state": "no kiosk runs"})
 
     def _bundles(self) -> BundleStore:
         return BundleStore(self.stage, stage_trust(load_stage(self.stage)))

@@ -38,6 +38,7 @@ from controller.kiosk.interface import (
 from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import archive, runs, settings, settings_change, targets
+from controller.kiosk.store.diagnostics import diagnostics
 from controller.kiosk.store.schedule_file import check
 from controller.stage.calibrations import finished_calibration
 from controller.stage.check import check_stage
@@ -245,7 +246,7 @@ class StageKiosk(AttachedKiosk):
             self.reload.set()
 
     def diagnostics(self) -> Path:
-        return archive.diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
+        return diagnostics(self.stage, {"state": plain(self._last), "events": plain(self.events())})
 
     def effect_of_settings(self, text: str) -> str:
         settings.validate(text)

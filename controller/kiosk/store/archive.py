@@ -1,28 +1,21 @@
-"""Backup, restore and diagnostics of a stage as tar files without secrets."""
+"""Backup and restore of a stage as a tar file without secrets."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import gzip
 import io
 import json
 import os
-import platform
 import shutil
-import sqlite3
 import tarfile
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
-from controller.artefacts.grade import FIGURES
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import json_path
-from controller.artefacts.published import BUNDLE_FIGURES
 from controller.config import load_stage
 from controller.config.loader import FILE, LARGEST_BYTES
 from controller.core.errors import UsageError, WorkError
@@ -30,8 +23,6 @@ from controller.core.files import require_regular
 from controller.core.storage import sync_folder
 from controller.kiosk.changes.devices import outputs_of_x
 from controller.stage.calibrations import finished_calibrations
-from controller.stage.recording import tapes
-from hal.runtime.caches import kept
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
@@ -40,7 +31,6 @@ RESTORING: Final = ".restoring"
 REPLACED: Final = "kiosk/replaced"
 KEPT: Final = 5
 CUT_OFF_S: Final = 3600.0
-LARGEST_TAPE: Final = 64 << 20
 """An unfinished backup without changes for this time is abandoned."""
 MOST_FILES: Final = 100_000
 ROOM_SHARE: Final = 0.9
@@ -56,7 +46,7 @@ def backup(stage: Path) -> Path:
     parts = [stage / name for name in _BACKED_UP if (stage / name).exists()]
     runs = finished_calibrations(stage)
     parts += runs[:1]
-    path = _new(stage, "backup", "tar.gz")
+    path = new_file(stage, "backup", "tar.gz")
     # On another computer the connectors have other names; the displays have not.
     displays = {one.name: one.serials for one in outputs_of_x()}
     mark = json.dumps(
@@ -64,11 +54,11 @@ def backup(stage: Path) -> Path:
     )
 
     def write(archive: tarfile.TarFile) -> None:
-        _add(archive, MARK, mark.encode())
+        add(archive, MARK, mark.encode())
         for part in parts:
             archive.add(part, str(part.relative_to(stage)), filter=_harmless)
 
-    return _written(path, write)
+    return write_tar(path, write)
 
 
 def restore(stage: Path, file: Path) -> None:
@@ -182,45 +172,8 @@ def clear_cut_off(stage: Path) -> None:
                 part.unlink()
 
 
-def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
-    """A new file for remote support: ``facts``, events, journals and logs, without secrets and pictures."""
-    path = _new(stage, "diagnostics", "tar.gz")
-    system = {"system": platform.platform(), "python": platform.python_version(), "disk": _disk(stage),
-              "outside_the_stage": [dataclasses.asdict(cache) for cache in kept()]}  # fmt: skip
-
-    def write(archive: tarfile.TarFile) -> None:
-        _add(archive, "facts.json", json.dumps({**system, **facts}, indent=1, default=str).encode())
-        for name in ("stage.toml", "schedule.toml", "lamps.json"):
-            if (stage / name).is_file():
-                archive.add(stage / name, name)
-        for database in sorted([*stage.glob("runs/*/journal.sqlite"), *stage.glob("kiosk/events.sqlite")])[-20:]:
-            with contextlib.suppress(sqlite3.Error):
-                _add(archive, str(database.relative_to(stage)), _copy_of(database))
-        for text in [*_texts(stage), *_last_tape(stage)]:
-            archive.add(text, str(text.relative_to(stage)))
-
-    return _written(path, write)
-
-
-def _last_tape(stage: Path) -> list[Path]:
-    """The newest tape, unless its pictures make it too large for a mail."""
-    return [path for path in tapes(stage)[-1:] if path.stat().st_size <= LARGEST_TAPE]
-
-
-def _texts(stage: Path) -> Iterable[Path]:
-    runs = Path("runs/*")
-    patterns = (runs / FIGURES, json_path(runs, StepKind.DRIFT), json_path(runs, BUNDLE_FIGURES), Path("run/*.log"))
-    for pattern in patterns:
-        yield from sorted(stage.glob(str(pattern)))[-20:]
-
-
-def _copy_of(database: Path) -> bytes:
-    """A consistent copy, even while the database is written."""
-    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as source:
-        return source.serialize()
-
-
-def _new(stage: Path, what: str, suffix: str) -> Path:
+def new_file(stage: Path, what: str, suffix: str) -> Path:
+    """The path of a new archive of one kind; the oldest of the others go."""
     folder = stage / FOLDER
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for old in sorted(folder.glob(f"{what}-*"))[: -KEPT + 1]:
@@ -228,7 +181,8 @@ def _new(stage: Path, what: str, suffix: str) -> Path:
     return folder / f"{what}-{time.strftime('%Y%m%d-%H%M%S')}-{time.monotonic_ns() % 1_000_000:06d}.{suffix}"
 
 
-def _written(path: Path, write: Any) -> Path:
+def write_tar(path: Path, write: Callable[[tarfile.TarFile], None]) -> Path:
+    """``path``, which is there only when it is whole. Raises WorkError("cannot-write")."""
     part = path.with_name(f".{path.name}.part")
     try:
         with tarfile.open(part, "w:gz", compresslevel=1) as archive:
@@ -243,7 +197,8 @@ def _written(path: Path, write: Any) -> Path:
     return path
 
 
-def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Put a file of these bytes into ``archive``."""
     info = tarfile.TarInfo(name)
     info.size, info.mtime = len(data), int(time.time())
     archive.addfile(info, io.BytesIO(data))
@@ -330,8 +285,3 @@ def _merge_runs(fresh: Path, runs: Path) -> None:
             name = f"{time.strftime('%Y%m%d-%H%M%S')}-{name.partition('-')[2].partition('-')[2] or 'calibrate'}"
         if not (runs / name).exists():
             run.rename(runs / name)
-
-
-def _disk(stage: Path) -> dict[str, int]:
-    usage = shutil.disk_usage(stage)
-    return {"total": usage.total, "free": usage.free}

@@ -26,7 +26,8 @@ from controller.solve.ghosting import ghosting
 from controller.solve.judged import as_table, by_pixels
 from controller.solve.metrics import compare, sharpness_windows
 from controller.steps import costs
-from controller.steps.appearance.publishing import PLAYED, bundle_display, photograph_hdr
+from controller.steps.appearance.photographing import PLAYED, photograph_hdr
+from controller.steps.appearance.publishing import bundle_display
 
 WINDOWS: Final = 48
 """Windows of the resolution map along the camera picture's longer side."""

@@ -35,7 +35,7 @@ from controller.solve.refine import (
 )
 from controller.steps import costs
 from controller.steps.appearance.causes import causes_step
-from controller.steps.appearance.publishing import take_bracket
+from controller.steps.appearance.photographing import take_bracket
 from controller.steps.appearance.solving import device_frames
 from controller.steps.capture.photographs import frames_digest
 

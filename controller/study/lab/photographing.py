@@ -12,7 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context
-from controller.steps.appearance.publishing import take_hdr
+from controller.steps.appearance.photographing import take_hdr
 from controller.steps.appearance.solving import device_frames
 from controller.steps.capture.photographs import frames_digest
 from controller.study.lab.dots import read_study_dots

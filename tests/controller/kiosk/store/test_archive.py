@@ -12,9 +12,11 @@ from types import SimpleNamespace
 import pytest
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.kiosk.service import Service, serving
+from controller.kiosk.service import Service
+from controller.kiosk.serving import serving
 from controller.kiosk.store import archive
 from controller.kiosk.store.archive import FOLDER
+from controller.kiosk.store.diagnostics import LARGEST_TAPE, diagnostics
 from controller.stage.recording import new_tape
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
@@ -152,7 +154,7 @@ def test_a_backup_that_would_fill_the_disk_is_refused(stage: Path, monkeypatch: 
 
 def test_diagnostics_hold_facts_and_journals_and_no_secret_and_no_picture(stage: Path) -> None:
     (stage / "lamps.json").write_text("{}")
-    file = archive.diagnostics(stage, {"state": "playing"})
+    file = diagnostics(stage, {"state": "playing"})
     held = names(file)
     assert {"facts.json", "stage.toml", "lamps.json", f"runs/{OLD}/journal.sqlite"} <= held
     assert not [name for name in held if name.endswith(".png") or "keys" in name or "accounts" in name]
@@ -160,14 +162,14 @@ def test_diagnostics_hold_facts_and_journals_and_no_secret_and_no_picture(stage:
     assert b'"state": "playing"' in contents(file)
 
 
-def test_diagnostics_hold_the_newest_tape_unless_it_is_too_large(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diagnostics_hold_the_newest_tape_unless_it_is_too_large(stage: Path) -> None:
     for number, name in enumerate(("old", "new")):
         new_tape(stage, name).write_text(f"velatura tape 1\n{'x' * 100}")
         os.utime(stage / "tapes" / f"{name}.tape", (number, number))
-    held = names(archive.diagnostics(stage, {}))
+    held = names(diagnostics(stage, {}))
     assert [name for name in held if name.startswith("tapes/")] == ["tapes/new.tape"]
-    monkeypatch.setattr(archive, "LARGEST_TAPE", 50)
-    assert not [name for name in names(archive.diagnostics(stage, {})) if name.startswith("tapes/")]
+    os.truncate(stage / "tapes" / "new.tape", LARGEST_TAPE + 1)  # sparse
+    assert not [name for name in names(diagnostics(stage, {})) if name.startswith("tapes/")]
 
 
 def test_a_disk_that_takes_nothing_is_told_and_leaves_nothing(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
