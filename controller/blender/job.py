@@ -7,7 +7,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -91,23 +91,27 @@ def write_job(
         },
     )
     view = geometry.camera if view is None else view
-    margin, matrix = margin_px(view), view.matrix
-    distance = mesh.vertices_m[:, 2]
     job = {
         "builtin": builtin,
         "scene_file": None if scene_file is None else str(scene_file.resolve()),
-        "camera": {
-            "size_px": (view.size_px[0] + 2 * margin, view.size_px[1] + 2 * margin),
-            "fx": float(matrix[0, 0]),
-            "fy": float(matrix[1, 1]),
-            "cx": float(matrix[0, 2]) + margin,
-            "cy": float(matrix[1, 2]) + margin,
-            "near_m": float(distance.min()) * 0.2,
-            "far_m": float(distance.max()) * 20,
-        },
+        "camera": _camera_of(view, mesh.vertices_m[:, 2]),
         **dataclasses.asdict(settings),
     }
     write_atomically(folder / "job.json", json.dumps(job, indent=1).encode())
+
+
+def _camera_of(view: Pinhole, depth_m: FloatImage) -> dict[str, Any]:
+    """Blender's camera, with the margin that the lens's distortion needs; ``depth_m`` (N,) of the object."""
+    margin, matrix = margin_px(view), view.matrix
+    return {
+        "size_px": (view.size_px[0] + 2 * margin, view.size_px[1] + 2 * margin),
+        "fx": float(matrix[0, 0]),
+        "fy": float(matrix[1, 1]),
+        "cx": float(matrix[0, 2]) + margin,
+        "cy": float(matrix[1, 2]) + margin,
+        "near_m": float(depth_m.min()) * 0.2,
+        "far_m": float(depth_m.max()) * 20,
+    }
 
 
 def upright(vectors: FloatImage) -> FloatImage:

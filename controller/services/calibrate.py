@@ -13,6 +13,7 @@ from controller.artefacts.grade import is_graded, passes
 from controller.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
 from controller.bundle.install import current
 from controller.bundle.signing import Trust, load_signing_key
+from controller.config.models import SolveTable
 from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
@@ -22,7 +23,9 @@ from controller.run.progress import Level, Reporter
 from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
 from controller.services.refine import Refinement, refine
+from controller.solve.appearance import BaseChoice
 from controller.solve.engines.choice import choose_engine
+from controller.solve.request import SolveOptions
 from controller.stage.calibrations import (
     KEY_FILE,
     finished_calibration,
@@ -133,7 +136,7 @@ def make_appearances(
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
 
-    ``scenes``: Blender scenes to render besides ``names``, or only these if no names are given.
+    ``scenes``: Blender scenes to render in addition to ``names``, or only these if no names are given.
     ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
     ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
     the next run without it solves them as stage.toml says. ``refinement``: how photographs then correct them; None
@@ -151,12 +154,7 @@ def make_appearances(
         calibrated = Calibrated(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
-        table = checked.stage.tables.solve
-        kept = base_choice(table.base)
-        options = replace(options_of(table), base=chosen or kept)
-        if quick:
-            # a high-pass base would be solved again for each
-            options = replace(options, mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
+        options = _options(checked.stage.tables.solve, chosen, quick=quick)
         outputs = output_sizes(checked)
         scale = costs.scale(size for _, size in outputs.values())
         with (
@@ -182,6 +180,15 @@ def make_appearances(
         with session.locked(), Journal(run) as journal:
             Runner([publish], journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
+
+
+def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> SolveOptions:
+    """``chosen``: the base image instead of the table's; ``quick``: base times scale alone."""
+    kept = base_choice(table.base)
+    if quick:
+        # a high-pass base would be solved again for each
+        return replace(options_of(table), mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
+    return replace(options_of(table), base=chosen or kept)
 
 
 def signing_key(checked: Checked) -> Path | None:
