@@ -1,4 +1,4 @@
-"""One set of points laid onto another, written anew: the judge shares no code with what it judges."""
+"""One set of points aligned with another, written separately: the judge shares no code with what it judges."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def _frames(size: str) -> list[dict[str, ByteImage]]:
 
 
 def more_than_kept(set_bytes: int) -> int:
-    """So many sets that a player which shows them in turn decodes each one anew."""
+    """So many sets that a player which shows them in turn decodes each one again."""
     return min(MOST_CACHED, CACHE_BYTES // set_bytes) + BEYOND_CACHE
 
 
@@ -96,7 +96,7 @@ def _settings(place: Path, swaps: Sequence[dict[str, ByteImage]]) -> PlayerSetti
 
 
 def keep_compiled() -> None:
-    """Let Python keep compiled modules: a kiosk has them, and without them every start compiles anew."""
+    """Let Python keep compiled modules: a kiosk has them, and without them every start compiles again."""
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
@@ -142,7 +142,7 @@ def starting(place: Path, settings: PlayerSettings) -> Row:
 
 
 def _sustained(display: PlayerDisplay, sets: int, *, paper: bool) -> list[Row]:
-    """As fast as they go: every set decoded anew, and then the same few from the cache."""
+    """As fast as they go: every set decoded again, and then the same few from the cache."""
     rows = []
     for count, figure, goal in (
         (sets, "swaps sustained, each decoded", 120.0 if paper else None),
@@ -212,7 +212,7 @@ def _watched(display: PlayerDisplay, place: Path, swaps: Sequence[dict[str, Byte
 
 
 def _memory(player: PlayerProcess, display: PlayerDisplay, sets: int) -> list[Row]:
-    """Private memory while every set is decoded anew, and its growth in that time."""
+    """Private memory while every set is decoded again, and its growth in that time."""
     _play(display, AS_FAST_HZ, sets)
     time.sleep(2.0)
     first, begin = private_bytes(player.pid), display.playing(deadline=in_seconds(5)).swaps

@@ -95,7 +95,7 @@ def _bundle(place: Path, sets: Sequence[dict[str, ByteImage]], width: int, heigh
 def _play(player: PlayerProcess, rate_hz: float, sets: int, seconds: float) -> Played:
     with Wire(player.socket) as wire:
         items = [[f"a{number}", 1 / rate_hz] for number in range(sets)]
-        # Until every set has been decoded and every texture drawn once; then count anew.
+        # Until every set has been decoded and every texture drawn once; then count from 0.
         wire.ask("sequence", items=items, rate_hz=rate_hz)
         time.sleep(min(3.0, seconds))
         wire.ask("sequence", items=items, rate_hz=rate_hz)

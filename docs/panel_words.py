@@ -58,7 +58,7 @@ def compiled(language: str) -> bytes:
 
 
 def main() -> None:
-    """Bring the catalogues up to date: new words come without a translation, those that nobody says go."""
+    """Bring the catalogues up to date: new words come without a translation, those that are no longer used go."""
     template = words()
     for language in LANGUAGES:
         if language == "en":

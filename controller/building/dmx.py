@@ -12,7 +12,7 @@ from controller.run.state_machine import State
 LOST_S: Final = 2.5
 """E1.31 (ANSI E1.31-2018, 6.7.1): a source that is silent for so long is lost."""
 SETTLE_S: Final = 0.15
-"""A fader that moves passes appearances that nobody wants to see."""
+"""A moving fader passes appearances that are not meant to be shown."""
 DIM_EVERY_S: Final = 0.25
 IN_TURN: Final = 255
 FADE_STEP_S: Final = 0.1

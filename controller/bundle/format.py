@@ -123,7 +123,7 @@ class BundledAppearance:
 
 @dataclass(frozen=True, slots=True)
 class PlaylistEntry:
-    """One entry of the playlist that a bundle suggests; whoever plays it may do otherwise."""
+    """One entry of the playlist that a bundle suggests; a player may ignore it."""
 
     appearance: str
     duration_ms: int

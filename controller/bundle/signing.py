@@ -42,7 +42,7 @@ class Trust:
 
 
 ANY_SIGNER: Final = Trust(allow_unsigned=True)
-"""For inspecting any bundle: a signature must match its content, whoever signed."""
+"""For inspecting any bundle: a signature must match its content, but any key may have signed."""
 
 
 def unsigned_warning(signed_by: bytes | None, trust: Trust) -> BundleError | None:

@@ -28,7 +28,7 @@ FAST_FROM_BYTES: Final = 32 * 1024 * 1024
 MOST_LARGER: Final = 1.5
 """So many times larger than with Zstandard a bundle may be for LZ4's sake,"""
 MOST_ADDED: Final = 1 / 50
-"""and this share of the pixels' own size besides: of even areas LZ4 keeps 1/255, Zstandard nearly nothing."""
+"""plus this share of the pixels' own size: LZ4 keeps 1/255 of even areas, Zstandard nearly nothing."""
 _SAMPLED_TILES: Final = 12
 """Of each output; every one is compressed both ways to choose the codec."""
 WORTH_NARROW: Final = 0.25

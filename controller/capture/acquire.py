@@ -67,7 +67,7 @@ class Acquirer:
         self._delay_s: float | None = None
         self._confirmed: tuple[float, ExposureSettings] | None = None
         self.last: LastShown | None = None
-        """Set by whoever photographs picture after picture, to find out whether one shows the picture before."""
+        """Set while one picture after the other is photographed, to find out whether one shows the previous picture."""
 
     @property
     def wait_s(self) -> float:

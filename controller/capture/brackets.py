@@ -38,7 +38,7 @@ RELATIVE_NOISE = 0.02
 BEFORE_CLIPPING = 0.9
 """Of full scale: up to this level a longer exposure is surely not clipped."""
 FEWEST_WHITES = 2
-"""One exposure alone would show neither the camera's noise nor whether it is linear."""
+"""One exposure alone would not show the camera's noise, or whether it is linear."""
 FLICKER = 0.02
 """A longer exposure may show this share less than shorter ones: lamps are not steady."""
 SPREADS = 3.0

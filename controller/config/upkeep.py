@@ -1,4 +1,4 @@
-"""The tables of stage.toml on what a kiosk does while nobody looks: its disk, its backups, and whom it tells."""
+"""The tables of stage.toml for an unattended kiosk: its disk, its backups, and who gets alerts."""
 
 from __future__ import annotations
 

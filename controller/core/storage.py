@@ -113,7 +113,7 @@ def _opened_lock(path: Path) -> int:
     except OSError as error:
         if error.errno != errno.EROFS:
             raise
-    # Nobody can have made the file since; who holds it from before holds it still.
+    # No other program can have made the file since; one that held it before still holds it.
     return os.open(path if path.exists() else path.parent, os.O_RDONLY | os.O_CLOEXEC)
 
 

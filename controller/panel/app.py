@@ -112,7 +112,7 @@ def _route(panel: Panel, path: str, entries: dict[str, Entry]) -> Route:
         method = "GET" if request.method == "HEAD" else request.method
         response = await guarded(panel, entries[method], request)
         if request.method == "HEAD" and isinstance(response, StreamingResponse):
-            # Nobody reads its content. An endless one would keep the connection from the next request.
+            # Its content is not read. An endless one would keep the connection from the next request.
             return Response(status_code=response.status_code, headers=dict(response.headers))
         return response
 

@@ -40,7 +40,7 @@ class TargetObject:
     def hit(self, from_m: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Metres (N,) along unit ``directions`` (N, 3) from ``from_m`` (3,) to the surface, AFTER_M where none.
 
-        And the faces' normals there (N, 3), unit, to whichever side they point; 0 where none.
+        And the faces' normals there (N, 3), unit, on the side to which they point; 0 where none.
         """
         if not len(directions):
             return np.zeros(0), np.zeros((0, 3))

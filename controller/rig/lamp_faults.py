@@ -7,7 +7,7 @@ from typing import Final
 from hal.errors import DeviceRefused
 from hal.values import ProjectorStatus
 
-AGAIN: Final = "Then start the same command or job again: it continues where it stopped."
+START_AGAIN: Final = "Then start the same command or job again: it continues where it stopped."
 _REMEDIES = {
     "lamp": "Let it cool for some minutes. If the fault returns, replace the lamp.",
     "temperature": "Clear its air inlets, clean the filter, and let it cool for 45 minutes before the next start.",

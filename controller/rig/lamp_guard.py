@@ -1,6 +1,6 @@
 """The lamp rules, between every caller and the projectors. No other code uses a projector without them.
 
-- A lamp is never struck while it cools, nor before its minimum off time is over.
+- A lamp is never struck while it cools, or before its minimum off time is over.
 - After a power cut or a kill, or when a lamp is found to be off by itself, it counts as hot from that moment.
 - Strikes are counted before they happen, hours while they pass; both survive restarts.
 - A mains relay opens only after cooling; photometric work begins only when the lamp is stable.

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from controller.rig.lamp_faults import AGAIN, fatal_faults, faulty
+from controller.rig.lamp_faults import START_AGAIN, fatal_faults, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Cancelled, Deadline, in_seconds
@@ -84,7 +84,7 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
                 raise DeviceRefused(
                     "lamp-went-off",
                     what=f"The lamp of projector {guard.name} went off while it was warming up.",
-                    remedy=f"Let it cool for some minutes. If it goes off again, replace the lamp. {AGAIN}",
+                    remedy=f"Let it cool for some minutes. If it goes off again, replace the lamp. {START_AGAIN}",
                 )
         left_s = max((guard.stable_left_s() for guard in guards), default=0.0)
         if left_s <= 0:
@@ -153,7 +153,7 @@ def cool_all(
 def _check(guard: LampGuard, deadline: Deadline) -> None:
     status = guard.status(deadline=deadline.within(guard.answer_s))
     if status.power is Power.FAULT or fatal_faults(status):
-        raise faulty(guard.name, status, then=AGAIN)
+        raise faulty(guard.name, status, then=START_AGAIN)
 
 
 def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock, tell: Tell) -> None:
@@ -195,7 +195,7 @@ def _is_on(guard: LampGuard, deadline: Deadline) -> bool:
     except (DeviceTimeout, DeviceBusy, ProtocolError):
         return False
     if status.power is Power.FAULT or fatal_faults(status):
-        raise faulty(guard.name, status, then=AGAIN)
+        raise faulty(guard.name, status, then=START_AGAIN)
     return status.power is Power.ON
 
 

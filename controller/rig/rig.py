@@ -11,7 +11,7 @@ import numpy as np
 from controller.capture.acquire import Acquirer
 from controller.core.arrays import ByteImage
 from controller.rig.ambient_light import AmbientLightLimit
-from controller.rig.lamp_faults import AGAIN, faulty
+from controller.rig.lamp_faults import START_AGAIN, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline
@@ -58,12 +58,12 @@ class Rig:
         for guard in self.guards:
             status = guard.status(deadline=deadline.within(guard.answer_s))
             if status.power is Power.FAULT:
-                raise faulty(guard.name, status, then=AGAIN)
+                raise faulty(guard.name, status, then=START_AGAIN)
             if status.power is not Power.ON or guard.stable_left_s() > 0:
                 raise DeviceRefused(
                     "lamp-went-off",
                     what=f"The lamp of projector {guard.name} went off during the work.",
-                    remedy=f"Check whether it was switched off or overheated. {AGAIN}",
+                    remedy=f"Check whether it was switched off or overheated. {START_AGAIN}",
                 )
 
     def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:

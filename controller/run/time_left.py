@@ -35,7 +35,7 @@ class TimeLeft:
         self.reason = ""
 
     def now(self, *, worked: float, worked_s: float, left: float, title: str) -> float | None:
-        """Seconds, or None as long as nobody can know.
+        """Seconds, or None until it can be estimated.
 
         ``worked``: the cost of what this run did in ``worked_s`` seconds; ``left``: the cost of the rest. ``reason``
         says why it is more than a fifth above the least that was shown, as long as it is.

@@ -168,7 +168,7 @@ def read_programme(path: Path) -> Programme:
         raise _wrong(path, f"it is not TOML ({error})") from error
     items, repeat = tables.get("item"), tables.get("repeat", 0)
     if tables.keys() - {"item", "repeat"} or not isinstance(items, list) or not items:
-        raise _wrong(path, "it needs [[item]] tables, and may have only repeat besides")
+        raise _wrong(path, "it needs [[item]] tables; its only other key is repeat")
     if type(repeat) is not int or repeat < 0:
         raise _wrong(path, "repeat must be a whole number from 0")
     return Programme(tuple(_item(path, number, table) for number, table in enumerate(items, start=1)), repeat)
@@ -176,7 +176,7 @@ def read_programme(path: Path) -> Programme:
 
 def _item(path: Path, number: int, table: Any) -> tuple[str, float, float]:
     if not isinstance(table, dict) or table.keys() - _KEYS or not isinstance(table.get("appearance"), str):
-        raise _wrong(path, f"item {number} needs appearance, and may have only seconds and fade_s besides")
+        raise _wrong(path, f"item {number} needs appearance; its only other keys are seconds and fade_s")
     seconds, fade_s = table.get("seconds", SHOWN_S), table.get("fade_s", 0.0)
     if any(type(value) not in (int, float) for value in (seconds, fade_s)) or not 0 <= fade_s <= seconds or not seconds:
         raise _wrong(path, f"in item {number}, seconds must be above 0, and fade_s from 0 to seconds")

@@ -27,7 +27,7 @@ Send = Callable[[Path, str, AlertsTable, Sequence[EventRow]], None]
 
 
 class Channel:
-    """One way out. What was sent is kept in the log's file, so that a restart neither repeats nor loses an alert."""
+    """One channel. What was sent is kept in the log's file, so that a restart does not repeat or lose an alert."""
 
     def __init__(self, name: str, send: Send, log: EventLog, monotonic: Callable[[], float]) -> None:
         self._name, self._send, self._log, self._monotonic = f"alerted-{name}", send, log, monotonic

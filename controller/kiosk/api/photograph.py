@@ -19,7 +19,7 @@ _lock = threading.Lock()
 
 
 def newest_photograph(stage: Path, now_s: float, since_s: float = 0.0) -> bytes | None:
-    """As JPEG; None if no run has taken one since ``since_s``, nor within ``AGE_S`` before ``now_s`` (Unix seconds)."""
+    """As JPEG; None if no run has taken one since ``since_s``, or within ``AGE_S`` before ``now_s`` (Unix seconds)."""
     try:
         # Each step of a run has a folder of its own for its photographs.
         folders = [step for step in (stage / "runs").glob(f"*/{CAPTURES}/*") if step.is_dir()]

@@ -81,7 +81,7 @@ class InventoryWatch:
         self._failed = False
 
     def step(self) -> None:
-        """Take an inventory if one is due. One that can't be written is tried again, and told once."""
+        """Take an inventory if one is due. One that can't be written is tried again, and reported once."""
         if self._busy() or _ahead(self._again_at_s, self._wall()):
             return
         try:

@@ -43,7 +43,7 @@ class TokenRow:
 
 @dataclass(frozen=True, slots=True)
 class NewToken:
-    """The secret of a new API token. It is not stored, so nobody can read it later."""
+    """The secret of a new API token. It is not stored, so it can't be read later."""
 
     token: str
 

@@ -80,7 +80,7 @@ class Guard:
 
 
 def _is_address(name: str) -> bool:
-    """Whether a name needs no resolving, so that nobody else can let it resolve to this machine."""
+    """Whether a name needs no resolving, so that no one else can make it resolve to this machine."""
     try:
         ipaddress.ip_address(name.strip("[]"))
     except ValueError:

@@ -1,4 +1,4 @@
-"""The player of an installed kiosk: systemd starts it, and starts it again; whoever supervises it is attached to it."""
+"""The player of an installed kiosk: systemd starts and restarts it; the supervisor only connects to it."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Canvas:
 
     @property
     def pictures(self) -> Sequence[int]:
-        """The textures that are drawn with share 0: whoever draws into them does what ``load`` does."""
+        """The textures that are drawn with share 0: code that draws into them does what ``load`` does."""
         self._held.clear()
         return self._before
 

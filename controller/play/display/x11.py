@@ -236,7 +236,7 @@ class XServer:
         xlib.XSync(self._display, 0)
 
     def keep_awake(self) -> None:
-        """Neither screen saver nor power saving blanks the outputs from now on."""
+        """Switch screen saver and power saving off, so that they do not blank the outputs."""
         xlib.XSetScreenSaver(self._display, 0, 0, 0, 0)
         xlib.XForceScreenSaver(self._display, 0)
         power = _power_saving()

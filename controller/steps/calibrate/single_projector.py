@@ -25,7 +25,7 @@ from controller.steps.calibrate.grade import verification_photographs_step, veri
 from controller.steps.calibrate.quick import Reuse, copy_from_last
 from controller.steps.capture.patterns import capture_steps
 
-ANEW = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
+REPEATED = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
 """Kinds of steps that concern every projector and depend on the new measurements."""
 EXPOSURE = StepId(StepKind.EXPOSURE)
 
@@ -59,7 +59,7 @@ def one_projector_steps(
 
 def reuse_of(step: StepId, projector: str) -> Reuse:
     """How to treat a step of the full calibration."""
-    if step.kind in ANEW or step == EXPOSURE or step.projector == projector:
+    if step.kind in REPEATED or step == EXPOSURE or step.projector == projector:
         return Reuse.RUN
     return Reuse.CORRECT if step.kind == StepKind.RADIOMETRY else Reuse.KEEP
 
