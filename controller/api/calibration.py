@@ -56,7 +56,7 @@ def decode(captures: CaptureSet) -> Correspondence:
 
 
 def measure_response(captures: CaptureSet) -> Radiometry:
-    """The projector's light for each device value, from mosaics of coloured tiles.
+    """The projector's light for each device value, from pictures of coloured tiles.
 
     Parameters
     ----------

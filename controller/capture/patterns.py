@@ -166,7 +166,7 @@ def plan_patterns(
     Parameters
     ----------
     few : two steps of each sinusoid, a quarter of a period apart, and one of the diagonal one; the opposites are
-        computed. One mosaic less
+        computed. One picture of tiles less
     code : ``COLOURS``: ``gray-rgb-0``.. with three bits each; ``KNOWN``: no code
 
 

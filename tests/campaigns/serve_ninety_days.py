@@ -172,8 +172,8 @@ class NinetyDays:
 
     def _new_lamp(self, lamp: object) -> None:
         setattr(lamp, "dud", False)  # noqa: B010 - the knob of a model
-        for keeper in self.kiosk.supervisors:
-            keeper.forgive()
+        for supervisor in self.kiosk.supervisors:
+            supervisor.forgive()
 
     def _right_clock(self) -> None:
         self.kiosk.wall_offset_s = self.truth_offset_s

@@ -114,8 +114,8 @@ def usb_well(kiosk: WiredKiosk) -> str:
     if kiosk.bus is None:
         return ""
     devices = kiosk.service.devices
-    keepers = [devices.mains, devices.sensor, *([devices.camera] if TETHER in kiosk.well else [])]
-    wrong = [keeper.problem.text for keeper in keepers if keeper and keeper.problem]
+    supervisors = [devices.mains, devices.sensor, *([devices.camera] if TETHER in kiosk.well else [])]
+    wrong = [supervisor.problem.text for supervisor in supervisors if supervisor and supervisor.problem]
     assert kiosk.service.keys is not None
     wrong.append(kiosk.service.keys.row.problem or "")
     if kiosk.bus.get("board", "state") != [True, True]:

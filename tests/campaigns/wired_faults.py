@@ -107,8 +107,8 @@ def mend_projectors(kiosk: WiredKiosk) -> None:
         if wire.wedged:
             wire.power_cycle()
         kiosk.lamps[name].repair()
-    for keeper in kiosk.service.devices.projectors:
-        keeper.forgive()
+    for supervisor in kiosk.service.devices.projectors:
+        supervisor.forgive()
 
 
 def processes() -> Iterator[Fault]:

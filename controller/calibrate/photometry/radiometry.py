@@ -1,6 +1,6 @@
 """A projector's response and colour mixing from colour tiles (idea of Raij 2003), and whether the camera is linear.
 
-Every tile of a mosaic shows a triple of device values of its own, so that two photographs hold some hundreds to
+Every tile of a picture shows a triple of device values of its own, so that two photographs hold some hundreds to
 thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Both are fitted
 together, each with the other held, until neither changes; tiles that do not fit are left out. A lamp is never equally
 strong in two photographs; the tiles that show full channels tell how strong it was in theirs.

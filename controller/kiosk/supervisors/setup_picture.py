@@ -19,25 +19,25 @@ _STEP_S: Final = 0.5
 @contextlib.contextmanager
 def shown(lines: Callable[[], tuple[str, ...]]) -> Iterator[None]:
     """Show ``lines()``, as they are from time to time, on one projector after the other until the end."""
-    keeper = PlayerSupervisor(
+    supervisor = PlayerSupervisor(
         RUNTIME,
         lambda _: PlayerSettings((), None),
         lambda _: None,
         attach=lambda _: AttachedPlayer(PLAYER_SOCKET, PLAYER_OPTIONS, None),
     )
     ended = threading.Event()
-    thread = threading.Thread(target=partial(_show, keeper, lines, ended), name="set-up picture", daemon=True)
+    thread = threading.Thread(target=partial(_show, supervisor, lines, ended), name="set-up picture", daemon=True)
     thread.start()
     try:
         yield
     finally:
         ended.set()
         thread.join(10.0)
-        keeper.close()
+        supervisor.close()
 
 
-def _show(keeper: PlayerSupervisor, lines: Callable[[], tuple[str, ...]], ended: threading.Event) -> None:
+def _show(supervisor: PlayerSupervisor, lines: Callable[[], tuple[str, ...]], ended: threading.Event) -> None:
     while not ended.is_set():
-        keeper.notice = lines()
-        keeper.step()
+        supervisor.notice = lines()
+        supervisor.step()
         ended.wait(_STEP_S)

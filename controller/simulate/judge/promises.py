@@ -8,7 +8,7 @@ PROMISES: Final = {
     "lamp rules": "No lamp is switched on while it is hot, or before its minimum off time.",
     "one owner": "A device is used by one program, and by one of its threads, at a time.",
     "no crash": "Nothing ends with an unexpected error.",
-    "decides always": "The decider waits for nothing.",
+    "decides always": "The reconciler waits for nothing.",
     "remedy": "An error says what happened and what to do.",
     "state": "The log's last word on the state is the state.",
     "black while closed": "No picture is shown while the stage is closed.",

@@ -44,7 +44,7 @@ _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 class Witness:
     """Sees what really is, and judges.
 
-    ``disturbed_until_s``: until when a fault, or what follows of it, excuses; ``paused_long``: whether the decider's
+    ``disturbed_until_s``: until when a fault, or what follows of it, excuses; ``paused_long``: whether the reconciler's
     pause that begins now is stretched; ``here``: the folder of this life, which is left out of what is logged.
     """
 
@@ -144,7 +144,7 @@ class Witness:
     # -- judging
 
     def judge(self, kiosk: StageKiosk, service: Service) -> bool:
-        """After a step of the decider. Whether something changed in it. Raises Broken."""
+        """After a step of the reconciler. Whether something changed in it. Raises Broken."""
         world, now_s = self._world, self._world.scheduler.now_s
         scheduler = world.scheduler
         if world.camera.sins:

@@ -98,31 +98,31 @@ def test_its_end_is_noticed_and_the_keeper_goes_on_with_the_next_one(starter: St
     def attach(chosen: PlayerSettings) -> AttachedPlayer:
         return AttachedPlayer(starter.socket, starter.options, chosen)
 
-    keeper = PlayerSupervisor(tmp_path, lambda _: wanted, told.append, attach=attach)
-    keeper.step()
+    supervisor = PlayerSupervisor(tmp_path, lambda _: wanted, told.append, attach=attach)
+    supervisor.step()
     os.kill(hello(starter.socket, 5.0)["pid"], signal.SIGKILL)
 
     def started_again() -> bool:
-        keeper.step()
+        supervisor.step()
         return [one.code for one in told].count("player-started") == 2
 
     wait_for(started_again)
     assert [one.code for one in told] == ["player-started", "player-died", "player-started"]
     assert starter.starts == 2
-    keeper.close()
+    supervisor.close()
 
 
 def test_a_service_that_ends_leaves_the_player_black(starter: Starter, tmp_path: Path) -> None:
-    keeper = PlayerSupervisor(
+    supervisor = PlayerSupervisor(
         tmp_path,
         lambda _: settings(tmp_path),
         lambda _: None,
         attach=lambda chosen: AttachedPlayer(starter.socket, starter.options, chosen),
     )
-    keeper.step()
+    supervisor.step()
     with Wire(starter.socket) as wire:
         wire.ask("identify")
-        keeper.close()
+        supervisor.close()
         assert wire.ask("status")["showing"] == "black"
     assert starter.starts == 1
 

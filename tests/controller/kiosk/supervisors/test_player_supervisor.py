@@ -1,4 +1,4 @@
-"""What the player's keeper does while a service ends; the rest is in the tests of the player, and of the kiosk."""
+"""What the player's supervisor does while a service ends; the rest is in the tests of the player, and of the kiosk."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def test_a_player_that_starts_after_its_keeper_was_closed_is_ended(
     monkeypatch.setattr(player_keeper, "PlayerProcess", ModelProcess)
 
     def settings(with_bundle: bool) -> PlayerSettings:
-        keeper.close()  # the service ends while the start is prepared
+        supervisor.close()  # the service ends while the start is prepared
         return PlayerSettings([("P1", 8, 8)], tmp_path / "outputs.frame")
 
-    keeper = PlayerSupervisor(tmp_path, settings, lambda _: None)
-    keeper.step()
+    supervisor = PlayerSupervisor(tmp_path, settings, lambda _: None)
+    supervisor.step()
     assert [process.alive for process in running] == [False]
