@@ -1,4 +1,4 @@
-"""The player of an installed kiosk: systemd starts and restarts it; the supervisor only connects to it."""
+"""The player of an installed kiosk: systemd starts and restarts it; the controller only connects to it."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class PlayerProcess:
         command = [sys.executable, "-m", "controller.play", "--socket", str(self.socket)]
         command += self._settings.arguments()
         with self.log.open("wb") as log:
-            # A session of its own: Ctrl-C is for the supervisor, which ends the player when the lamps are safe.
+            # A session of its own: Ctrl-C is for the controller, which ends the player when the lamps are safe.
             return subprocess.Popen(  # noqa: S603
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env=_environment()
             )

@@ -42,7 +42,7 @@ class Notifier:
     def _send(self, state: str) -> None:
         if not self._address:
             return
-        # A supervisor that is gone must not stop the picture.
+        # A service manager that is gone must not stop the picture.
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
             channel.setblocking(False)
             channel.sendto(state.encode(), self._address)
