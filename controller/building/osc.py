@@ -18,7 +18,7 @@ from pythonosc.osc_packet import OscPacket, ParseError
 from controller.building.protocol import NetworkOptions, Protocol
 from controller.building.server import changes
 from controller.building.verbs import Verbs
-from controller.core.errors import VelaturaError
+from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
 from controller.kiosk.interface import KioskState
 from controller.kiosk.operations.fields import Field as Value
 
@@ -157,7 +157,7 @@ async def _answer(
         channel.sendto(message("error", verb[:40], error.code, f"{error.what} {error.remedy}"), source)
     except Exception:  # noqa: BLE001 - one message must not end the protocol
         _LOG.exception("An OSC message failed.")
-        channel.sendto(message("error", verb[:40], "crash", "Export the diagnostics."), source)
+        channel.sendto(message("error", verb[:40], "crash", SEND_DIAGNOSTICS), source)
 
 
 async def _send_feedback(channel: asyncio.DatagramTransport, listeners: Sequence[Address], verbs: Verbs) -> None:

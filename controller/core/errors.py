@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Final
+
+SEND_DIAGNOSTICS: Final = "Export the diagnostics and send them to the maintainers."
+"""What to do about the code ``crash``: an error that the program did not expect."""
 
 
 class VelaturaError(Exception):

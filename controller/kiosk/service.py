@@ -10,7 +10,7 @@ from functools import partial
 from typing import Final
 
 from controller.core import kiosk_places
-from controller.core.errors import WorkError
+from controller.core.errors import SEND_DIAGNOSTICS, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.alerts.alerts import Alerts
 from controller.kiosk.backup.nightly import NightlyBackup
@@ -163,7 +163,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                 # The watchdog is not fed, so systemd restarts the service if the error persists.
                 what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
-                self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
+                self.log.add(Decision("crash", what, SEND_DIAGNOSTICS, "error"))
                 cancel.wait(AFTER_CRASH_S)
                 continue
             if hurried:
@@ -299,7 +299,7 @@ class Service:
                     step()
                 except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                     what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
-                    self.log.add(Decision("crash", what, "Export the diagnostics.", "error"))
+                    self.log.add(Decision("crash", what, SEND_DIAGNOSTICS, "error"))
                     self._stop.wait(AFTER_CRASH_S)
                 (sooner or self._stop).wait(every_s)
                 if sooner is not None:

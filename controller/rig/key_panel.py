@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import ByteImage
+from controller.core.errors import SEND_DIAGNOSTICS
 from controller.core.lettering import text_size, write
 from controller.run.state_machine import Event, State, allowed_events
 from hal.deadline import Cancelled, Deadline, in_seconds
@@ -128,7 +129,7 @@ class KeyService:
 
 def _unknown(error: Exception) -> DeviceError:
     what = f"An unexpected error occurred at the key panel ({type(error).__name__}: {error})."
-    return DeviceError("crash", what=what, remedy="Export the diagnostics and send them to the maintainers.")
+    return DeviceError("crash", what=what, remedy=SEND_DIAGNOSTICS)
 
 
 def key_picture(command: KeyCommand, state: State, size_px: tuple[int, int]) -> ByteImage:

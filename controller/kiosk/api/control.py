@@ -14,7 +14,7 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from controller.core.errors import UsageError, VelaturaError
+from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.core.sockets import listening
 from controller.core.storage import runtime_path
 from controller.kiosk.operations.dispatch import CALLER
@@ -94,7 +94,7 @@ class ControlServer:
             return _error("cannot-write", f"A file could not be used: {error}.", "Check the disk and its free space.")
         except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it answers and continues
             what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
-            return _error("crash", what, "Export the diagnostics.")
+            return _error("crash", what, SEND_DIAGNOSTICS)
 
 
 def _user_of(channel: socket.socket) -> str:

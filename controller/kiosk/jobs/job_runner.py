@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.core.errors import VelaturaError
+from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, JobStep
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -185,7 +185,7 @@ class JobRunner:
 
 def _crashed(request: Request, error: BaseException) -> Finished:
     what = f"The job failed with an unexpected error ({type(error).__name__}: {error})."
-    return Finished(request, Decision("crash", what, "Export the diagnostics.", "error"), failed=True)
+    return Finished(request, Decision("crash", what, SEND_DIAGNOSTICS, "error"), failed=True)
 
 
 def run_name(result: Mapping[str, object]) -> str:
