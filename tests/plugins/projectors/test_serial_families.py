@@ -20,6 +20,7 @@ from plugins.emulated.projectors.families.sanyo import SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import shipped_profiles
 from tests.plugins.conftest import each, hasty, wait_for_power
+from tests.plugins.projectors.switching import strikes_once_when_its_second_answer_is_lost
 
 SOON = 30.0
 SERIAL = [name for name in shipped_profiles() if name != "pjlink" and baud_of(name)]
@@ -111,17 +112,7 @@ def test_a_lost_acknowledgement_strikes_once_and_is_confirmed_by_the_state(open_
     def lost(profile: str) -> None:
         pair = open_serial(profile=profile, name=profile, edit=hasty)
         pair.driver.status(deadline=in_seconds(SOON))
-        lose = pair.emulator.faults.loses_this_one
-        answers: list[bool] = []
-
-        def lose_the_second() -> bool:
-            answers.append(len(answers) == 1)
-            return answers[-1] or lose()
-
-        pair.emulator.faults.loses_this_one = lose_the_second
-        pair.driver.switch_on(deadline=in_seconds(SOON))
-        assert pair.emulator.lamp.strikes == 1
-        wait_for_power(pair.driver, Power.ON)
+        strikes_once_when_its_second_answer_is_lost(pair)
 
     each(SWITCHABLE, lost)
 

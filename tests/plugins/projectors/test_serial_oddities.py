@@ -17,9 +17,9 @@ from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.families.sanyo import SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.odd_board import OddBoard
-from tests.plugins.conftest import each, wait_for_power
+from tests.plugins.conftest import each
+from tests.plugins.projectors.switching import SOON, status, switches_without_hours
 
-SOON = 30.0
 LAMP_QUESTION = {
     "optoma-later": b"~00108 1\r",
     "epson-escvp21": b"LAMP?\r",
@@ -58,19 +58,6 @@ def odd(profile: str, answers: Mapping[bytes, bytes | None]) -> Callable[[Emulat
     return lambda lamp: OddBoard(usual(lamp), answers)
 
 
-def status(pair: Any) -> ProjectorStatus:
-    return pair.driver.status(deadline=in_seconds(SOON))  # type: ignore[no-any-return]
-
-
-def burns_and_goes_off(pair: Any) -> None:
-    pair.driver.switch_on(deadline=in_seconds(SOON))
-    wait_for_power(pair.driver, Power.ON)
-    assert status(pair).lamp_hours is None
-    pair.driver.switch_off(deadline=in_seconds(SOON))
-    assert status(pair).power in (Power.COOLING, Power.OFF)
-    assert pair.emulator.lamp.strikes == 1
-
-
 @pytest.mark.parametrize("answer", [None, b"", b"LAMP=many", b"\xff\xfe\x01", b"?!"], ids=repr)
 def test_a_lamp_question_that_nobody_answers_well_costs_the_hours_and_nothing_else(
     open_serial: Any, answer: bytes | None
@@ -79,7 +66,7 @@ def test_a_lamp_question_that_nobody_answers_well_costs_the_hours_and_nothing_el
         said = None if answer is None else answer + END.get(profile, b"\r")
         board = odd(profile, {LAMP_QUESTION[profile]: said})
         pair = open_serial(profile=profile, name=profile, board=board, edit=quick)
-        burns_and_goes_off(pair)
+        switches_without_hours(pair)
         assert pair.driver.identity(deadline=in_seconds(SOON)).maker
         notes = [text for code, text in pair.driver.troubles() if code == "projector-answer-odd"]
         assert len([text for text in notes if "lamp hours" in text]) <= 1
@@ -154,7 +141,7 @@ def test_a_sanyo_with_any_number_of_lamps_tells_the_hours_of_the_first(open_seri
 def test_a_christie_without_lamps_refuses_their_hours_by_any_number(open_serial: Any, code: bytes) -> None:
     refusal = b'(65535 00000 ERR%s "LPH: Unknown request")' % code
     pair = open_serial(profile="christie", board=odd("christie", {b"(LPH?)": refusal}), edit=quick)
-    burns_and_goes_off(pair)
+    switches_without_hours(pair)
     assert pair.driver.troubles() == []
 
 

@@ -23,7 +23,8 @@ from plugins.emulated.projectors.network.gates import GATES, JvcGate, JvcHashedG
 from plugins.emulated.projectors.network.server import EmulatedNetworkProjector
 from plugins.projectors.network.driver import DRIVER, open_network_projector
 from plugins.projectors.network.wake import magic_packet
-from tests.plugins.conftest import each, hasty, wait_for_power
+from tests.plugins.conftest import each, hasty
+from tests.plugins.projectors.switching import strikes_once_when_its_second_answer_is_lost
 
 SOON = 30.0
 NETWORK = [name for name in BOARDS if login_of(name)]
@@ -118,17 +119,7 @@ def test_a_lost_acknowledgement_strikes_once(open_network: Any) -> None:
     def lost(profile: str) -> None:
         pair = open_network(profile=profile, name=profile, edit=hasty)
         assert power(pair) is Power.OFF
-        lose = pair.emulator.faults.loses_this_one
-        answers: list[bool] = []
-
-        def lose_the_second() -> bool:
-            answers.append(len(answers) == 1)
-            return answers[-1] or lose()
-
-        pair.emulator.faults.loses_this_one = lose_the_second
-        pair.driver.switch_on(deadline=in_seconds(SOON))
-        assert pair.emulator.lamp.strikes == 1
-        wait_for_power(pair.driver, Power.ON)
+        strikes_once_when_its_second_answer_is_lost(pair)
 
     each(NETWORK, lost)
 

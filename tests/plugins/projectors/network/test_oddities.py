@@ -11,14 +11,13 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceRefused, ProtocolError
-from hal.values import Power, ProjectorStatus
+from hal.values import Power
 from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.families.barco import BarcoPulseBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.odd_board import OddBoard
-from tests.plugins.conftest import wait_for_power
+from tests.plugins.projectors.switching import SOON, status, switches_without_hours
 
-SOON = 30.0
 SDCP = bytes.fromhex("02 0A 53 4F 4E 59")
 
 
@@ -45,19 +44,6 @@ class OddBarco(BarcoPulseBoard):
         return super()._act(method, params)
 
 
-def status(pair: Any) -> ProjectorStatus:
-    return pair.driver.status(deadline=in_seconds(SOON))  # type: ignore[no-any-return]
-
-
-def burns_without_hours(pair: Any) -> None:
-    pair.driver.switch_on(deadline=in_seconds(SOON))
-    wait_for_power(pair.driver, Power.ON)
-    assert status(pair).lamp_hours is None
-    pair.driver.switch_off(deadline=in_seconds(SOON))
-    assert status(pair).power in (Power.COOLING, Power.OFF)
-    assert pair.emulator.lamp.strikes == 1
-
-
 @pytest.mark.parametrize(
     ("family", "question", "answer"),
     [
@@ -76,14 +62,14 @@ def test_hours_that_are_refused_or_mean_nothing_cost_nothing_else(
     open_network: Any, family: str, question: bytes, answer: bytes | None
 ) -> None:
     pair = open_network(profile=family, board=odd(family, question, answer), edit=quick)
-    burns_without_hours(pair)
+    switches_without_hours(pair)
     assert len([code for code, _ in pair.driver.troubles()]) <= 1
 
 
 @pytest.mark.parametrize("answer", [{"code": -32601, "message": "Property not found"}, "soon", None, [1, 2], -1])
 def test_a_barco_that_tells_odd_hours_works(open_network: Any, answer: object) -> None:
     results = {"statistics.laserruntime.value": answer}
-    burns_without_hours(open_network(profile="barco-pulse", board=lambda lamp: OddBarco(lamp, results), edit=quick))
+    switches_without_hours(open_network(profile="barco-pulse", board=lambda lamp: OddBarco(lamp, results), edit=quick))
 
 
 @pytest.mark.parametrize("state", ["boot", "service"])
