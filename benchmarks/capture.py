@@ -16,7 +16,7 @@ import rawpy
 from benchmarks import Row, Timing, at_most, peak_bytes, timed
 from benchmarks._stage import FIRST_SEED, over, prepared_stage
 from controller.capture.acquire import Shot
-from controller.capture.latency import thumbprint
+from controller.capture.latency import fingerprint
 from controller.capture.raw import read_photograph
 from controller.core.arrays import ByteImage
 from controller.rig.rig import Rig
@@ -113,7 +113,7 @@ def _development(path: Path) -> list[Row]:
     return [
         at_most("RAW development", ours.median, None, unit="s", how=f"LibRaw's reading in it: {reading}"),
         at_most("RAW development by rawpy and OpenCV's bilinear", ratios[1], 2.0, unit="x", how=how),
-        at_most("is it the picture before?", timed(lambda: thumbprint(path, EXPOSURE_S)).median, None, unit="s",
+        at_most("is it the picture before?", timed(lambda: fingerprint(path, EXPOSURE_S)).median, None, unit="s",
                 how="a photograph's sparse samples, LibRaw's reading in it"),
         at_most("largest difference from OpenCV's", 100 * difference, None, unit="% of full scale",
                 how=f"but {BORDER_PX} pixels of border; its output has 16 bits"),

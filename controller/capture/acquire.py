@@ -16,7 +16,7 @@ from hal.interfaces import Camera, Display
 from hal.values import CapturedFile, ExposureSettings, FileKind, Presented
 
 if TYPE_CHECKING:  # it needs OpenCV, and a kiosk gets here before its first picture
-    from controller.capture.latency import Thumbprint
+    from controller.capture.latency import Fingerprint
 
 STORE_MARGIN_S = 5.0
 """Longest time that a camera may need beyond the exposure itself: mirror, write-out and transfer."""
@@ -42,7 +42,7 @@ class LastShown:
     """The last photograph of a row of pictures: its frames, what it shows, and the frames' number at the display."""
 
     frames: Mapping[str, ByteImage]
-    shows: Thumbprint
+    shows: Fingerprint
     sequence: int
 
 

@@ -166,31 +166,31 @@ def changed_share(before: Mapping[str, ByteImage], after: Mapping[str, ByteImage
 
 
 @dataclass(frozen=True, slots=True)
-class Thumbprint:
+class Fingerprint:
     """Sparse green samples of a photograph in full scale per second, and what a full scale is: 1 / exposure_s."""
 
     samples: FloatImage
     full_scale: float
 
 
-def thumbprint(path: Path, exposure_s: float) -> Thumbprint:
-    """Read a photograph's thumbprint. Raises WorkError("photograph-unreadable")."""
+def fingerprint(path: Path, exposure_s: float) -> Fingerprint:
+    """Read a photograph's fingerprint. Raises WorkError("photograph-unreadable")."""
     if is_jpeg(path):
         # Squared, a JPEG's values are near enough to light for telling whether two pictures are the same.
         light = (read_jpeg_values(path)[::SPARSE, ::SPARSE, 1].astype(np.float32) / 255) ** 2
-        return Thumbprint((light / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
+        return Fingerprint((light / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
     if is_linear(path):
         sparse = read_samples(path)[0][::SPARSE, ::SPARSE, 1]
-        return Thumbprint((sparse / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
+        return Fingerprint((sparse / np.float32(exposure_s)).astype(np.float32), 1 / exposure_s)
     mosaic = read_mosaic(path)
     column = 0 if mosaic.levels.colours[0, 0] == 1 else 1
     sparse = mosaic.samples[0::SPARSE, column::SPARSE].astype(np.float32)
     black, white = mosaic.levels.black[0, column], mosaic.levels.white[0, column]
     samples = (sparse - np.float32(black)) / np.float32((white - black) * exposure_s)
-    return Thumbprint(samples.astype(np.float32), 1 / exposure_s)
+    return Fingerprint(samples.astype(np.float32), 1 / exposure_s)
 
 
-def same_picture(one: Thumbprint, other: Thumbprint, *, noise: CameraNoise | None = None) -> bool:
+def same_picture(one: Fingerprint, other: Fingerprint, *, noise: CameraNoise | None = None) -> bool:
     """Whether two photographs show the same picture, as far as noise, flicker and clipping let one see."""
     noise = noise or CameraNoise()
     if one.samples.shape != other.samples.shape:

@@ -165,8 +165,8 @@ def _show(
         )
 
     try:
-        with way_to_light(rig, context, ready) as way:
-            figures = run_live(open_it(), way.maker, way.write, rate_hz=rate_hz, seconds=seconds, report=report)
+        with live_mode(rig, context, ready) as mode:
+            figures = run_live(open_it(), mode.maker, mode.write, rate_hz=rate_hz, seconds=seconds, report=report)
             # the last one is shown at the next tick of the player's clock
             context.deadline.sleep(LAST_S)
             report(figures)
@@ -192,7 +192,7 @@ def _delivered(figures: LiveFigures, status: LiveStatus | None) -> dict[str, Any
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class LiveMode:
     """How pictures are shown: as targets for the player's shaders, or as finished frames."""
 
     maker: Maker
@@ -200,7 +200,7 @@ class Way:
 
 
 @contextlib.contextmanager
-def way_to_light(rig: Rig, context: Context, ready: Ready) -> Iterator[Way]:
+def live_mode(rig: Rig, context: Context, ready: Ready) -> Iterator[LiveMode]:
     """Start live mode in the player in a way that it supports, and end it on leaving; the picture stays.
 
     Raises what devices raise.
@@ -211,12 +211,12 @@ def way_to_light(rig: Rig, context: Context, ready: Ready) -> Iterator[Way]:
         size = OutputSize(TARGET, *ready.maps.target_px)
         with _fresh(folder / TARGETS_FILE, [size]) as file:
             if _takes_targets(rig, file.path, ready.brightness, deadline):
-                yield Way(TargetMaker(ready.maps.target_px), _target_writer(file))
+                yield LiveMode(TargetMaker(ready.maps.target_px), _target_writer(file))
                 return
     outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in display.outputs(deadline=deadline)]
     with _fresh(folder / FRAMES_FILE, outputs) as file:
         display.live(file.path, deadline=deadline)
-        yield Way(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
+        yield LiveMode(FrameMaker(Interactive(ready.maps), ready.brightness), _writer(file, outputs, ready.maps))
 
 
 def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bool:

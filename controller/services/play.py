@@ -35,7 +35,7 @@ _KEYS: Final = {"appearance", "seconds", "fade_s"}
 
 
 @dataclass(frozen=True, slots=True)
-class Programme:
+class PlayedSequence:
     """Appearances one after the other: (name, seconds, fade_s) each; ``repeat`` rounds, 0: without end.
 
     ``for_s``: black after so many seconds; None: after the rounds.
@@ -66,7 +66,7 @@ def play(
     """Switch the projectors on and show appearances of the installed bundle.
 
     No name: the playlist in the bundle. One name: for ``seconds``, or until stopped. Several, or
-    ``sequence`` (a file, see ``read_programme``): each for ``seconds``, of which ``fade_s`` fade it in, ``repeat``
+    ``sequence`` (a file, see ``read_sequence``): each for ``seconds``, of which ``fade_s`` fade it in, ``repeat``
     rounds, without end if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
     "sequence-file-wrong", "fade-too-long" or "appearance-unknown"), and BundleError for a bundle that
     the stage does not trust or that was made for other outputs; always before a lamp is struck.
@@ -80,28 +80,28 @@ def play(
             remedy="Run `velatura appearance` on it first.",
         )
     if names or sequence is not None:
-        programme = _programme(names, sequence, seconds, fade_s, repeat)
+        played_sequence = _requested(names, sequence, seconds, fade_s, repeat)
     else:
-        programme = suggested_programme(installed, stage_trust(checked.stage), repeat, seconds)
-    index = _checked_index(installed, checked, programme)
+        played_sequence = suggested_sequence(installed, stage_trust(checked.stage), repeat, seconds)
+    index = _checked_index(installed, checked, played_sequence)
     session.run(
         checked,
-        lambda rig, _: _playing(rig, programme, index),
+        lambda rig, _: _playing(rig, played_sequence, index),
         name="play",
         reporter=reporter,
         cancel=cancel,
         plays=True,
     )
-    played = list(dict.fromkeys(name for name, _, _ in programme.items))
+    played = list(dict.fromkeys(name for name, _, _ in played_sequence.items))
     return {"played": played[0] if len(played) == 1 else played}
 
 
-def _checked_index(bundle: Path, checked: Checked, programme: Programme) -> Index:
+def _checked_index(bundle: Path, checked: Checked, played_sequence: PlayedSequence) -> Index:
     """The index of a bundle that the stage trusts, that fits its outputs and has the given appearances."""
     with Bundle.open_trusted(bundle, stage_trust(checked.stage)) as opened:
         index = opened.index
     held = [appearance.name for appearance in index.appearances]
-    for name, _, _ in programme.items:
+    for name, _, _ in played_sequence.items:
         if name not in held:
             raise UsageError(
                 "appearance-unknown",
@@ -113,9 +113,9 @@ def _checked_index(bundle: Path, checked: Checked, programme: Programme) -> Inde
     return index
 
 
-def _programme(
+def _requested(
     names: Sequence[str], sequence: Path | None, seconds: float | None, fade_s: float, repeat: int
-) -> Programme:
+) -> PlayedSequence:
     if names and sequence is not None:
         raise UsageError(
             "played-twice",
@@ -123,10 +123,10 @@ def _programme(
             remedy="Give names of appearances, or --sequence FILE.",
         )
     if sequence is not None:
-        return read_programme(sequence)
+        return read_sequence(sequence)
     if len(names) == 1:
         # The last picture of a sequence stays, so its duration does not matter.
-        return Programme(((names[0], max(fade_s, 1.0), fade_s),), 1, LONGEST_RUN_S if seconds is None else seconds)
+        return PlayedSequence(((names[0], max(fade_s, 1.0), fade_s),), 1, LONGEST_RUN_S if seconds is None else seconds)
     each_s = SHOWN_S if seconds is None else seconds
     if fade_s > each_s:
         raise UsageError(
@@ -134,10 +134,10 @@ def _programme(
             what=f"The fade of {fade_s:g} s is longer than the {each_s:g} s for each appearance.",
             remedy="Give a shorter --fade or longer --seconds.",
         )
-    return Programme(tuple((name, each_s, fade_s) for name in names), repeat)
+    return PlayedSequence(tuple((name, each_s, fade_s) for name in names), repeat)
 
 
-def suggested_programme(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> Programme:
+def suggested_sequence(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> PlayedSequence:
     """The playlist in a bundle. ``seconds``: replaces each item's time; a fade is at most as long.
 
     Raises UsageError("nothing-to-play") for a bundle without playlist, and BundleError as ``Bundle.open``.
@@ -151,10 +151,10 @@ def suggested_programme(bundle: Path, trust: Trust, repeat: int, seconds: float 
             remedy="Give names of appearances, or --sequence FILE.",
         )
     lasting = [(hint.appearance, seconds or hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints]
-    return Programme(tuple((name, shown_s, min(fade_s, shown_s)) for name, shown_s, fade_s in lasting), repeat)
+    return PlayedSequence(tuple((name, shown_s, min(fade_s, shown_s)) for name, shown_s, fade_s in lasting), repeat)
 
 
-def read_programme(path: Path) -> Programme:
+def read_sequence(path: Path) -> PlayedSequence:
     """Read a sequence from a TOML file: ``repeat`` (0: without end), and a table [[item]] for each appearance.
 
     An item has ``appearance``, ``seconds`` and optionally ``fade_s``, at most its seconds. Raises
@@ -171,7 +171,7 @@ def read_programme(path: Path) -> Programme:
         raise _wrong(path, "it needs [[item]] tables; its only other key is repeat")
     if type(repeat) is not int or repeat < 0:
         raise _wrong(path, "repeat must be a whole number from 0")
-    return Programme(tuple(_item(path, number, table) for number, table in enumerate(items, start=1)), repeat)
+    return PlayedSequence(tuple(_item(path, number, table) for number, table in enumerate(items, start=1)), repeat)
 
 
 def _item(path: Path, number: int, table: Any) -> tuple[str, float, float]:
@@ -191,23 +191,25 @@ def _wrong(path: Path, detail: str) -> UsageError:
     )
 
 
-def _playing(rig: Rig, programme: Programme, index: Index) -> Sequence[Step]:
+def _playing(rig: Rig, played_sequence: PlayedSequence, index: Index) -> Sequence[Step]:
     shown = bundle_display(rig).outputs(deadline=in_seconds(20))
     check_outputs(index, {(output.name, output.width_px, output.height_px) for output in shown})
-    title = " and ".join(dict.fromkeys(name for name, _, _ in programme.items))
+    title = " and ".join(dict.fromkeys(name for name, _, _ in played_sequence.items))
     return [
-        Step(StepId("play"), partial(_show, rig, programme), title=f"Playing {title}",
+        Step(StepId("play"), partial(_show, rig, played_sequence), title=f"Playing {title}",
              enter=Event.PLAY, leave=Event.PAUSE, always=True)
     ]  # fmt: skip
 
 
-def _show(rig: Rig, programme: Programme, context: Context) -> Sequence[Path]:
+def _show(rig: Rig, played_sequence: PlayedSequence, context: Context) -> Sequence[Path]:
     display = bundle_display(rig)
     display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
     # A fade answers at its end.
-    patience_s = 20 + programme.items[0][2]
-    display.play_sequence(programme.items, repeat=programme.repeat, deadline=context.deadline.within(patience_s))
-    whole_s = programme.whole_s
+    patience_s = 20 + played_sequence.items[0][2]
+    display.play_sequence(
+        played_sequence.items, repeat=played_sequence.repeat, deadline=context.deadline.within(patience_s)
+    )
+    whole_s = played_sequence.whole_s
     until = in_seconds(whole_s)
     while not until.passed:
         context.advance(0.0 if whole_s >= LONGEST_RUN_S else 1 - until.left_s() / whole_s)

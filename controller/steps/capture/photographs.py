@@ -26,8 +26,8 @@ from controller.capture.latency import (
     CHANGED_FRAMES,
     LONGEST_S,
     changed_share,
+    fingerprint,
     same_picture,
-    thumbprint,
 )
 from controller.capture.profile import load_profile
 from controller.core.arrays import ByteImage
@@ -150,7 +150,7 @@ def _take(rig: Rig, context: Context, planned: Planned, identity: ShotId) -> Tak
     )
     path = file.path
     if acquirer.protected:
-        last = LastShown(frames, thumbprint(path, exposure_s), presented.sequence)
+        last = LastShown(frames, fingerprint(path, exposure_s), presented.sequence)
         if before is not None and changed_share(before.frames, frames) > CHANGED_FRAMES:
             path, exposure_s, last = _changed_photograph(rig, context, identity, shot, (path, exposure_s, last), before)
         acquirer.last = last
@@ -174,7 +174,7 @@ def _changed_photograph(
         shot.name, shot.exposure_s, first[0].parent, shown_at_s=presented.at_s, deadline=context.deadline,
         wait_s=max(LONGEST_S, 2 * acquirer.wait_s),
     )  # fmt: skip
-    again = LastShown(shot.frames, thumbprint(file.path, exposure_s), presented.sequence)
+    again = LastShown(shot.frames, fingerprint(file.path, exposure_s), presented.sequence)
     if not same_picture(again.shows, before.shows):
         longer_s = min(acquirer.wait_s + MORE_DELAY_S, LONGEST_S)
         acquirer.set_delay(longer_s)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from controller.capture.latency import (
     CHANGED_FRAMES,
     RESOLUTION_S,
-    Thumbprint,
+    Fingerprint,
     changed_share,
     measure_latency,
     same_picture,
@@ -94,12 +94,12 @@ def test_the_share_of_the_outputs_that_changes() -> None:
     assert changed_share(old, {**old, "P1": dots}) < CHANGED_FRAMES
 
 
-def print_of(light: FloatImage, exposure_s: float, seed: int) -> Thumbprint:
+def print_of(light: FloatImage, exposure_s: float, seed: int) -> Fingerprint:
     signal = light * exposure_s
     noisy = signal + np.sqrt(NOISE.shot * signal + NOISE.read**2) * np.random.default_rng(seed).standard_normal(
         signal.shape
     )
-    return Thumbprint((np.clip(noisy, -0.01, 1) / exposure_s).astype(np.float32), 1 / exposure_s)
+    return Fingerprint((np.clip(noisy, -0.01, 1) / exposure_s).astype(np.float32), 1 / exposure_s)
 
 
 def gray(phase: int, low: float = 0.02, high: float = 8.0) -> FloatImage:
@@ -126,4 +126,4 @@ def test_two_dark_pictures_and_two_blown_ones_are_the_same() -> None:
         flat = np.full((64, 96), light, np.float32)
         assert same_picture(print_of(flat, 0.1, 1), print_of(flat, 0.1, 2))
     assert not same_picture(print_of(gray(0, high=100), 0.1, 1), print_of(gray(1, high=100), 0.1, 2))
-    assert not same_picture(Thumbprint(gray(0), 10.0), Thumbprint(gray(0)[:5], 10.0))
+    assert not same_picture(Fingerprint(gray(0), 10.0), Fingerprint(gray(0)[:5], 10.0))

@@ -16,7 +16,7 @@ from controller.live.sources import LivePicture
 from controller.play.control.launch import PlayerSettings, start_player
 from controller.rig.rig import Rig
 from controller.run.runner import Context
-from controller.services.live import Ready, way_to_light
+from controller.services.live import Ready, live_mode
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from plugins.display.player import DRIVER, PlayerDisplay
@@ -50,10 +50,10 @@ def test_targets_go_to_shaders_where_there_are_any_and_finished_frames_otherwise
     context = cast("Context", SimpleNamespace(deadline=in_seconds(100)))
     with display_of(tmp_path, windows=windows) as display:
         rig = cast("Rig", SimpleNamespace(stage=tmp_path, display=display))
-        with way_to_light(rig, context, Ready(maps, 1.1, shaded=in_bundle)) as way:
-            made = way.maker.blank()
-            way.maker.make(LivePicture(target, 0, 0), made)
-            way.write(made)
+        with live_mode(rig, context, Ready(maps, 1.1, shaded=in_bundle)) as mode:
+            made = mode.maker.blank()
+            mode.maker.make(LivePicture(target, 0, 0), made)
+            mode.write(made)
 
             def status() -> str | None:
                 live = display.playing(deadline=in_seconds(20)).live

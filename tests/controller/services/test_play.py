@@ -12,7 +12,7 @@ from controller.bundle.format import PlaylistEntry
 from controller.bundle.signing import ANY_SIGNER, Trust
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.errors import BundleError, UsageError
-from controller.services.play import Programme, _programme, read_programme, suggested_programme
+from controller.services.play import PlayedSequence, _requested, read_sequence, suggested_sequence
 
 
 def test_a_sequence_file_says_what_for_how_long_and_how_often(tmp_path: Path) -> None:
@@ -20,7 +20,7 @@ def test_a_sequence_file_says_what_for_how_long_and_how_often(tmp_path: Path) ->
     path.write_text(
         'repeat = 2\n[[item]]\nappearance = "marble"\nseconds = 5\nfade_s = 1.5\n[[item]]\nappearance = "stone"\n'
     )
-    found = read_programme(path)
+    found = read_sequence(path)
     assert found.items == (("marble", 5.0, 1.5), ("stone", 10.0, 0.0))
     assert found.whole_s == 30.0
 
@@ -45,25 +45,25 @@ def test_a_wrong_sequence_file_is_told_with_its_item(tmp_path: Path, text: str, 
     path = tmp_path / "s.toml"
     path.write_text(text)
     with pytest.raises(UsageError, match=why) as caught:
-        read_programme(path)
+        read_sequence(path)
     assert caught.value.code == "sequence-file-wrong"
 
 
 def test_one_name_stays_and_several_take_turns() -> None:
-    alone = _programme(("a",), None, 7.0, 2.0, 0)
+    alone = _requested(("a",), None, 7.0, 2.0, 0)
     assert (alone.repeat, alone.whole_s) == (1, 7.0)
-    several = _programme(("a", "b"), None, 3.0, 1.0, 4)
+    several = _requested(("a", "b"), None, 3.0, 1.0, 4)
     assert several.items == (("a", 3.0, 1.0), ("b", 3.0, 1.0))
     assert several.whole_s == 24.0
 
 
 def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="Both appearances and a sequence"):
-        _programme(("a",), tmp_path / "s.toml", None, 0.0, 0)
+        _requested(("a",), tmp_path / "s.toml", None, 0.0, 0)
     with pytest.raises(UsageError, match="is longer than the 1 s for each"):
-        _programme(("a", "b"), None, 1.0, 2.0, 0)
+        _requested(("a", "b"), None, 1.0, 2.0, 0)
     with pytest.raises(UsageError, match="can't be read"):
-        read_programme(tmp_path / "none.toml")
+        read_sequence(tmp_path / "none.toml")
 
 
 def test_with_nothing_named_the_bundle_s_own_playlist_is_played(tmp_path: Path) -> None:
@@ -73,10 +73,10 @@ def test_with_nothing_named_the_bundle_s_own_playlist_is_played(tmp_path: Path) 
     write_bundle(
         path, **several, appearances=made, schedule=[PlaylistEntry("b", 9_000, 500), PlaylistEntry("a", 2_000, 2_000)]
     )
-    assert suggested_programme(path, ANY_SIGNER, 3, None) == Programme((("b", 9.0, 0.5), ("a", 2.0, 2.0)), 3)
-    assert suggested_programme(path, ANY_SIGNER, 0, 1.0).items == (("b", 1.0, 0.5), ("a", 1.0, 1.0))
+    assert suggested_sequence(path, ANY_SIGNER, 3, None) == PlayedSequence((("b", 9.0, 0.5), ("a", 2.0, 2.0)), 3)
+    assert suggested_sequence(path, ANY_SIGNER, 0, 1.0).items == (("b", 1.0, 0.5), ("a", 1.0, 1.0))
     write_bundle(path, **several, appearances=made)
     with pytest.raises(UsageError, match="has no playlist"):
-        suggested_programme(path, ANY_SIGNER, 0, None)
+        suggested_sequence(path, ANY_SIGNER, 0, None)
     with pytest.raises(BundleError, match="no signature"):
-        suggested_programme(path, Trust(), 0, None)
+        suggested_sequence(path, Trust(), 0, None)
