@@ -15,7 +15,7 @@ from controller.artefacts.photographs import codes_of
 from controller.artefacts.projectors import Pixels
 from controller.calibrate.values import Metapixels, Radiometry
 from controller.calibrate.verify.grade import verify
-from controller.capture.patterns import device_frame, frame
+from controller.capture.pattern_frames import device_frame, frame
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.steps.appearance.solving import random_pattern
 

@@ -19,7 +19,8 @@ from benchmarks.geometry import FIRST_SEED, geometry_seconds
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.metapixels.from_phase import fit_pixels
 from controller.calibrate.values import Correspondence
-from controller.capture.patterns import PatternPlan, frame, plan_patterns
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.core.arrays import FloatImage
 
 NOISE = 0.002

@@ -24,7 +24,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import PhotographSet, captured
 from controller.calibrate.metapixels.from_dots import fit_picture
 from controller.calibrate.values import Calibration
-from controller.capture.patterns import device_frame
+from controller.capture.pattern_frames import device_frame
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.run.progress import Silent
 from controller.services.calibrate import calibrate

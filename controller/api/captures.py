@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.photographs import develop, merge_brackets
-from controller.capture.patterns import device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import plan_patterns
 from controller.capture.profile import CameraProfile
 from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import UsageError

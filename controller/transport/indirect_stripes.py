@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured
-from controller.capture.patterns import Pattern, PatternPlan, frame
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import Pattern, PatternPlan
 from controller.core.arrays import FloatImage, Mask
 from controller.core.channels import finite
 from controller.transport.indirect import down

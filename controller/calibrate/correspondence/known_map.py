@@ -15,7 +15,8 @@ import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import CELL_PX, TILE_MARGIN, PatternKind, PatternPlan, tile_levels
+from controller.capture.pattern_frames import tile_levels
+from controller.capture.patterns import CELL_PX, TILE_MARGIN, PatternKind, PatternPlan
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import finite
 

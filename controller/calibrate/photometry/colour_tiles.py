@@ -12,7 +12,8 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.correspondence.codes import read_code
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame, tile_levels
+from controller.capture.pattern_frames import tile_levels
+from controller.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage, Mask
 

@@ -15,7 +15,8 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.photographs import DRIFT as TAKEN
 from controller.artefacts.photographs import PATTERN as PATTERN_NAME
 from controller.calibrate.verify.drift import DriftPhotographs, find_drift
-from controller.capture.patterns import Pattern, PatternKind, device_frame, frame
+from controller.capture.pattern_frames import device_frame, frame
+from controller.capture.patterns import Pattern, PatternKind
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step

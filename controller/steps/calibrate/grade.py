@@ -30,7 +30,8 @@ from controller.calibrate.photometry.gloss import gloss_strength, glossy
 from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
-from controller.capture.patterns import Pattern, device_frame, frame
+from controller.capture.pattern_frames import device_frame, frame
+from controller.capture.patterns import Pattern
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig

@@ -19,7 +19,8 @@ from controller.artefacts.photographs import WHITE, Developed, Taken, light_of, 
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light
 from controller.calibrate.correspondence.coloured_code import decode_colours
 from controller.calibrate.correspondence.known_map import MapCheck, check_map
-from controller.capture.patterns import Code, Pattern, PatternKind, PatternPlan, device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import Code, Pattern, PatternKind, PatternPlan, plan_patterns
 from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
 from controller.rig.rig import Rig, RigProjector

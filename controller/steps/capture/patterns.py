@@ -18,7 +18,8 @@ from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_brackets, choose_exposure
 from controller.capture.jpeg_response import nominal_response
 from controller.capture.latency import LONGEST_S
-from controller.capture.patterns import CELL_PX, Pattern, PatternPlan, device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import CELL_PX, Pattern, PatternPlan, plan_patterns
 from controller.capture.raw import read_photograph
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector

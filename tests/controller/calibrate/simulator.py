@@ -14,7 +14,8 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from controller.capture.patterns import PatternPlan, device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import PatternPlan, plan_patterns
 from controller.core.arrays import ByteImage, Float64, FloatImage
 
 ENLARGED = 10

@@ -18,7 +18,8 @@ from controller.calibrate.geometry.values import CameraPrior, Reconstruction
 from controller.calibrate.metapixels.from_phase import fit_pixels
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.values import Calibration, Correspondence, ProjectorCalibration, Radiometry
-from controller.capture.patterns import PatternKind, frame, plan_patterns
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import PatternKind, plan_patterns
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, VelaturaError
 from controller.transport import LightTransport, build_transport

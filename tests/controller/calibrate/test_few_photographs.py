@@ -21,7 +21,8 @@ from controller.calibrate.metapixels.blur import measure_blur
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import indirect_share, sinusoid_contrast
 from controller.calibrate.values import Correspondence, Radiometry
-from controller.capture.patterns import CELL_PX, Code, PatternKind, PatternPlan, device_frame, frame, plan_patterns
+from controller.capture.pattern_frames import device_frame, frame
+from controller.capture.patterns import CELL_PX, Code, PatternKind, PatternPlan, plan_patterns
 from controller.capture.profile import CameraNoise
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError

@@ -5,16 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.capture.patterns import (
-    CELL_PX,
-    PERIOD_PX,
-    PatternKind,
-    device_frame,
-    encode_frame,
-    frame,
-    plan_patterns,
-    tile_levels,
-)
+from controller.capture.encoding import encode_frame
+from controller.capture.pattern_frames import device_frame, frame, tile_levels
+from controller.capture.patterns import CELL_PX, PERIOD_PX, PatternKind, plan_patterns
 from controller.core.errors import UsageError
 
 RESPONSE = np.stack([(np.arange(256) / 255) ** gamma for gamma in (2.2, 2.0, 1.8)])

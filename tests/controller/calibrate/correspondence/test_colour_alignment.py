@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
-from controller.capture.patterns import frame, plan_patterns
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage
 
 MIXING = np.array([[0.86, 0.10, 0.04], [0.07, 0.88, 0.05], [0.02, 0.09, 0.89]])

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.values import Correspondence
-from controller.capture.patterns import CELL_PX, device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import CELL_PX, plan_patterns
 from controller.core.arrays import MAPPED_FROM, FloatImage
 from controller.core.errors import CalibrationError
 from controller.solve.memory_need import DECODED

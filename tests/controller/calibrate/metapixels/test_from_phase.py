@@ -9,7 +9,8 @@ import scipy.sparse
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.metapixels.from_phase import fit_metapixels
 from controller.calibrate.values import Correspondence, Metapixels
-from controller.capture.patterns import PatternKind, frame, plan_patterns
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import PatternKind, plan_patterns
 from controller.core.arrays import Float64
 from tests.controller.calibrate.simulator import Scene, Stage, photographed
 

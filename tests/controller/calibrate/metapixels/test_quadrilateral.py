@@ -10,7 +10,8 @@ from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.metapixels.from_phase import fit_metapixels
 from controller.calibrate.metapixels.quadrilateral import quadrilateral_corners, quadrilateral_weights
 from controller.calibrate.values import Metapixels
-from controller.capture.patterns import PatternKind, frame, plan_patterns
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import PatternKind, plan_patterns
 from controller.core.arrays import FloatImage
 from tests.controller.calibrate.simulator import Scene, Stage, photographed
 from tests.controller.transport.sparse_shares import gaussian_weights, normalised, predicted

@@ -14,7 +14,8 @@ from hypothesis.extra.numpy import arrays
 from controller.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import PatternKind, device_frame, plan_patterns
+from controller.capture.pattern_frames import device_frame
+from controller.capture.patterns import PatternKind, plan_patterns
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from tests.controller.calibrate.photometry.linearity import check_linearity

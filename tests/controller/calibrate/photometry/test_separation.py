@@ -14,7 +14,8 @@ from controller.calibrate.photometry.separation import (
     sinusoid_contrast,
 )
 from controller.calibrate.values import Radiometry
-from controller.capture.patterns import PatternKind, device_frame, plan_patterns, tile_levels
+from controller.capture.pattern_frames import device_frame, tile_levels
+from controller.capture.patterns import PatternKind, plan_patterns
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from tests.controller.calibrate.simulator import Scene, Stage

@@ -9,7 +9,8 @@ import pytest
 from controller.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
 from controller.calibrate.verify.error_attribution import attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.error_causes import COLOURS, ErrorCause
-from controller.capture.patterns import Pattern, PatternKind, frame
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import Pattern, PatternKind
 from controller.core.arrays import FloatImage, Mask
 
 ROWS, COLUMNS = 90, 120

@@ -8,7 +8,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from controller.calibrate.verify.registration import register
-from controller.capture.patterns import Pattern, PatternKind, frame
+from controller.capture.pattern_frames import frame
+from controller.capture.patterns import Pattern, PatternKind
 from controller.core.arrays import Float64, FloatImage
 
 ROWS, COLUMNS = 150, 200
