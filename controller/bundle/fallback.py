@@ -16,7 +16,7 @@ from typing import Final
 from controller.bundle.install import CURRENT, current, previous, switch_back
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER
-from controller.bundle.starts import Starts
+from controller.bundle.starts import Count, Starts
 from controller.core.errors import VelaturaError
 
 MOST_FAILED_STARTS: Final = 3
@@ -24,14 +24,16 @@ MISSING: Final = "missing"
 """What was given up, where the bundle's file is gone."""
 
 
-def chosen(folder: Path) -> Path | None:
+def chosen(folder: Path, count: Count | None = None) -> Path | None:
     """The file that the player starts with: the current one, or the previous one where the player has gone back to it
-    and the links could not be changed, because the disk is full. None where none is installed.
+    and the links could not be changed, because the disk is full. None where none is installed. ``count``: the folder's.
     """
-    now, earlier, starts = current(folder), previous(folder), Starts.read(folder)
+    now, earlier = current(folder), previous(folder)
+    if earlier is None:
+        return now
+    starts = (count or Count(folder)).read()
     name = MISSING if now is None else now.name
-    went_back = earlier is not None and (starts.bundle, starts.given_up) == (earlier.name, name)
-    return earlier if went_back else now
+    return earlier if (starts.bundle, starts.given_up) == (earlier.name, name) else now
 
 
 class CountedStart:

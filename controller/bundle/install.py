@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -170,11 +171,16 @@ def _switch(folder: Path, target: Path) -> None:
 def _target(folder: Path, link: str) -> Path | None:
     # By the names alone: a kiosk asks this several times at each of its steps.
     try:
-        name = os.readlink(os.path.join(folder, link))  # noqa: PTH115, PTH118
+        name = os.readlink(f"{folder}/{link}")  # noqa: PTH115
     except OSError:
         return None
-    sound = _INSTALLED.fullmatch(name) and os.path.isfile(os.path.join(folder, name))  # noqa: PTH113, PTH118
-    return folder / name if sound else None
+    sound = _INSTALLED.fullmatch(name) and os.path.isfile(f"{folder}/{name}")  # noqa: PTH113
+    return _inside(folder, name) if sound else None
+
+
+@lru_cache(maxsize=16)
+def _inside(folder: Path, name: str) -> Path:
+    return folder / name
 
 
 def _link(folder: Path, link: str, target: Path) -> None:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import json
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.storage import runtime_path, write_atomically
@@ -32,22 +33,9 @@ class Starts:
     given_up: str | None = None
 
     @classmethod
-    def read(cls, folder: Path) -> Self:
+    def read(cls, folder: Path) -> Starts:
         """The count of ``folder``; none where there is no file, or the file is not ours."""
-        in_memory = _in_memory(folder)
-        found = None if in_memory is None else cls._read(in_memory)
-        return found or cls._read(folder / NAME) or cls()
-
-    @classmethod
-    def _read(cls, file: Path) -> Self | None:
-        try:
-            with file.open("rb") as stream:
-                values: Any = json.loads(stream.read(_LARGEST_BYTES))
-            found = cls(values["bundle"], values["failed"], values["given_up"])
-        except (OSError, ValueError, TypeError, KeyError, RecursionError):
-            return None
-        sound = isinstance(found.bundle, str) and type(found.failed) is int and found.failed >= 0
-        return found if sound and isinstance(found.given_up, str | None) else None
+        return Count(folder).read()
 
     def write(self, folder: Path) -> None:
         """Replace the count of ``folder``. Raises WorkError("cannot-write" or "no-space"), and OSError."""
@@ -64,6 +52,36 @@ class Starts:
                 in_memory.unlink(missing_ok=True)
 
 
+class Count:
+    """The count of one folder of bundles, for those who read it again and again: where it is, is found out once."""
+
+    def __init__(self, folder: Path) -> None:
+        in_memory = _place_in_memory(folder)
+        # As text, and without buffers: a kiosk reads it several times at each of its steps.
+        self._files = [str(file) for file in (in_memory, folder / NAME) if file is not None]
+
+    def read(self) -> Starts:
+        """See ``Starts.read``."""
+        for file in self._files:
+            with contextlib.suppress(OSError), open(file, "rb", buffering=0) as stream:  # noqa: PTH123
+                found = _parsed(stream.read(_LARGEST_BYTES))
+                if found is not None:
+                    return found
+        return Starts()
+
+
+@lru_cache(maxsize=16)
+def _parsed(data: bytes) -> Starts | None:
+    """None if it is not ours."""
+    try:
+        values: Any = json.loads(data)
+        found = Starts(values["bundle"], values["failed"], values["given_up"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    sound = isinstance(found.bundle, str) and type(found.failed) is int and found.failed >= 0
+    return found if sound and isinstance(found.given_up, str | None) else None
+
+
 def forget(folder: Path) -> None:
     """Count anew: somebody installed a bundle, or went back to one. Raises OSError."""
     for file in (folder / NAME, _in_memory(folder)):
@@ -75,9 +93,14 @@ def _in_memory(folder: Path) -> Path | None:
     """The file in the runtime folder of the stage; None for bundles of which the player does not count the starts, and
     while nothing serves the stage.
     """
+    place = _place_in_memory(folder)
+    return place if place is not None and place.parent.is_dir() else None
+
+
+def _place_in_memory(folder: Path) -> Path | None:
+    """The same, whether something serves the stage or not."""
     if folder.name != "bundles":
         return None
     with contextlib.suppress(UsageError, OSError):
-        runtime = runtime_path(folder.parent)
-        return runtime / NAME if runtime.is_dir() else None
+        return runtime_path(folder.parent) / NAME
     return None

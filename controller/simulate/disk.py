@@ -50,10 +50,10 @@ class Disk:
         """Raises Killed in a task whose program is."""
         self._scheduler.check()
 
-    def changes(self) -> None:
+    def changes(self, *, takes_space: bool = True) -> None:
         """The present task is about to change a file. Raises OSError and Killed."""
         program = self._scheduler.present.program
-        if self._outside:
+        if self._outside and takes_space:
             self._refuse()
         if program is None or self._outside:
             return
@@ -64,7 +64,8 @@ class Disk:
                 self.kill_after = None
                 self._scheduler.kill(program)
                 raise Killed
-        self._refuse()
+        if takes_space:
+            self._refuse()
 
     def _refuse(self) -> None:
         if self.full:
@@ -144,4 +145,11 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         disk, beginnings = _watched[-1]
         path = str(arguments[0])
         if path.startswith(beginnings):
-            disk.changes() if changes else disk.reads(path)
+            disk.changes(takes_space=_takes_space(event, arguments, path)) if changes else disk.reads(path)
+
+
+def _takes_space(event: str, arguments: tuple[Any, ...], path: str) -> bool:
+    """A lock that is there, and a folder that is, are opened and "made" again on a full disk, too."""
+    if event == "open":
+        return bool(arguments[2] & (os.O_TRUNC | os.O_APPEND | os.O_EXCL)) or not os.path.lexists(path)
+    return event != "os.mkdir" or not os.path.isdir(path)  # noqa: PTH112 - text, and called for each change

@@ -41,9 +41,11 @@ from hal.errors import DeviceError
 
 LIFE_DAYS: Final = 14.0
 AGAIN_S: Final = 5.0
-CALM: Final = (8.0, 240.0, 2400.0)
-"""How far pauses are stretched: while lamps or work are under way, while something is wrong, while all is well."""
-CALMER: Final = 2.0
+CALM: Final = (8.0, 32.0, 480.0, 7200.0)
+"""How far pauses are stretched: while lamps come, while work or cooling takes its time, while something is wrong, and
+while all is well.
+"""
+CALMER: Final = 3.0
 END_S: Final = 150.0
 SERVES_S: Final = 60.0
 GOOD: Final = "kiosk/stage.toml.good"
@@ -173,7 +175,7 @@ class Life:
 
     def _serves(self, program: Program) -> None:
         """A program that was not ended since has a service. Raises Broken."""
-        spoilt = {"stage.toml", GOOD} <= self.unreadable or self.world.disk.full
+        spoilt = {"stage.toml", GOOD} <= self.unreadable
         spoilt = spoilt or self.world.scheduler.now_s - self.repaired_s < SERVES_S
         if self.program is program and not program.dead and self.service is None and not spoilt:
             why = None if self.kiosk is None else self.kiosk.snapshot().reason
@@ -196,6 +198,8 @@ class Life:
         assert program is not None
         self.stop.restarting = lit
         self.stop.set()
+        if self.kiosk is not None:
+            self.kiosk.reload.set()
         ends_s = scheduler.now_s + END_S
         while any(task.is_alive() for task in program.tasks) and scheduler.now_s < ends_s and not program.dead:
             scheduler.sleep(0.5)
@@ -213,15 +217,16 @@ class Life:
                 with serving(STAGE, stop, world=world, jobs=SimulatedJobs(world)) as service:
                     kiosk.attach(service)
                     self._follow(kiosk, service)
+                    # The end sets both; the real one looks at both several times a second.
                     while not (stop.is_set() or kiosk.reload.is_set()):
-                        stop.wait(0.2)
+                        kiosk.reload.wait()
                     self.service = None
                 kiosk.detach()
                 self.witness.disturb(0.0)
             except (VelaturaError, DeviceError) as error:
                 kiosk.attach(None, f"{error.what} {error.remedy}")
                 # Nothing else of it runs, and whatever happens ends the pause.
-                world.scheduler.stretch = min(world.scheduler.stretch * CALMER, CALM[1])
+                world.scheduler.stretch = min(world.scheduler.stretch * CALMER, CALM[2])
                 stop.wait(AGAIN_S)
 
     def _follow(self, kiosk: StageKiosk, service: Service) -> None:
@@ -268,7 +273,8 @@ class Life:
         steady = all(view.stable_left_s in (0, float("inf")) for view in views)
         rests = steady and all(view.condition in (Condition.LIT, Condition.DARK) for view in views)
         wrong = state in (State.DEGRADED, State.FAULT) or (not well and (settled or state is State.COOLING))
-        limit = CALM[2] if settled and well and rests else CALM[1] if wrong else CALM[0]
+        waits = state in (State.OFF, State.CALIBRATING) and well
+        limit = CALM[3] if settled and well and rests else CALM[2] if wrong else CALM[1] if waits else CALM[0]
         scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 
     # -- people

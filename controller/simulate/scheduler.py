@@ -84,7 +84,7 @@ class Scheduler:
         self._random = random.Random(f"{seed} turns")
         self.now_s = 0.0
         self.stretch = 1.0
-        self.longest_s = 600.0
+        self.longest_s = 1800.0
         self.crashes: list[tuple[str, BaseException]] = []
         self.turns = 0
         self.on_kill: Callable[[], None] = lambda: None

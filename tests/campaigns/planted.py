@@ -1,10 +1,10 @@
 """How good the simulation is: bugs planted in a copy of the kiosk's code, and how many of them it finds.
 
-    python -m tests.campaigns.planted [SECONDS] [WORD ...]
+    python -m tests.campaigns.planted [--seeds=NAME] [SECONDS] [WORD ...]
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
 the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
-WORDs only the patches that have one in their names.
+WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import sys, time
 from controller.simulate.life import Life
 number, days = 0, 0.0
 while time.process_time() < float(sys.argv[1]):
-    outcome = Life(f"planted-{number}", 7.0).live()
+    outcome = Life(f"{sys.argv[2]}-{number}", 7.0).live()
     number, days = number + 1, days + outcome.at_s / 86400
     if outcome.broken:
         print(f"{outcome.how} (seed {outcome.seed}, after {days:.1f} days)")
@@ -58,15 +58,15 @@ def planted(patch: Path | None, folder: Path) -> Path:
     return folder
 
 
-def search(patch: Path | None, seconds: float) -> Found:
+def search(patch: Path | None, seconds: float, seeds: str = "planted") -> Found:
     """Live until a promise is broken, or the time is over."""
     with tempfile.TemporaryDirectory() as name:
         copy = planted(patch, Path(name))
         before_s = os.times().children_user + os.times().children_system
         environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
         done = subprocess.run(
-            [sys.executable, "-c", LIVES, str(seconds)], cwd=copy, env=environment, capture_output=True, text=True,
-            check=False,
+            [sys.executable, "-c", LIVES, str(seconds), seeds],
+            cwd=copy, env=environment, capture_output=True, text=True, check=False,
         )  # fmt: skip
         took_s = os.times().children_user + os.times().children_system - before_s
     if done.returncode not in (0, 9):
@@ -75,15 +75,16 @@ def search(patch: Path | None, seconds: float) -> Found:
 
 
 def main() -> int:
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
+    named = [text for text in sys.argv[1:] if text.startswith("--seeds=")]
+    seconds, *words = [text for text in sys.argv[1:] if text not in named] or ["120"]
+    seeds = named[-1].partition("=")[2] if named else "planted"
     began_s, found, all_s = time.monotonic(), 0, 0.0
-    words = sys.argv[2:]
     if not words:
-        control = search(None, seconds)
+        control = search(None, float(seconds), seeds)
         print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
     bugs = patches(words or [""])
     for patch in bugs:
-        one = search(patch, seconds)
+        one = search(patch, float(seconds), seeds)
         found += bool(one.how)
         all_s += one.took_s
         print(f"{one.took_s:6.0f} s  {one.bug:42} {one.how or 'NOT FOUND'}", flush=True)

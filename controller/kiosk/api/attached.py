@@ -147,14 +147,14 @@ class AttachedKiosk(FolderKiosk):
         if service is None:
             return
         self._end_notice(service)
-        now = self._snapshots.of(service, self._last.revision + 1)
+        now = self._snapshots.of(service, self._last.revision)
         with self._lock:
             # Read once: an event logged between two reads would never be sent to the panel.
             events = service.log.number
-            same = replace(now, revision=self._last.revision) == self._last and self._events == events
+            same = now == self._last and self._events == events
             self._events = events
             if not same:
-                self._last = now
+                self._last = replace(now, revision=now.revision + 1)
         if not same:
             self._notify()
 

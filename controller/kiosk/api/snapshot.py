@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -52,7 +51,7 @@ class Snapshots:
             state=state,
             reason=reason,
             since_unix_s=self._since[1],
-            devices=(*self._rows(service), self._player_row(service), service.disk.row),
+            devices=(*service.rows(), self._player_row(service), service.disk.row),
             job=job,
             playing=shown.appearance if shown is not None else "",
             disk_free_bytes=service.disk.free_bytes,
@@ -71,15 +70,6 @@ class Snapshots:
             brightness=round(100 * live.brightness, 1),
             dose_klx_h=service.devices.dose_klx_h,
         )
-
-    def _rows(self, service: Service) -> tuple[DeviceRow, ...]:
-        """The devices; each projector with the output that feeds it, because cables and windows bear that name."""
-        outputs = {table.name: table.output for table in service.checked.stage.tables.projectors}
-        return tuple(
-            replace(row, output=outputs[row.name])
-            if row.kind == "projector" and row.name in outputs else row
-            for row in service.rows()
-        )  # fmt: skip
 
     def _job(self, service: Service) -> Job | None:
         """The job that runs, or waits for its lamps; else the last one."""

@@ -10,6 +10,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
 from functools import lru_cache
+from operator import itemgetter
 from typing import Final
 
 from controller.kiosk.decide.hours import Opening, always_open, local_day, moment, openings, zone_of
@@ -72,11 +73,12 @@ def plan(now_s: float | None, schedule: Schedule, done: Collection[str], *, sinc
     known = openings(schedule, now_s)
     present = [opening for opening in known if opening.begins_s <= now_s < opening.ends_s]
     due, expired = _tasks(now_s, schedule, done, since_s)
-    appearance, following = present[-1].appearance if present else "", _next(known, now_s, schedule)
-    return Plan(bool(present), appearance, due, expired, following, _changes_s(known, now_s))
+    appearance, times = present[-1].appearance if present else "", merged(tuple(known))
+    return Plan(bool(present), appearance, due, expired, _next(times, now_s, schedule), _changes_s(times, now_s))
 
 
-def merged(known: Sequence[Opening]) -> list[Opening]:
+@lru_cache(maxsize=8)
+def merged(known: tuple[Opening, ...]) -> tuple[Opening, ...]:
     """Without overlaps: the times at which the stage really opens and closes."""
     result: list[Opening] = []
     for opening in known:
@@ -84,21 +86,20 @@ def merged(known: Sequence[Opening]) -> list[Opening]:
             result[-1] = Opening(result[-1].begins_s, max(result[-1].ends_s, opening.ends_s))
         else:
             result.append(opening)
-    return result
+    return tuple(result)
 
 
-def _changes_s(known: Sequence[Opening], now_s: float) -> float | None:
-    edges = (edge for opening in merged(known) for edge in (opening.begins_s, opening.ends_s))
+def _changes_s(times: Sequence[Opening], now_s: float) -> float | None:
+    edges = (edge for opening in times for edge in (opening.begins_s, opening.ends_s))
     return min((edge for edge in edges if edge > now_s), default=None)
 
 
-def _next(known: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
-    upcoming = [NextEvent("opens", opening.begins_s) for opening in merged(known)]
-    upcoming += [NextEvent("closes", opening.ends_s) for opening in merged(known)]
-    upcoming += [NextEvent(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
-    return min(
-        (event for event in upcoming if event.at_unix_s > now_s), key=lambda event: event.at_unix_s, default=None
-    )
+def _next(times: Sequence[Opening], now_s: float, schedule: Schedule) -> NextEvent | None:
+    upcoming = [("opens", opening.begins_s) for opening in times]
+    upcoming += [("closes", opening.ends_s) for opening in times]
+    upcoming += [(task.what, task.begins_s) for task in _all_tasks(now_s, schedule)]
+    soonest = min((one for one in upcoming if one[1] > now_s), key=itemgetter(1), default=None)
+    return None if soonest is None else NextEvent(*soonest)
 
 
 def _all_tasks(now_s: float, schedule: Schedule) -> tuple[Task, ...]:

@@ -16,7 +16,7 @@ from controller.bundle.format import Index
 from controller.bundle.install import current, previous
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.bundle.starts import Starts
+from controller.bundle.starts import Count
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn
@@ -54,12 +54,13 @@ class BundleStore:
 
     def __init__(self, stage: Path, trust: Trust, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._stage, self._trust, self._monotonic = stage, trust, monotonic
+        self._count = Count(stage / "bundles")
         self._known: dict[Path, tuple[Index | None, float]] = {}
         self._previewing = threading.Lock()
 
     def bundle(self) -> Path | None:
         """The installed bundle's file, even if it can't be read: the player then goes back to the previous one."""
-        return chosen(self._stage / "bundles")
+        return chosen(self._stage / "bundles", self._count)
 
     def installed(self) -> Sequence[Path]:
         """The files of the bundle that plays and of the one before."""
@@ -82,8 +83,7 @@ class BundleStore:
 
     def given_up(self) -> str:
         """The file's name of the bundle that showed no picture, so that the one before plays; empty if none."""
-        folder = self._stage / "bundles"
-        starts, now = Starts.read(folder), chosen(folder)
+        starts, now = self._count.read(), self.bundle()
         fell_back = starts.given_up is not None and now is not None and starts.bundle == now.name != starts.given_up
         return str(starts.given_up) if fell_back else ""
 

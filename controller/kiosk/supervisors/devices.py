@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -85,9 +85,10 @@ class Devices:
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """The rows that the panel shows."""
-        drivers = [table.driver for table in self._checked.stage.tables.projectors]
+        tables = self._checked.stage.tables.projectors
         projectors = [
-            projector_row(supervisor.view, driver) for supervisor, driver in zip(self.projectors, drivers, strict=True)
+            projector_row(supervisor.view, table.driver, table.output)
+            for supervisor, table in zip(self.projectors, tables, strict=True)
         ]
         return (*projectors, *(supervisor.row for supervisor in self.others))
 
@@ -242,8 +243,9 @@ TOO_BRIGHT: Final = "{0} lux (too bright to calibrate)"
 _DARKEN: Final = "Switch the lights off and close the blinds. Other light makes the appearance pale."
 
 
-def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
-    """The row of a projector on the panel."""
+@lru_cache(maxsize=32)
+def projector_row(view: ProjectorView, driver: str, output: str = "") -> DeviceRow:
+    """The row of a projector on the panel. Made four times a second, and mostly the same."""
     problem = view.problem
     # The disk has a row of its own, and the lamp is not broken.
     of_disk = problem is not None and problem.code == DISK_FULL
@@ -255,7 +257,7 @@ def projector_row(view: ProjectorView, driver: str) -> DeviceRow:
     if view.condition is Condition.LIT and view.stable_left_s > 0:
         values.append(LiveValue.said("Stable in", "{0} s", view.stable_left_s))
     what, remedy = (None, "") if problem is None or of_disk else (problem.reason, problem.remedy)
-    return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy)
+    return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy, output)
 
 
 def _look_at_camera(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.decide.interfaces import Condition, Request
@@ -28,10 +28,14 @@ PLAYER_S: Final = 120.0
 BLACK_S: Final = 30.0
 DARK_S: Final = 240.0
 BACK_S: Final = 15.0
+HANGS_S: Final = 45.0
+"""A start, two questions without an answer, and the pauses between them."""
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
 MOST_STRIKES: Final = 5
 MOST_WORDS: Final = 240
+MOST_AGAIN: Final = 20
+"""Of the same words; the longest pause between two starts of the player is 30 s."""
 WORDS_S: Final = 300.0
 STAYS_S: Final = 120.0
 WORK_S: Final = 3600.0
@@ -70,7 +74,8 @@ class Witness:
         self._strikes_since: dict[str, int] = {}
         self.begun_checks: dict[str, int] = {}
         self._uncounted: dict[str, int] = {}
-        self._recent: deque[float] = deque(maxlen=MOST_WORDS)
+        self._recent: deque[tuple[float, str]] = deque()
+        self._often: Counter[str] = Counter()
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
         self.stays_lit: dict[str, float | None] = {}
@@ -83,6 +88,7 @@ class Witness:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
         self._held.clear()
+        self._found_since_s.pop("hangs", None)
         self._logged_state = State.OFF.value
 
     def player_fell(self) -> None:
@@ -173,6 +179,7 @@ class Witness:
         self._stay_lit(wanted)
         self._works(service)
         self._alerts()
+        self._player()
         self._devices(service)
         self._closed(service, state, wanted)
         self._opened(kiosk, service, state, wanted)
@@ -196,7 +203,7 @@ class Witness:
                 self.rows[row.number] = row
             else:
                 self._held.append(row)
-            self._recent.append(now_s)
+            self._said(row)
             if row.code == "crash":
                 raise Broken("no crash", row.text)
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
@@ -212,9 +219,18 @@ class Witness:
                 self.begun_checks[key] = self.begun_checks.get(key, 0) + 1
                 if self.begun_checks[key] > 1:
                     raise Broken("once a night", row.text)
-        if len(self._recent) == MOST_WORDS and now_s - self._recent[0] < WORDS_S:
-            raise Broken("few words", f"{MOST_WORDS} events in {now_s - self._recent[0]:.0f} s")
         return True
+
+    def _said(self, row: EventRow) -> None:
+        now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
+        recent.append((now_s, row.text))
+        often[row.text] += 1
+        while now_s - recent[0][0] >= WORDS_S:
+            often[recent.popleft()[1]] -= 1
+        if len(recent) >= MOST_WORDS:
+            raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
+        if often[row.text] >= MOST_AGAIN:
+            raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
 
     def _off(self, row: EventRow) -> None:
         for name, line in self._world.lines.items():
@@ -259,6 +275,13 @@ class Witness:
                 self._alerted_number, self._kills = row.number, 0
         self._alerted = len(world.alerted)
 
+    def _player(self) -> None:
+        """A picture that stands still is no sign of a player that lives."""
+        screen = self._world.screen
+        hangs = screen.hung and screen.process is not None and screen.process.alive
+        if self._found_s("hangs", hangs) > HANGS_S:
+            raise Broken("picture back", f"the player hangs for {HANGS_S:.0f} s, and nobody ends it")
+
     def _devices(self, service: Service) -> None:
         world, now_s = self._world, self._world.scheduler.now_s
         if world.camera.gone or service.devices.camera.device is not None:
@@ -283,7 +306,7 @@ class Witness:
         if shut_s > BLACK_S and service.reconciler.live != LiveChanges():
             raise Broken("as usual again", f"{service.reconciler.live}, {shut_s:.0f} s after it closed")
         reached = now_s > self.player_disturbed_until_s
-        if shut_s > BLACK_S and reached and world.screen.appearance and not world.screen.hung:
+        if shut_s > BLACK_S and reached and world.screen.appearance:
             raise Broken("black while closed", f"{world.screen.appearance} is shown, {shut_s:.0f} s after it closed")
         works = service.reconciler.working or now_s < self.light_until_s
         if works:
