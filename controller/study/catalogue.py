@@ -12,7 +12,7 @@ from controller.study.experiments.appearances.experiment import APPEARANCES
 from controller.study.experiments.drift import DRIFTING
 from controller.study.experiments.earlier import EARLIER
 from controller.study.experiments.effort import EFFORT
-from controller.study.experiments.frequency import FREQUENCY
+from controller.study.experiments.frequency import FREQUENCY, FREQUENCY_SHARP, sharp_object
 from controller.study.experiments.live import LIVE
 from controller.study.experiments.placement.experiment import PLACEMENT, planned_object
 from controller.study.experiments.regions import REGIONS
@@ -30,6 +30,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     RESIDUAL_SIX,
     SHARPNESS,
     FREQUENCY,
+    FREQUENCY_SHARP,
     EARLIER,
     APPEARANCES,
     TIMES,
@@ -54,6 +55,7 @@ _ALL: Final = (
     Scene(
         "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
     ),
+    Scene("sharp", "the shell, three projectors in focus at all depths", sharp_object, {"stands": "../stands.toml"}),
 )
 SCENES: Final[Mapping[str, Scene]] = {scene.name: scene for scene in _ALL}
 

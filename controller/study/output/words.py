@@ -45,7 +45,10 @@ pale shell, at an exposure that one projector can reach. *Contrast kept* is the 
 target's wave, in the photograph's green channel, over the target's own as the camera sees it; light at
 another phase or frequency counts as lost. F is the frequency where it first falls below a half. The paper says
 neither which contrast nor which criterion it used. The bases, for the faint waves, contain the target's detail above
-a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6).""",
+a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6). *As the plan calculates
+it*: as `velatura plan` does, from the measured blur, pitch and light. Superposition adds positions of light, not
+contrast, so the blur of the optics limits how much finer three are than one: 1.4 times is asked only where it is at
+most 0.35 pixels, as on [another page](frequency-sharp.md).""",
     "earlier": """\
 The same target at an exposure that the best projector can reach alone, so that brightness makes no difference.
 *One projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* lights each point with its brightest
@@ -62,6 +65,10 @@ the object's own pattern at full resolution; *minimum* leaves that to the scale.
 speckles where it has almost no light itself, mostly at depth edges. The seconds include work that is done once: maps
 and compiled code.""",
 }
+SHARP_DESCRIPTION: Final = """\
+The same waves as on the page [The finest sinusoid](frequency.md), with optics as sharp as the bench knows: the shell
+with three projectors at planned places, their lenses stopped down until no depth of the object is out of focus. What is
+left is the blur of the lenses themselves. Everything else is as there."""
 SIX_PROJECTORS_DESCRIPTION: Final = """\
 As the page of three projectors, on the same shell with six round it: left, right, above, far left, far right, high.
 Three of them light all of it about evenly, so the first three are not those of the other page. Everything is compared
@@ -88,8 +95,6 @@ next cannot make it better. That is what the median region shows, and the mean h
     ("residual-six", "mean, median region"): """\
 The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
 residual a little more, but the errors of their own calibration add as much.""",
-    ("frequency", "F_3 / F_1"): """\
-The projectors' blur: superposition adds positions of light, not contrast, and smoothness takes a little of it.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
 well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
@@ -100,9 +105,11 @@ with the base's limit at a quarter of F_1 nothing is lost.""",
 
 def description(name: str) -> str:
     """The paragraph of an experiment, or nothing."""
-    return SIX_PROJECTORS_DESCRIPTION if name == "residual-six" else DESCRIPTIONS.get(name, "")
+    beside = {"residual-six": SIX_PROJECTORS_DESCRIPTION, "frequency-sharp": SHARP_DESCRIPTION}
+    return beside.get(name) or DESCRIPTIONS.get(name, "")
 
 
 def miss_reason(name: str, asked: str) -> str:
     """Why the criterion is missed, as far as it was found; nothing where nothing was written down."""
-    return " ".join(text for (one, begins), text in MISS_REASONS.items() if one == name and asked.startswith(begins))
+    own = name.removesuffix("-sharp")
+    return " ".join(text for (one, begins), text in MISS_REASONS.items() if one == own and asked.startswith(begins))
