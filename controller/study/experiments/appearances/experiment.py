@@ -15,13 +15,13 @@ from controller.core.errors import VelaturaError
 from controller.report.pictures import Crop, crop_around, error_picture
 from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.solve.bounded.weights import appearance_weights
-from controller.solve.judged import TITLES, PixelSet, by_pixels
+from controller.solve.judged import TITLES, PixelSet
 from controller.solve.metrics import colour_difference
 from controller.solve.targets.values import Target
 from controller.solve.traditional import traditional_compensation
 from controller.study.experiments.appearances.targets import LOOKS, Look, as_it_is
 from controller.study.experiments.residual import brightest_first
-from controller.study.lab.measuring import Quality, predicted, quality
+from controller.study.lab.measuring import Quality, pixel_sets, predicted, quality
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.output.drawing import LabelledPicture, screen, strip
 from controller.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable
@@ -39,7 +39,7 @@ class PhotographedLook:
 
     ``share`` of the object at the target's exposure in reach; ``ours``, ``model`` (what the light transport predicts of
     the same frames) and ``alone`` (one projector, same exposure) over the pixels in reach, ``whole`` ours over all lit
-    ones, ``pixels`` ours by sets of pixels.
+    ones, ``pixels`` ours by sets of pixels, ``alone_pixels`` those of one projector at the same exposure.
     At the exposure that one projector can reach by itself, ``dimmer`` times ours: ``alone_dimmed``, over the pixels
     that both can reach, and ``ours_there``, at our own exposure, over the same ones
     """
@@ -52,6 +52,7 @@ class PhotographedLook:
     ours: Quality
     whole: Quality
     pixels: dict[str, PixelSet]
+    alone_pixels: dict[str, PixelSet]
     model: Quality
     alone: Quality
     dimmer: float
@@ -116,15 +117,8 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
         by_one=pictures[1],
         ours=quality(subject, pictures[0], wanted),
         whole=quality(subject, pictures[0], wanted, target.mask & subject.mask),
-        pixels=by_pixels(
-            pictures[0],
-            wanted.radiance,
-            subject.calibration.camera_to_xyz,
-            wanted.white,
-            reachable=wanted.mask,
-            valid=target.mask,
-            lit=subject.mask,
-        ),
+        pixels=pixel_sets(subject, pictures[0], wanted),
+        alone_pixels=pixel_sets(subject, pictures[1], wanted),
         model=quality(subject, predicted(subject, frames), wanted),
         alone=quality(subject, pictures[1], wanted),
         dimmer=dimmed.white / wanted.white,
@@ -211,11 +205,16 @@ def _tables(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) -> t
     rows: list[tuple[Cell, ...]] = []
     for one in shown:
         missing = {TITLES[name]: round(each.left_out_share, 4) for name, each in one.pixels.items()}
-        visible, name = one.pixels["visible"], TITLES["visible"]
-        rows.append(
-            (one.look.title, one.look.made_by, "ours", name, 1.0, _rounded(visible.delta_e00_median),
-             _rounded(visible.delta_e00_p95), None, None, None, missing[name], one.wanted.as_asked)
-        )  # fmt: skip
+        for way, sets, names in (
+            ("ours", one.pixels, ("visible",)),
+            ("one projector", one.alone_pixels, ("lit", "visible")),
+        ):
+            for name in names:
+                median, most = (_rounded(each) for each in (sets[name].delta_e00_median, sets[name].delta_e00_p95))
+                rows.append(
+                    (one.look.title, one.look.made_by, way, TITLES[name], 1.0, median, most, None, None, None,
+                     missing[TITLES[name]], one.wanted.as_asked)
+                )  # fmt: skip
         for way, compared, exposure, found in (
             ("ours", "in reach", 1.0, one.ours),
             ("ours", TITLES["lit"], 1.0, one.whole),
