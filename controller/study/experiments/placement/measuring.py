@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from controller.calibrate.values import ProjectorCalibration
+from controller.calibrate.values import Geometry, ProjectorCalibration
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.plan.optics import lit_by, pixels_of
 from controller.plan.target_object import AFTER_M, TargetObject
@@ -17,6 +19,10 @@ from controller.plan.values import Placement, Surface
 STEP_PX: Final = 4
 """Camera pixels to each side over which a pixel's size is measured."""
 LARGEST_JUMP_M: Final = 0.02
+LEAST_POINTS: Final = 100
+MOST_POINTS: Final = 20_000
+"""Of the calibrated shape, by which it is laid on the mesh."""
+ROUNDS: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,79 @@ def seen_by(at: Placement, part: ProjectorCalibration, lit: Mask, target_object:
     towards = -np.sign(np.sum(normals[hit] * ray[hit], axis=1))[:, None]
     facing.reshape(-1, 3)[at_hits] = normals[hit] * towards
     return Points(points, facing)
+
+
+def seen_by_camera(geometry: Geometry, first: Points, target_object: TargetObject) -> Points:
+    """Surface points by the camera: its rays, sent out from where it stands in the plan's room.
+
+    Where it stands follows from the object: the calibrated shape is laid on the mesh, whatever its scale. So points do
+    not depend on where any projector stands. ``first``: points that are roughly right; there the fit begins.
+
+    Raises ValueError if fewer than ``LEAST_POINTS`` points are known.
+    """
+    known = np.isfinite(geometry.points_m).all(axis=2)
+    both = known & np.isfinite(first.points_m).all(axis=2)
+    if both.sum() < LEAST_POINTS:
+        raise ValueError(f"{both.sum()} points are too few to lay the calibrated shape on the mesh")
+    own = geometry.points_m[known].astype(np.float64)
+    scale, rotation, at_m = _similarity(geometry.points_m[both].astype(np.float64), first.points_m[both])
+    scale, rotation, at_m = _laid_on(own[:: max(1, len(own) // MOST_POINTS)], (scale, rotation, at_m), target_object)
+    ray = own / np.linalg.norm(own, axis=1, keepdims=True) @ rotation.T
+    distance, normals = target_object.hit(at_m, ray)
+    hit = distance < AFTER_M
+    at_hits = np.flatnonzero(known.ravel())[hit]
+    points, facing = np.full((*known.shape, 3), np.nan), np.full((*known.shape, 3), np.nan)
+    points.reshape(-1, 3)[at_hits] = at_m + distance[hit, None] * ray[hit]
+    facing.reshape(-1, 3)[at_hits] = normals[hit] * -np.sign(np.sum(normals[hit] * ray[hit], axis=1))[:, None]
+    return Points(points, facing)
+
+
+Similarity = tuple[float, Float64, Float64]
+"""Scale, rotation (3, 3) and translation (3,): scale * rotation @ x + translation."""
+
+
+def _similarity(a: Float64, b: Float64) -> Similarity:
+    """The best from points ``a`` (N, 3) to ``b`` (N, 3) (Umeyama 1991)."""
+    middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
+    u, strength, vt = np.linalg.svd((b - middle_b).T @ (a - middle_a) / len(a))
+    mirror = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ np.diag(mirror) @ vt
+    scale = float((strength * mirror).sum() / ((a - middle_a) ** 2).sum(axis=1).mean())
+    return scale, rotation, middle_b - scale * rotation @ middle_a
+
+
+def _laid_on(points: Float64, start: Similarity, target_object: TargetObject) -> Similarity:
+    """The similarity that lays ``points`` (N, 3) on the mesh: least squares of the distances to it, outliers left out.
+
+    Nearest vertices and their tangent planes, which is exact enough for meshes much finer than their bends.
+    """
+    vertices, normals = target_object.vertices_m, _vertex_normals(target_object)
+    nearest = cKDTree(vertices)
+    scale, rotation, at_m = start
+    for _ in range(ROUNDS):
+        placed = scale * points @ rotation.T + at_m
+        vertex = nearest.query(placed)[1]
+        normal = normals[vertex]
+        off = np.sum(normal * (placed - vertices[vertex]), axis=1)
+        use = np.abs(off) <= 3 * np.median(np.abs(off)) + 1e-9
+        middle = placed.mean(axis=0)
+        arm = placed - middle
+        parts = np.concatenate([np.cross(arm, normal), normal, np.sum(normal * arm, axis=1)[:, None]], axis=1)
+        step = np.linalg.lstsq(parts[use], -off[use], rcond=None)[0]
+        turn, grown = Rotation.from_rotvec(step[:3]).as_matrix(), 1 + float(step[6])
+        at_m = grown * turn @ (at_m - middle) + middle + step[3:6]
+        scale, rotation = grown * scale, turn @ rotation
+    return scale, rotation, at_m
+
+
+def _vertex_normals(target_object: TargetObject) -> Float64:
+    """(V, 3) unit, of all faces round each vertex."""
+    corners = target_object.vertices_m[target_object.faces]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(target_object.vertices_m)
+    for corner in range(3):
+        np.add.at(total, target_object.faces[:, corner], face)
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
 def compare_placement(

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.calibrate.values import Metapixels, PhaseMap, ProjectorCalibration, Radiometry
+from controller.calibrate.values import Geometry, Metapixels, PhaseMap, Pinhole, ProjectorCalibration, Radiometry
 from controller.core.arrays import Float64, Mask
 from controller.plan.optics import lit_by, pixels_of
 from controller.plan.target_object import AFTER_M, TargetObject
 from controller.plan.values import Placement, Surface
 from controller.study.experiments.placement.experiment import CAMERA_M, STANDS, at_size, planned, planned_object, set_up
-from controller.study.experiments.placement.measuring import compare_placement, seen_by
+from controller.study.experiments.placement.measuring import compare_placement, seen_by, seen_by_camera
 from plugins.emulated.optics.stands import read_stands
 
 SIZE = (280, 210)
@@ -67,6 +67,28 @@ def test_a_stage_that_is_as_planned_agrees_with_the_plan(plan: tuple[Path, Targe
     assert np.nanquantile(np.abs(size - 1), 0.9) < 0.06
     np.testing.assert_allclose(np.nanmedian(found.light[1] / found.light[0]), 1.0, rtol=1e-3)
     assert np.nanmedian(np.abs(found.blur_px[1] - np.hypot(0.5, np.sqrt(1 / 12)))) < 1e-6
+
+
+def test_where_the_camera_looks_is_found_though_no_projector_stands_as_planned(
+    plan: tuple[Path, TargetObject, list[Placement]],
+) -> None:
+    _, target_object, (first, *_) = plan
+    away = dataclasses.replace(
+        first, rotation=Rotation.from_euler("yx", (0.6, -0.5), degrees=True).as_matrix() @ first.rotation
+    )
+    wrong = seen_by(first, *measured(away, target_object), target_object)
+    right = seen_by(away, *measured(away, target_object), target_object)
+    # as a calibration finds it: from the camera, turned, and at any scale
+    turn = Rotation.from_rotvec([0.1, -0.15, 0.02]).as_matrix()
+    own = (0.8 * (right.points_m - CAMERA_M[0]) @ turn.T).astype(np.float32)
+    camera = Pinhole(np.eye(3), np.zeros(2), np.eye(3), np.zeros(3), (240, 180))
+    found = seen_by_camera(Geometry(camera, (), own, own, 0.0, False), wrong, target_object)
+    known = np.isfinite(right.points_m[..., 0]) & np.isfinite(found.points_m[..., 0])
+    assert known.sum() > 0.98 * np.isfinite(right.points_m[..., 0]).sum()
+    before, after = (np.nanmedian(np.linalg.norm(one.points_m - right.points_m, axis=2)) for one in (wrong, found))
+    assert before > 5e-3
+    assert after < 2e-4
+    assert (np.sum(found.normals * right.normals, axis=2)[known] > 0.99).mean() > 0.98
 
 
 def test_a_projector_that_stands_elsewhere_or_is_zoomed_otherwise_is_told(
