@@ -55,7 +55,12 @@ _ALL: Final = (
     Scene(
         "planned", "the shell, three projectors where they were planned", planned_object, {"stands": "../stands.toml"}
     ),
-    Scene("sharp", "the shell, three projectors in focus at all depths", sharp_object, {"stands": "../stands.toml"}),
+    Scene(
+        "sharp",
+        "the shell, three projectors with sharp lenses, in focus at all depths",
+        sharp_object,
+        {"stands": "../stands.toml"},
+    ),
 )
 SCENES: Final[Mapping[str, Scene]] = {scene.name: scene for scene in _ALL}
 

@@ -42,6 +42,8 @@ PLANNED = "as the plan calculates it, within 10 %"
 ASKED = 1.4
 SHARP_PX = 0.35
 """Blur of the optics, in projector pixels and on average, up to which F_3 / F_1 has to be ``ASKED``."""
+LENS_PX = 0.2
+"""Blur of a lens in focus on the sharp stage, the least for which a plan was tried."""
 MIDDLE = 0.6
 """Of the object's width: farther out the surface turns away, its pixels are narrower and would blur the figure."""
 GREEN = 1
@@ -63,11 +65,13 @@ class Waves:
 
 
 def sharp_object(path: Path, seed: int) -> None:
-    """As ``planned_object``, with lenses stopped down so far that no depth of the object is out of focus."""
+    """As ``planned_object``, with lenses of ``LENS_PX``, and so small a pupil that no depth is out of focus."""
     planned_object(path, seed)
     place = path.parent / STANDS
     stands = tomllib.loads(place.read_text())["stands"]
-    write_atomically(place, toml_text({"stands": [{**stand, "pupil_m": 0.0} for stand in stands]}).encode())
+    write_atomically(
+        place, toml_text({"stands": [{**one, "pupil_m": 0.0, "sharpest_px": LENS_PX} for one in stands]}).encode()
+    )
 
 
 def rising_sinusoid(subject: Subject) -> Result:

@@ -66,9 +66,9 @@ speckles where it has almost no light itself, mostly at depth edges. The seconds
 and compiled code.""",
 }
 SHARP_DESCRIPTION: Final = """\
-The same waves as on the page [The finest sinusoid](frequency.md), with optics as sharp as the bench knows: the shell
-with three projectors at planned places, their lenses stopped down until no depth of the object is out of focus. What is
-left is the blur of the lenses themselves. Everything else is as there."""
+The same waves as on the page [The finest sinusoid](frequency.md), on a stage with sharper optics: the shell with three
+projectors at planned places, their lenses better than the usual ones of the bench (0.2 pixels in focus) and stopped
+down until no depth of the object is out of focus. Everything else is as there."""
 SIX_PROJECTORS_DESCRIPTION: Final = """\
 As the page of three projectors, on the same shell with six round it: left, right, above, far left, far right, high.
 Three of them light all of it about evenly, so the first three are not those of the other page. Everything is compared

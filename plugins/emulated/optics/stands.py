@@ -27,6 +27,7 @@ PLACES: Final = (
 DEFAULT: Final = 3
 
 
+DRAWN: Final = -1.0
 LUX_OF_LIGHT: Final = 9000.0
 """Illuminance by which the bench calls the light on a surface 1."""
 
@@ -36,7 +37,8 @@ class Stand:
     """A projector put up as planned. World and device frames as in ``truth``; lens and light as data sheets have them.
 
     ``throw_ratio``: distance by picture width; ``centre_share``: the axis' place in the picture, in its width and
-    height from the upper left corner; ``focus_m``: the depth of best focus; ``lumens`` of a white picture; ``pupil_m``
+    height from the upper left corner; ``focus_m``: the depth of best focus; ``lumens`` of a white picture; ``pupil_m``;
+    ``sharpest_px``: standard deviation of a pixel's blur in focus; ``DRAWN``: as lenses differ
     """
 
     name: str
@@ -47,6 +49,7 @@ class Stand:
     focus_m: Annotated[float, Between(0.01, 100.0)]
     lumens: Annotated[float, Between(1.0, 1e6)]
     pupil_m: Annotated[float, Between(0.0, 1.0)]
+    sharpest_px: Annotated[float, Between(0.0, 3.0)] = DRAWN
 
     def lens(self, size_px: tuple[int, int]) -> Lens:
         width, height = size_px
@@ -93,7 +96,12 @@ class Stands:
             projector,
             pose=Pose(stand.position_m, stand.rotation_vector),
             lens=lens,
-            focus=dataclasses.replace(projector.focus, distance_m=stand.focus_m, slope_px_per_m=slope),
+            focus=dataclasses.replace(
+                projector.focus,
+                distance_m=stand.focus_m,
+                slope_px_per_m=slope,
+                sharpest_px=projector.focus.sharpest_px if stand.sharpest_px < 0 else stand.sharpest_px,
+            ),
             light=dataclasses.replace(
                 projector.light, reference_m=stand.focus_m, brightness=stand.light_at_focus(size)
             ),
@@ -104,7 +112,7 @@ SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
     f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
-    " throw_ratio, centre_share, focus_m, lumens and pupil_m",
+    " throw_ratio, centre_share, focus_m, lumens, pupil_m and, if it shall not be drawn, sharpest_px",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
     "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
 }

@@ -65,11 +65,14 @@ def test_a_stage_of_modern_size_has_four_projectors_unless_told_otherwise(tmp_pa
 
 def test_a_projector_stands_and_shines_as_it_is_told(tmp_path: Path) -> None:
     file = tmp_path / "stands.toml"
-    file.write_text(TABLE.format(name="one", lumens=2000.0) + TABLE.format(name="two", lumens=4000.0))
+    second = TABLE.format(name="two", lumens=4000.0) + "sharpest_px = 0.2\n"
+    file.write_text(TABLE.format(name="one", lumens=2000.0) + second)
     one, two = prepared(tmp_path, stands=str(file)).projectors
     assert (one.name, one.pose.position_m, one.pose.rotation_vector) == ("one", (0.3, -0.4, -1.2), (0.1, -0.2, 0.0))
     assert (one.lens.focal_px, one.lens.centre_px) == (560.0, (139.5, 220.0))
     assert one.focus.distance_m == 1.25
+    assert one.focus.sharpest_px == pytest.approx(0.32, abs=0.04)
+    assert two.focus.sharpest_px == 0.2
     assert two.light.brightness == pytest.approx(2 * one.light.brightness)
     # 2000 lumens on a picture 0.625 m wide and three quarters as high
     assert one.light.brightness == pytest.approx(2000 / (0.625 * 0.46875) / 9000)
