@@ -71,6 +71,8 @@ def test_without_blender_its_looks_are_left_out_and_told_and_the_others_are_made
     errors = {(row[0], row[2], row[3]): float(row[5] or 0) for row in result.tables[1].rows}
     assert errors["gloss", "ours", "in reach"] < errors["gloss", "one projector", "in reach"]
     assert errors["gloss", "ours", "in reach"] < 4
+    for compared in ("all lit pixels", "whole visible object"):
+        assert errors["gloss", "ours", compared] < errors["gloss", "one projector", compared]
 
 
 def test_a_stage_that_fails_is_not_told_as_a_look_that_was_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +166,7 @@ def shown(look: Look, ours: float, model: float, alone: float) -> PhotographedLo
     of = partial(Quality, delta_e_p95=0.0, rmse=0.0, ssim=1.0, sharpness=1.0)
     return PhotographedLook(
         look, ReachableTarget(nothing, np.ones((2, 2), np.bool_), 1.0), 1.0, nothing, nothing, of(ours), of(ours),
-        {}, of(model), of(alone), 0.5, of(alone), of(ours), 1.0,
+        {}, {}, of(model), of(alone), 0.5, of(alone), of(ours), 1.0,
     )  # fmt: skip
 
 
