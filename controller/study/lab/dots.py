@@ -68,7 +68,12 @@ def _evaluate(name: str, size: tuple[int, int], context: Context) -> Sequence[Pa
     model = initial_metapixels(modelled_correspondence(read_geometry(folder, [name]), 0), (columns, rows))
     start = where_missing(initial_metapixels(read_correspondence(folder, name), (columns, rows)), model)
     fitted, _ = fit_dots(captures, light.white, start, spacing, fallback=model)
-    path = npz_path(folder, StepKind.STUDY_SHARES, name)
+    return [write_study_dots(folder, name, Dots(shares, fitted))]
+
+
+def write_study_dots(folder: Path, name: str, dots: Dots) -> Path:
+    """Keep a projector's dots in a run's folder, for ``read_study_dots``."""
+    path, shares, fitted = npz_path(folder, StepKind.STUDY_SHARES, name), dots.shares, dots.metapixels
     save_arrays(
         path,
         {
@@ -77,7 +82,7 @@ def _evaluate(name: str, size: tuple[int, int], context: Context) -> Sequence[Pa
             "centre_px": fitted.centre_px, "covariance_px2": fitted.covariance_px2, "valid": fitted.valid,
         },
     )  # fmt: skip
-    return [path]
+    return path
 
 
 def read_study_dots(folder: Path, name: str) -> Dots:

@@ -18,7 +18,7 @@ from controller.study.experiments import ablation, earlier, live
 from controller.study.experiments.earlier import feathered
 from controller.study.experiments.residual import BRIGHT, DIM, PAPER, ResidualResult, _criteria, residual
 from controller.study.experiments.sharpness import local_sharpness
-from controller.study.lab.dots import dots_as_shares
+from controller.study.lab.dots import dots_as_shares, read_study_dots, write_study_dots
 from controller.study.lab.measuring import Quality, Variant, unbounded_inverse
 from controller.study.lab.subject import ReachableTarget
 from controller.study.output.words import description
@@ -91,6 +91,17 @@ def test_dots_become_the_shares_that_made_them() -> None:
         -0.5 * ((np.arange(columns) - x[20, 24]) ** 2 + (np.arange(rows)[:, None] - y[20, 24]) ** 2) / 0.25
     )
     assert np.abs(middle - np.where(expected > 0.01, expected, 0)).max() < 0.01
+
+
+def test_dots_are_kept_as_they_were_found(tmp_path: Path) -> None:
+    subject = array_subject()
+    found = subject.light.dots(1)
+    write_study_dots(tmp_path, "left", found)
+    kept = read_study_dots(tmp_path, "left")
+    assert (kept.shares != found.shares).nnz == 0
+    assert kept.shares.shape == found.shares.shape
+    for name in ("centre_px", "covariance_px2", "valid"):
+        np.testing.assert_array_equal(getattr(kept.metapixels, name), getattr(found.metapixels, name))
 
 
 @pytest.mark.parametrize("one", EXPERIMENTS, ids=lambda one: one.name)
