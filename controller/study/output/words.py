@@ -95,6 +95,9 @@ next cannot make it better. That is what the median region shows, and the mean h
     ("residual-six", "mean, median region"): """\
 The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
 residual a little more, but the errors of their own calibration add as much.""",
+    ("frequency", "F_3 / F_1 at least 1.4, at 50% contrast"): """\
+To make a wave finer than one projector's pixels, three have to sharpen it against their blur, up to full light and
+down to none, and a bold wave leaves less room for that than a faint one.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
 well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
