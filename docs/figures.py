@@ -134,7 +134,7 @@ def pages(root: Path) -> Iterator[tuple[Path, str]]:
 def differing(root: Path) -> Iterator[tuple[Path, str, str]]:
     """What does not agree: the file, what is wrong, and its right content where that is known, else nothing."""
     for path, text in pages(root):
-        if path.read_text() != text:
+        if not path.exists() or path.read_text() != text:
             yield path, "is not what docs/study/data says", text
     texts = {path: path.read_text() for path in documents(root)}
     for path, text in texts.items():
