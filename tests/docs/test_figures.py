@@ -70,5 +70,6 @@ def test_a_name_that_is_not_known_and_a_figure_that_nobody_tells_are_found(copy:
 
 
 def test_texts_of_the_pages_hold_no_measured_number() -> None:
-    for text in (*words.DESCRIPTIONS.values(), words.SIX_PROJECTORS_DESCRIPTION, *words.MISS_REASONS.values()):
+    beside = words.SIX_PROJECTORS_DESCRIPTION, words.SHARP_DESCRIPTION
+    for text in (*words.DESCRIPTIONS.values(), *beside, *words.MISS_REASONS.values()):
         assert not re.search(r"\d\.\d\d|seed \d|size (small|medium|paper)\b", text), text

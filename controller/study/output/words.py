@@ -47,8 +47,8 @@ another phase or frequency counts as lost. F is the frequency where it first fal
 neither which contrast nor which criterion it used. The bases, for the faint waves, contain the target's detail above
 a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6). *As the plan calculates
 it*: as `velatura plan` does, from the measured blur, pitch and light. Superposition adds positions of light, not
-contrast, so the blur of the optics limits how much finer three are than one: 1.4 times is asked only where it is at
-most 0.35 pixels, as on [another page](frequency-sharp.md).""",
+contrast, so the blur of the optics limits how much finer three are than one: the ratio is asked for only where the
+optics are sharp enough, as on [another page](frequency-sharp.md).""",
     "earlier": """\
 The same target at an exposure that the best projector can reach alone, so that brightness makes no difference.
 *One projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* lights each point with its brightest
