@@ -280,7 +280,7 @@ class Witness:
         screen = self._world.screen
         hangs = screen.hung and screen.process is not None and screen.process.alive
         if self._found_s("hangs", hangs) > HANGS_S:
-            raise Broken("picture back", f"the player hangs for {HANGS_S:.0f} s, and nobody ends it")
+            raise Broken("picture back", f"the player hangs for {HANGS_S:.0f} s, and was not ended")
 
     def _devices(self, service: Service) -> None:
         world, now_s = self._world, self._world.scheduler.now_s

@@ -112,7 +112,7 @@ SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
     f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
-    " throw_ratio, centre_share, focus_m, lumens, pupil_m and, if it shall not be drawn, sharpest_px",
+    " throw_ratio, centre_share, focus_m, lumens, pupil_m and sharpest_px; without the last, it is drawn at random",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
     "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
 }
