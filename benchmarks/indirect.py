@@ -43,6 +43,8 @@ NAMES: Final = ("grey", "wrapped", "seen")
 GOALS: Final = {0: (0.7, 4.0), 1: (0.5, 3.5), 2: (0.4, 3.0)}
 BLOCK_PX: Final = 50
 BORDER_PX: Final = 6
+OUTLINE_PX: Final = 3
+"""Pixels so near to the object's border see the room, too, where projectors stay dark (docs/decisions/0059)."""
 RESPONSE_AT: Final = 64
 FORGIVEN: Final = 0.02
 """Drive beyond [0, 1] that counts as in reach yet."""
@@ -165,6 +167,8 @@ class Judge:
         around = np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)
         borders = [(cv2.dilate(one, around) > 0) & (cv2.erode(one, around) == 0) for one in whole]
         self.border: Mask = np.asarray(np.any(borders, axis=0))
+        outline = np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)
+        self.inner: Mask = np.asarray(cv2.erode(self.lit.astype(np.uint8), outline) > 0)
 
     def clean(self, light: FloatImage) -> FloatImage:
         """As the controller develops it."""
@@ -212,6 +216,7 @@ class Judge:
             "reach %": 100 * float(mask.sum() / self.lit.sum()),
             "falsely %": 100 * float(beyond.any(axis=1).mean()),
             "border 95": float(np.percentile(error[mask & self.border], 95)),
+            "inner border 95": float(np.percentile(error[mask & self.border & self.inner], 95)),
             "no border 95": float(np.percentile(error[mask & ~self.border], 95)),
             "blocks %": 100 * self._block_error(shown, solved.target, mask),
         }
@@ -248,6 +253,7 @@ def _rows(found: list[dict[str, float]]) -> list[Row]:
             worst(f"{name}, 95 %{after}", [f"{name} 95, {photographs}"], p95, "CIEDE2000")
         worst(f"falsely in reach{after}", [f"{name} falsely %, {photographs}" for name in NAMES], 2.0, "%")
         worst(f"shadow borders, even grey, 95 %{after}", [f"grey border 95, {photographs}"], 5.0, "CIEDE2000")
+        worst(f"the same, off the outline{after}", [f"grey inner border 95, {photographs}"], None, "CIEDE2000")
         worst(f"error of blocks{after}", [f"{name} blocks %, {photographs}" for name in NAMES], 4.0, "%")
     worst("predicted blocks", [key for key in found[0] if key.startswith("blocks %")], 4.0, "% rms")
     for colour in ("red", "green", "blue"):

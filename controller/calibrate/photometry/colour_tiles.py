@@ -33,7 +33,8 @@ class TileMeasurements:
     ``levels`` (tiles, 3) int64 device values shown; ``ratio`` (tiles, 3) light per camera channel, white being 1;
     ``weight`` (tiles, 3): inverse of its variance; ``photograph`` (tiles,) int64: which one of the tiles' photographs
     it is from, from 0; ``pixels``: camera pixels that they come from; ``indirect`` (tiles, 3): light that was taken
-    away from ``ratio``, as it is when the lamp is as strong as at white
+    away from ``ratio``, as it is when the lamp is as strong as at white; ``place`` (tiles, 2) int64: the tile's column
+    and row in the projector's image
     """
 
     levels: npt.NDArray[np.int64]
@@ -42,6 +43,7 @@ class TileMeasurements:
     photograph: npt.NDArray[np.int64]
     pixels: int
     indirect: Float64
+    place: npt.NDArray[np.int64]
 
     def at(self, strength: Float64) -> TileMeasurements:
         """As they would be had the lamp been as strong as at white; ``strength`` of it in each photograph."""
@@ -104,7 +106,7 @@ def measure_tiles(
     total = _sums(white[inside], which, number)
     full = np.maximum(np.percentile(white[inside], 99, axis=0), 1e-12) if which.size else np.ones(3)
     used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
-    levels, ratios, weights, photographs, thrown = [], [], [], [], []
+    levels, ratios, weights, photographs, thrown, places = [], [], [], [], [], []
     for photograph, pattern in enumerate(tiles_patterns):
         shown = tile_levels(pattern, plan.size_px)
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
@@ -123,10 +125,11 @@ def measure_tiles(
         ratios.append(ratio[measured])
         weights.append(1 / variance[measured])
         thrown.append(taken[measured])
+        places.append(np.stack(np.divmod(used[measured], -(-across // side))[::-1], axis=1))
         photographs.append(np.full(np.count_nonzero(measured), photograph, np.int64))
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    shown_in, away = np.concatenate(photographs), np.concatenate(thrown)
-    return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away)
+    shown_in, away, place = (np.concatenate(parts) for parts in (photographs, thrown, places))
+    return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away, place)
 
 
 def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:

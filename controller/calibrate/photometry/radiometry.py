@@ -8,12 +8,14 @@ strong in two photographs; the tiles that show full channels tell how strong it 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.photometry.colour_tiles import KnownIndirect, TileMeasurements, measure_tiles
+from controller.calibrate.photometry.uneven_light import own_weight, uneven_light
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PatternPlan
 from controller.capture.profile import CameraNoise
@@ -28,6 +30,8 @@ ROUNDS = 40
 ROUGH_ROUNDS = 5
 """Rounds in which no tile is left out and no stray light is assumed yet."""
 CONVERGED = 1e-5
+UNEVEN_ROUNDS = 6
+"""Turns of fit and uneven indirect light. More change the response at value 64 by a few tenths of a per cent."""
 OUTLIER = 3.0
 WORST_SCATTER = 0.05
 WORST_ADDITIVITY = 0.08
@@ -121,6 +125,9 @@ def measure_radiometry(
             f"three responses, white by {100 * fit.additivity:.0f} %.",
             remedy=REMEDY,
         )
+    # a white segment could be mistaken for it
+    if indirect is not None and not fit.segment:
+        fit = _evened(tiles, fit)
     stray = float(fit.stray.mean())
     flicker = float(np.abs(fit.strength - 1).max())
     report = RadiometryReport(tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity, fit.segment, flicker)
@@ -161,6 +168,21 @@ class _RadiometryFit:
         return self.scatter <= WORST_SCATTER and self.fall <= WORST_FALL and self.additivity <= WORST_ADDITIVITY
 
 
+def _evened(tiles: TileMeasurements, fit: _RadiometryFit) -> _RadiometryFit:
+    """The fit, and what is uneven in the known indirect light, found in turns."""
+    # as if the lamp were steady, so that a flicker is nothing that neighbours share
+    first, additivity, steady = fit.strength, fit.additivity, tiles.at(fit.strength)
+    weight = own_weight(tiles)
+    uneven, change = np.zeros_like(tiles.ratio), np.ones_like(first)
+    for _ in range(UNEVEN_ROUNDS):
+        residual = _residual(steady.at(change), fit)
+        uneven = uneven_light(tiles, residual, weight * _kept(residual - uneven))
+        fit = _fit(dataclasses.replace(steady, ratio=steady.ratio - uneven, weight=weight))
+        change = fit.strength
+    fit.strength, fit.additivity = first * change, additivity
+    return fit
+
+
 def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryFit:
     """Mixing with the responses held, responses with the mixing held, new weights, until nothing changes."""
     x = np.arange(256) / 255
@@ -179,7 +201,8 @@ def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryF
         if rough:
             gamma = _gamma_of(fit.response)
             continue
-        _fit_strength(steady, fit)
+        # while indirect light is not known, tiles with much of it are not worse than others
+        _fit_strength(steady, weight if tiles.indirect.any() else tiles.weight, fit)
         steady = tiles.at(fit.strength)
         weight = tiles.weight * _kept(_residual(steady, fit))
         if np.max(np.abs(fit.response - before)) < CONVERGED:
@@ -191,22 +214,22 @@ def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryF
     return fit
 
 
-def _fit_strength(tiles: TileMeasurements, fit: _RadiometryFit) -> None:
+def _fit_strength(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit) -> None:
     """The lamp's strength in each photograph: against the others by all tiles, against white by full channels.
 
     Where a channel is full its light is known, whatever the response is; below, a stronger lamp looks like another
-    response.
+    response. Tiles of no ``weight`` (tiles, 3) do not fit, and would tell another lamp.
     """
     fitted = tiles.ratio - _residual(tiles, fit)
-    against = np.sum(tiles.weight * fitted * tiles.ratio, axis=1), np.sum(tiles.weight * fitted**2, axis=1)
+    against = np.sum(weight * fitted * tiles.ratio, axis=1), np.sum(weight * fitted**2, axis=1)
     light, known = (np.bincount(tiles.photograph, one, len(fit.strength)) for one in against)
     each = np.divide(light, known, out=np.ones_like(light), where=known > 0)
     full = (tiles.levels == 255) @ fit.mixing.T * (1 - fit.stray)
-    some = np.flatnonzero((tiles.levels == 255).any(axis=1))
+    some = np.flatnonzero((weight * full).sum(axis=1) > 0)
     if some.size < FEWEST_FULL:
         return
-    weight = tiles.weight[some] * full[some]
-    found = 1 + np.sum(weight * (tiles.ratio - fitted)[some], axis=1) / np.sum(weight * full[some], axis=1)
+    each_full = weight[some] * full[some]
+    found = 1 + np.sum(each_full * (tiles.ratio - fitted)[some], axis=1) / np.sum(each_full * full[some], axis=1)
     strength = fit.strength * (each / each.mean()) * np.median(found)
     fit.strength = np.clip(strength, 1 - MOST_FLICKER, 1 + MOST_FLICKER)
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -139,6 +140,42 @@ def test_a_lamp_that_flickers_throws_more_light_at_other_surfaces_too(flicker: t
     at = 64
     np.testing.assert_allclose(found.response[:, at], steady.response[:, at], rtol=0.01)
     assert seen == pytest.approx(max(abs(change) for change in flicker), abs=0.01)
+
+
+def thrown_back(share: float, spread_px: float) -> tuple[dict[str, FloatImage], KnownIndirect]:
+    """A scene of which ``share`` comes by way of other surfaces: from around, as a Gaussian of ``spread_px``."""
+    captures, truth = dict(before_response(scene())), scene()
+    black, white = captures["black"], captures["white"] - captures["black"]
+    for pattern in PLAN.of_kind(PatternKind.COLOUR_TILES):
+        own = captures[pattern.name] - black
+        lit = cv2.GaussianBlur(white, (0, 0), spread_px)
+        around = cv2.GaussianBlur(own, (0, 0), spread_px) / np.maximum(lit, 1e-6)
+        captures[pattern.name] = (black + (1 - share) * own + share * white * around).astype(np.float32)
+    for pattern in PLAN.of_kind(PatternKind.GRAY):
+        own = captures[pattern.name] - black
+        captures[pattern.name] = (black + (1 - share) * own + share / 2 * white).astype(np.float32)
+    known = Radiometry(truth.response(), np.array(truth.mixing))
+    return captures, KnownIndirect((share * white).astype(np.float32), known)
+
+
+def test_tiles_that_do_not_fit_tell_no_flicker() -> None:
+    """A lamp in the room shines on a part of the object in one photograph alone."""
+    captures, known = thrown_back(0.05, 80.0)
+    image = captures["mosaic-1"].copy()
+    image[60:130, 100:200] *= 1.5
+    captures["mosaic-1"] = image
+    radiometry, report = measure_radiometry(captures, PLAN, indirect=known)
+    assert report.flicker < 0.004
+    assert max(off(radiometry, scene())) < 0.005
+
+
+@pytest.mark.parametrize("spread_px", [50.0, 80.0])
+def test_light_that_comes_back_from_nearby_tiles_bends_no_response(spread_px: float) -> None:
+    """Known is the picture's mean alone; tiles around are brighter or darker than it."""
+    captures, known = thrown_back(0.15, spread_px)
+    radiometry, _ = measure_radiometry(captures, PLAN, indirect=known)
+    off_64 = radiometry.response[:, 64] / scene().response()[:, 64] - 1
+    assert np.abs(off_64).max() < 0.02
 
 
 @dataclass(frozen=True)
