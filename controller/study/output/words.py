@@ -73,7 +73,8 @@ SIX_PROJECTORS_DESCRIPTION: Final = """\
 As the page of three projectors, on the same shell with six round it: left, right, above, far left, far right, high.
 Three of them light all of it about evenly, so the first three are not those of the other page. Everything is compared
 over the whole object that any of the six lights, at two exposures: as bright as all six can make 95 % of it, and as
-bright as the first can make 95 % of what it lights."""
+bright as the first can make 95 % of what it lights. The paper's figures are of an exposure that three can make. They
+are asked here, too, at one that only six can make, for which the first three lack light."""
 
 MISS_REASONS: Final[Mapping[tuple[str, str], str]] = {
     ("ablation", "+ Gaussian metapixels"): """\
@@ -93,8 +94,9 @@ photographs a projector (see the ablation); the smoothness of ours costs a littl
 Each projector adds the errors of its own calibration and its own noise; where one already reaches a region well, the
 next cannot make it better. That is what the median region shows, and the mean hides.""",
     ("residual-six", "mean, median region"): """\
-The fifth and sixth projector light the shell from similar directions as others. By the model they reduce the
-residual a little more, but the errors of their own calibration add as much.""",
+Where two projectors light a region well, further ones can hardly make it better: by the model they reduce the residual
+a little more, but the errors of their own calibration add as much. What is left of the mean and of the 95 % lies at
+the object's rim, as the maps show.""",
     ("frequency", "F_3 / F_1 at least 1.4, at 50% contrast"): """\
 To make a wave finer than one projector's pixels, three have to sharpen it against their blur, up to full light and
 down to none, and a bold wave leaves less room for that than a faint one.""",
