@@ -302,8 +302,9 @@ class ProjectorSupervisor:
         else:
             # Until the next status shows it off: the lamp may be lit behind FAULT and UNKNOWN. What prevented the last
             # attempt stays a problem so long; otherwise every second would have two events.
-            kept = self._view.problem if self._view.condition is Condition.LIT else None
-            self._see(Condition.BROKEN if faults else Condition.LIT, status, problem or kept)
+            condition = Condition.BROKEN if faults else Condition.LIT
+            kept = self._view.problem if self._view.condition is condition else None
+            self._see(condition, status, problem if kept is None or _same_code(kept, problem) else kept)
             if not (faults and status.power is Power.FAULT and not guard.may_be_lit):
                 guard.switch_off(deadline=self._deadline(guard.switch_s))
 
@@ -329,6 +330,10 @@ class ProjectorSupervisor:
 
 def _decision(error: DeviceError | VelaturaError) -> Decision:
     return Decision(error.code, error.what, error.remedy, "error")
+
+
+def _same_code(one: Decision, other: Decision | None) -> bool:
+    return other is not None and one.code == other.code
 
 
 def _unrecorded(error: VelaturaError) -> Decision:
