@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from typing import Final
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from controller.calibrate.photometry.colour_tiles import DOUBT, TileMeasurements
 from controller.core.arrays import Float64
@@ -21,6 +23,11 @@ ALIKE_TILES: Final = 1.5
 OWN: Final = 0.05
 """Standard deviation of a tile's own part, relative."""
 LEAST_KEPT: Final = 1e-3
+REACH: Final = 6.0
+"""Standard deviations beyond which tiles are not alike."""
+CONVERGED: Final = 1e-7
+MOST_TURNS: Final = 1000
+SMALLEST: Final = 1e-300
 
 
 def own_weight(tiles: TileMeasurements) -> Float64:
@@ -34,21 +41,51 @@ def uneven_light(tiles: TileMeasurements, residual: Float64, weight: Float64) ->
 
     ``weight`` (tiles, 3): inverse variance of each tile's own part; 0 for what does not count
     """
-    from scipy.linalg import solve
-
     found = np.zeros_like(residual)
     for photograph in range(int(tiles.photograph.max(initial=-1)) + 1):
         own = np.flatnonzero(tiles.photograph == photograph)
-        place = tiles.place[own].astype(np.float64)
-        apart = ((place[:, None] - place[None]) ** 2).sum(axis=2)
-        alike = np.exp(-apart / (2 * ALIKE_TILES**2))
-        for channel in range(3):
-            strength = UNEVEN * tiles.indirect[own, channel]
-            shared = alike * strength[:, None] * strength
-            variance = 1 / np.maximum(weight[own, channel], LEAST_KEPT * tiles.weight[own, channel])
-            whole = shared + np.diag(variance)
-            found[own, channel] = shared @ solve(whole, residual[own, channel], assume_a="pos")
+        variance = 1 / np.maximum(weight[own], LEAST_KEPT * tiles.weight[own])
+        shared = _Shared(tiles.place[own], UNEVEN * tiles.indirect[own])
+        found[own] = shared.times(_solved(shared, variance, residual[own]))
     return found
+
+
+class _Shared:
+    """The covariance (tiles, tiles) of each channel, as a filter of the tiles' grid: 8,100 tiles make a big matrix."""
+
+    def __init__(self, place: npt.NDArray[np.int64], strength: Float64) -> None:
+        self._place, self._strength = (place[:, 0], place[:, 1]), strength
+        self._size = (*(place.max(axis=0, initial=0) + 1), 3)
+        reach = np.arange(-int(REACH * ALIKE_TILES), int(REACH * ALIKE_TILES) + 1)
+        self._alike = np.exp(-(reach**2) / (2 * ALIKE_TILES**2))
+        self.variance = strength**2
+
+    def times(self, values: Float64) -> Float64:
+        """``values`` (tiles, 3) of each channel times its covariance."""
+        grid = np.zeros(self._size)
+        grid[self._place] = values * self._strength
+        around = cv2.sepFilter2D(grid, cv2.CV_64F, self._alike, self._alike, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(around[self._place] * self._strength, np.float64)
+
+
+def _solved(shared: _Shared, variance: Float64, residual: Float64) -> Float64:
+    """x of each channel in (shared + variance) x = residual, by conjugate gradients."""
+    scale = 1 / (variance + shared.variance)
+    x, left = np.zeros_like(residual), residual.copy()
+    way = ahead = scale * left
+    energy = (left * ahead).sum(axis=0)
+    enough = CONVERGED**2 * energy
+    for _ in range(MOST_TURNS):
+        if (energy <= enough).all():
+            break
+        moved = shared.times(way) + variance * way
+        step = energy / np.maximum((way * moved).sum(axis=0), SMALLEST)
+        x += step * way
+        left -= step * moved
+        ahead = scale * left
+        before, energy = energy, (left * ahead).sum(axis=0)
+        way = ahead + energy / np.maximum(before, SMALLEST) * way
+    return x
 
 
 __all__ = ["own_weight", "uneven_light"]
