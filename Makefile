@@ -28,7 +28,7 @@ COUNT ?=
 CORES := $(shell nproc 2>/dev/null || echo 2)
 # Many tests wait for devices and programs, so there are more workers than cores. A worker that crashed is not started
 # again: pytest-xdist would run its file again and again, without an end.
-WORKERS ?= $(shell expr $(CORES) \* 3 / 2 + 1)
+WORKERS ?= $(shell expr $(CORES) + 1)
 # Folders of tests that need no other program. `slow` marks those that take seconds.
 FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture config core kiosk/decide plan report solve transport) \
 	tests/plugins/ptp tests/test_architecture.py
