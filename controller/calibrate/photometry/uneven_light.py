@@ -27,7 +27,6 @@ REACH: Final = 6.0
 """Standard deviations beyond which tiles are not alike."""
 CONVERGED: Final = 1e-7
 MOST_TURNS: Final = 1000
-SMALLEST: Final = 1e-300
 
 
 def own_weight(tiles: TileMeasurements) -> Float64:
@@ -70,22 +69,23 @@ class _Shared:
 
 def _solved(shared: _Shared, variance: Float64, residual: Float64) -> Float64:
     """x of each channel in (shared + variance) x = residual, by conjugate gradients."""
-    scale = 1 / (variance + shared.variance)
-    x, left = np.zeros_like(residual), residual.copy()
-    way = ahead = scale * left
-    energy = (left * ahead).sum(axis=0)
-    enough = CONVERGED**2 * energy
-    for _ in range(MOST_TURNS):
-        if (energy <= enough).all():
-            break
-        moved = shared.times(way) + variance * way
-        step = energy / np.maximum((way * moved).sum(axis=0), SMALLEST)
-        x += step * way
-        left -= step * moved
-        ahead = scale * left
-        before, energy = energy, (left * ahead).sum(axis=0)
-        way = ahead + energy / np.maximum(before, SMALLEST) * way
-    return x
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    shape, size = residual.shape, residual.size
+    scale = (1 / (variance + shared.variance)).ravel()
+
+    def whole(x: Float64) -> Float64:
+        values = x.reshape(shape)
+        return (shared.times(values) + variance * values).ravel()
+
+    found, _ = cg(
+        LinearOperator((size, size), matvec=whole, dtype=np.float64),
+        residual.ravel(),
+        rtol=CONVERGED,
+        maxiter=MOST_TURNS,
+        M=LinearOperator((size, size), matvec=lambda x: scale * x, dtype=np.float64),
+    )
+    return np.asarray(found.reshape(shape), np.float64)
 
 
 __all__ = ["own_weight", "uneven_light"]

@@ -25,9 +25,8 @@ PLACES: Final = (
 )
 """Name, degrees to the right of the camera and above it, as seen from the object."""
 DEFAULT: Final = 3
-
-
 DRAWN: Final = -1.0
+"""Instead of a blur: it is drawn, as lenses differ."""
 LUX_OF_LIGHT: Final = 9000.0
 """Illuminance by which the bench calls the light on a surface 1."""
 
