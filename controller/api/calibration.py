@@ -17,6 +17,8 @@ from controller.artefacts.calibration import object_mask, projectors_of
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.grade import graded
 from controller.calibrate.correspondence import decode as correspondence_decode
+from controller.calibrate.correspondence.colour_alignment import colour_shifts
+from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
@@ -51,8 +53,13 @@ def decode(captures: CaptureSet) -> Correspondence:
 
     Errors: ``capture-missing``, ``capture-shape-wrong``, ``captures-inconsistent`` (photographs in the wrong order).
     """
+    return _decoded(captures, None)
+
+
+def _decoded(captures: CaptureSet, colours: ColourPlaces | None) -> Correspondence:
+    plan = plan_patterns(captures.projector_px)
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5) if captures.from_bayer else 0.0
-    return correspondence_decode.decode(captures.pictures, plan_patterns(captures.projector_px), camera_blur_px=blur_px)
+    return correspondence_decode.decode(captures.pictures, plan, camera_blur_px=blur_px, colours=colours)
 
 
 def measure_response(captures: CaptureSet) -> Radiometry:
@@ -94,7 +101,8 @@ def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> Fitt
 def calibrate(captures: Mapping[str, CaptureSet], *, indirect: bool = False) -> Calibration:
     """Calibrate several projectors from their captures: response, correspondence and metapixels of each.
 
-    The same steps as ``velatura calibrate`` in its fast mode. Geometry (poses and points) is not part of it.
+    The same steps as ``velatura calibrate`` in its fast mode, those for colours that lie apart included. Geometry
+    (poses and points) is not part of it.
 
     Parameters
     ----------
@@ -130,19 +138,22 @@ def calibrate(captures: Mapping[str, CaptureSet], *, indirect: bool = False) -> 
 def _calibrated(
     name: str, captures: CaptureSet, *, indirect: bool
 ) -> tuple[ProjectorCalibration, npt.NDArray[np.int64] | None]:
-    radiometry = measure_response(captures)
-    correspondence = decode(captures)
+    radiometry, plan = measure_response(captures), plan_patterns(captures.projector_px)
+    white = np.maximum(captures.pictures["white"] - captures.pictures["black"], 0).astype(np.float32)
+    apart_px = colour_shifts(captures.pictures, plan, white, radiometry.mixing).sure_px
+    colours = None if apart_px is None else ColourPlaces.of(apart_px, white, radiometry.mixing)
+    correspondence = _decoded(captures, colours)
     if not correspondence.valid.any():
         raise CalibrationError(
             "projector-reaches-nothing",
             what=f"No pixel of projector {name} was found on the object.",
             remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
-    fitted = fit_metapixels(captures, correspondence)
-    white = np.nan_to_num(np.maximum(captures.pictures["white"] - captures.pictures["black"], 0)).astype(np.float32)
+    fitted = fit_pixels(captures.pictures, plan, correspondence, colours)
+    white = np.nan_to_num(white, copy=False)
     if not indirect:
         return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
-    plan, encoded_with = plan_patterns(captures.projector_px), radiometry.response
+    encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
     for _ in range(PASSES):
         linearity = shown_contrast(radiometry, encoded_with)

@@ -63,6 +63,7 @@ class Pixels:
     ``centre_px``, ``covariance_px2``, ``valid``: see ``Metapixels``
     ``shown_px``, ``spread_px2``: see ``PhaseMap``; None in runs from before there was one
     ``mosaic`` (2, 2) int: see ``Calibration``; of size 0 where each camera pixel has its own three colours
+    ``colours_px`` (3, 2): see ``PhaseMap``; None where the colours lie on each other
     """
 
     projector_px: FloatImage
@@ -74,6 +75,7 @@ class Pixels:
     shown_px: FloatImage | None
     spread_px2: FloatImage | None
     mosaic: npt.NDArray[np.int64] | None
+    colours_px: Float64 | None = None
 
     @property
     def correspondence(self) -> Correspondence:
@@ -87,7 +89,7 @@ class Pixels:
     def phase_map(self) -> PhaseMap | None:
         if self.shown_px is None or self.spread_px2 is None:
             return None
-        return PhaseMap(self.shown_px, self.spread_px2)
+        return PhaseMap(self.shown_px, self.spread_px2, self.colours_px)
 
     @property
     def known_mosaic(self) -> npt.NDArray[np.int64] | None:
@@ -112,8 +114,8 @@ class Pixels:
         return cls(**{name: arrays[name] for name in _names(cls) if name not in later}, **later)
 
 
-_LATER = ("shown_px", "spread_px2", "mosaic")
-"""Arrays that older runs do not have."""
+_LATER = ("shown_px", "spread_px2", "mosaic", "colours_px")
+"""Arrays that older runs do not have, or aligned projectors."""
 
 
 @dataclass(frozen=True, slots=True)

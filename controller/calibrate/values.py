@@ -53,10 +53,13 @@ class PhaseMap:
     ``projector_px`` (camera rows, columns, 2) float32: x and y in projector pixels, NaN where unknown
     ``spread_px2`` (projector rows, columns, 3) float32: covariance xx, xy, yy of the light of a pixel in projector
     pixels squared, as a single camera sample sees it, NaN where unknown
+    ``colours_px`` (3, 2) float64: how far the projector's red, green and blue lie to the right of these places, and
+    below them; None where they lie on each other
     """
 
     projector_px: FloatImage
     spread_px2: FloatImage
+    colours_px: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

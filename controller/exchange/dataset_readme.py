@@ -39,6 +39,7 @@ A projector's name stands for NAME.
 | `geometry.json` | `camera` and `projectors`: `matrix`, `distortion` (k1, k2), `rotation`, `translation_m`, `size_px` |
 | `radiometry-NAME.npz` | `white` of this projector alone, `black`; `response` (3, 256); `mixing` |
 | `pixels-NAME.npz` | `projector_px` of camera pixels where `seen`; of projector pixels `centre_px`, `covariance_px2` |
+| | `colours_px` (3, 2): how far red, green and blue lie to the right and below, where they do not lie on each other |
 | `dots-NAME.npz`, `edges-NAME.npz` | the same spots, measured by dots, where the run has them |
 | `camera.npz` | measurements of the camera |
 | `indirect-NAME.npz` | light that came by way of other surfaces, where it was measured |

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, grey
 from controller.calibrate.correspondence.codes import read_code
+from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.opposites import step_variance
 from controller.calibrate.correspondence.phase_shift import CODED, CONTRADICTED, FINE, WAVES, locate_pixel
 from controller.calibrate.correspondence.smoothing import correct_for_paint, fit_planes
@@ -70,6 +71,7 @@ def decode(
     scratch: Path | None = None,
     known_px: FloatImage | None = None,
     noise: CameraNoise | None = None,
+    colours: ColourPlaces | None = None,
 ) -> Correspondence:
     """Decode one projector's Gray-code and sinusoid captures.
 
@@ -84,6 +86,7 @@ def decode(
     scratch : a folder on a disk, for the sums of a large camera (40 bytes a pixel), which then need not stay in memory
     known_px : (rows, columns, 2) a map from before, for a plan without code; it may be off by 8 px
     noise : of a camera sample, in the captures' unit, where the plan shows too few pictures to measure it
+    colours : where the projector's colours lie apart; positions are then green's
 
     Returns
     -------
@@ -110,6 +113,8 @@ def decode(
     _check_order(seen, lit, state, position, WITHOUT_DIAGONAL if plan.computed else LEAST_UNCONTRADICTED)
     valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)
     del sums, near
+    if colours is not None:
+        position += colours.to_green_px()
     valid &= _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
     as_seen = position

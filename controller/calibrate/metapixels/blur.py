@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, grey
+from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.inverse_map import cells_of
 from controller.calibrate.values import Correspondence
 from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PatternPlan
@@ -28,13 +29,16 @@ LEAST_VARIANCE_PX2 = 0.02
 MOST_VARIANCE_PX2 = 16.0
 
 
-def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> tuple[FloatImage, Mask]:
+def measure_blur(
+    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+) -> tuple[FloatImage, Mask]:
     """Blur covariance S of each projector pixel.
 
     Parameters
     ----------
     captures : needs ``black``, ``phase-*`` and ``blur-*``, ``completed``; linear, in one unit
     correspondence : of the same projector
+    colours : where the projector's colours lie apart; S is then the blur of one colour
 
     Returns
     -------
@@ -46,7 +50,8 @@ def measure_blur(captures: Captures, plan: PatternPlan, correspondence: Correspo
     black = grey(captures, "black")
 
     def contrast(prefix: str, frequency: tuple[float, float]) -> FloatImage:
-        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells)
+        left = np.empty((0, 0), np.float32) if colours is None else colours.contrast(frequency)
+        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
 
     fine = np.stack([contrast(f"blur-{name}", frequency) for name, frequency in BLUR_FREQUENCIES.items()])
     coarse_x, coarse_y = contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))
@@ -84,11 +89,13 @@ def _contrast(
     black: FloatImage,
     correspondence: Correspondence,
     cells: npt.NDArray[np.int32],
+    left: FloatImage,
 ) -> FloatImage:
     """Modulation around each projector pixel, (rows, columns); NaN where nothing was seen.
 
     Each camera pixel's wave is turned back by the phase it should have before the waves are added, so that noise
-    cancels instead of adding contrast, and so does the alias of the projector's pixel grid.
+    cancels instead of adding contrast, and so does the alias of the projector's pixel grid. It is compared with the
+    part of its light that is ``left`` (camera rows, columns) where colours cancel each other; (0, 0): with all of it.
     """
     width, height = plan.size_px
     wave, light = np.zeros(width * height), np.zeros(width * height)
@@ -99,7 +106,7 @@ def _contrast(
     whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
     alone = not plan.measures_phase(prefix)
     for pattern, image in zip(steps, images, strict=True):
-        _add_step(image, black, position, whole, along, pattern.phase_rad, alone, wave, light)
+        _add_step(image, black, position, whole, along, pattern.phase_rad, alone, left, wave, light)
     # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4; one step and its opposite
     # have a wave of W M cos^2, and light that is weighted by the same square adds up to 2 W cos^2
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
@@ -117,6 +124,7 @@ def _add_step(
     frequency: Float64,
     phase_rad: float,
     alone: bool,
+    left: FloatImage,
     wave: Float64,
     light: Float64,
 ) -> None:
@@ -129,7 +137,8 @@ def _add_step(
                 along = frequency[0] * position[row, column, 0] + frequency[1] * position[row, column, 1]
                 cosine = np.cos(2 * np.pi * along - phase_rad)
                 wave[cell] += value * cosine
-                light[cell] += value * (2 * cosine * cosine if alone else 1.0)
+                part = left[row, column] if left.size else np.float32(1)
+                light[cell] += value * part * (2 * cosine * cosine if alone else 1.0)
 
 
 def _covariance(fine: FloatImage, coarse: FloatImage) -> tuple[FloatImage, Mask]:

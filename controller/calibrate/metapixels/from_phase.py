@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 
 from controller.calibrate.correspondence.bayer_pattern import find_bayer_pattern
 from controller.calibrate.correspondence.captures import Captures, grey
+from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import frame_margin_px
 from controller.calibrate.correspondence.inverse_map import invert_map
 from controller.calibrate.correspondence.phase_map import make_phase_map
@@ -44,10 +46,15 @@ class FittedPixels:
     mosaic: npt.NDArray[np.int64] | None
 
 
-def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspondence) -> FittedPixels:
-    """Metapixels and phase map from the same measurements; parameters and errors as ``fit_metapixels``."""
+def fit_pixels(
+    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+) -> FittedPixels:
+    """Metapixels and phase map from the same measurements; parameters and errors as ``fit_metapixels``.
+
+    ``colours``: what ``decode`` was given; metapixels are then green's, and the phase map says where the others lie
+    """
     inverse = invert_map(correspondence, plan.size_px)
-    blur, blur_valid = measure_blur(captures, plan, correspondence)
+    blur, blur_valid = measure_blur(captures, plan, correspondence, colours)
     valid = inverse.valid & blur_valid
     flat = carry_covariance(inverse.jacobian, blur)
     centre, covariance = measure_footprints(correspondence, inverse, blur, flat, valid)
@@ -65,6 +72,8 @@ def fit_pixels(captures: Captures, plan: PatternPlan, correspondence: Correspond
         interpolated=mosaic is not None,
         white=_white(captures, plan),
     )
+    if colours is not None:
+        phase_map = dataclasses.replace(phase_map, colours_px=colours.shifts_px)
     return FittedPixels(metapixels, phase_map, mosaic)
 
 

@@ -15,6 +15,7 @@ from controller.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.artefacts.photographs import Developed, light_of, noise_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
 from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
+from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.geometry.self_calibration import reconstruct
@@ -121,6 +122,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     shifts = colour_shifts(captures, plan, light.white, light.mixing)
     if (said := misaligned(projector.name, shifts)) is not None:
         context.reporter.say(said, Level.WARNING)
+    apart_px = shifts.sure_px
+    colours = None if apart_px is None else ColourPlaces.of(apart_px, light.white, light.mixing)
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
     correspondence = decode(
         captures,
@@ -129,6 +132,7 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         scratch=context.folder,
         known_px=used.known_px(context.folder, projector.name),
         noise=noise_of(taken[plan.sinusoids("phase-x")[0].name]),
+        colours=colours,
     )
     if not correspondence.valid.any():
         raise CalibrationError(
@@ -137,7 +141,7 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
             remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
-    fitted = fit_pixels(captures, plan, correspondence)
+    fitted = fit_pixels(captures, plan, correspondence, colours)
     metapixels = fitted.metapixels
     pixels = Pixels(
         projector_px=correspondence.projector_px,
@@ -149,6 +153,7 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         shown_px=fitted.phase_map.projector_px,
         spread_px2=fitted.phase_map.spread_px2,
         mosaic=fitted.mosaic,
+        colours_px=apart_px,
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
     figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen))

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.values import PhaseMap
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.windows.order import place_cells, settle, take_turns
 from controller.transport.windows.profiles import GROUP, Profiles, build_profiles, build_small_profiles
 from controller.transport.windows.sample_kernels import BEYOND, MOST_SHEAR, NEAR, OTHER, SORTS, Windows, kind_of
@@ -24,18 +24,24 @@ _Filled = tuple[
 
 
 def build_windows(
-    maps: tuple[PhaseMap, ...], white: tuple[FloatImage, ...], colours: npt.NDArray[np.int64], use: tuple[Mask, ...]
+    maps: tuple[PhaseMap, ...],
+    white: tuple[FloatImage, ...],
+    colours: npt.NDArray[np.int64],
+    use: tuple[Mask, ...],
+    mixing: FloatImage,
 ) -> Windows:
     """Windows of the camera pixels ``use`` (rows, columns) of each projector that look at its frame.
 
-    ``white`` (rows, columns, 3) of each; ``colours`` (2, 2) of the sites, or (0, 0): each pixel has three sites.
+    ``white`` (rows, columns, 3) of each; ``colours`` (2, 2) of the sites, or (0, 0): each pixel has three sites;
+    ``mixing`` (projectors, 3, 3).
     """
     tables = build_profiles(), build_small_profiles()
     sizes = np.array([m.spread_px2.shape[:2] for m in maps], np.int64).reshape(-1, 2)
-    halo = max((_halo(m.spread_px2, tables[0]) for m in maps), default=NEAR)
+    apart = [_apart(m, mixing[n]) for n, m in enumerate(maps)]
+    halo = max((_halo(m.spread_px2, apart[n], tables[0]) for n, m in enumerate(maps)), default=NEAR)
     place, cell_first = place_cells(sizes)
     walks = [
-        (phase_map.projector_px, phase_map.spread_px2, white[n], colours, use[n], *tables, halo)
+        (phase_map.projector_px, phase_map.spread_px2, apart[n], white[n], colours, use[n], *tables, halo)
         for n, phase_map in enumerate(maps)
     ]
     # all are counted first, so that there is one array of each kind from the beginning
@@ -88,11 +94,31 @@ def _part(filled: _Filled, part: slice) -> _Filled:
     return site[part], at[part], across[part], down[part], skew[part], gain[part]
 
 
-def _halo(spread_px2: FloatImage, table: Profiles) -> int:
+def _apart(phase_map: PhaseMap, mixing: FloatImage) -> Float64:
+    """(3, 5): x and y of where a channel of the camera looks, less the map's place; xx, xy, yy more of its spread.
+
+    A channel sees a mixture of the projector's colours. Where they lie apart, it looks at the mean of their places, and
+    their distance from it is spread (docs/decisions/0082).
+    """
+    if phase_map.colours_px is None:
+        return np.zeros((3, 5))
+    mixed = mixing.astype(np.float64)
+    x, y = np.asarray(phase_map.colours_px, np.float64).T
+    mean_x, mean_y = mixed @ x, mixed @ y
+    more = mixed @ (x * x) - mean_x**2, mixed @ (x * y) - mean_x * mean_y, mixed @ (y * y) - mean_y**2
+    return np.stack([-mean_x, -mean_y, *more], axis=1)
+
+
+def _halo(spread_px2: FloatImage, apart: Float64, table: Profiles) -> int:
     """How far windows reach beyond their tile, pixels."""
-    xx, xy, yy = (part[np.isfinite(part)].astype(np.float64) for part in np.moveaxis(spread_px2, -1, 0))
-    if not yy.size:
+    known = spread_px2[np.isfinite(spread_px2).all(axis=2)].astype(np.float64)
+    if not known.size:
         return NEAR
+    return max(_reach(known + more, table) for more in np.unique(apart[:, 2:], axis=0))
+
+
+def _reach(spread_px2: Float64, table: Profiles) -> int:
+    xx, xy, yy = spread_px2.T
     k = np.clip(xy / np.maximum(yy, 1e-6), -MOST_SHEAR, MOST_SHEAR)
     widest = kind_of(float((xx - 2 * k * xy + k * k * yy).max()))
     highest = kind_of(float(yy.max()))

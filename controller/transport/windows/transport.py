@@ -73,7 +73,7 @@ class WindowTransport(LightTransport):
         # a pixel of the object is made of samples beside it, too
         near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if colours.size else mask
         bright = tuple(near & (white.max(axis=2) > FAINTEST * white.max(initial=0)) for white in whites)
-        windows = build_windows(maps, whites, colours, bright)
+        windows = build_windows(maps, whites, colours, bright, mixing)
         sizes = tuple((int(rows), int(columns)) for rows, columns in windows.size)
         lit = np.zeros((len(maps), *mask.shape), np.bool_)
         pixels = int(windows.start[-1])

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 from controller.transport.windows.profiles import (
     LANES,
@@ -47,6 +47,7 @@ Shape = tuple[int, int, int, int]
 def walk(
     position: FloatImage,
     spread: FloatImage,
+    apart: Float64,
     white: FloatImage,
     colours: npt.NDArray[np.int64],
     use: Mask,
@@ -62,34 +63,39 @@ def walk(
     skew: npt.NDArray[np.int8],
     gain: FloatImage,
 ) -> None:
-    """Count the windows of each cell and sort in ``fill``, or write them from there on; arrays as in ``Windows``."""
+    """Count the windows of each cell and sort in ``fill``, or write them from there on; arrays as in ``Windows``.
+
+    ``apart`` (3, 5): what is added to place and spread of each of the camera's colours
+    """
     rows, columns = spread.shape[:2]
     tiles_across = (columns + TILE - 1) // TILE
     tiles = (rows + TILE - 1) // TILE * tiles_across
     pixels = use.size
     for r in range(use.shape[0]):
         for c in range(use.shape[1]):
-            x, y = position[r, c, 0], position[r, c, 1]
-            # NaN fails every comparison
-            if not (use[r, c] and -BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
+            if not use[r, c]:
                 continue
-            left, top = int(np.floor(x)), int(np.floor(y))
-            near = spread[
-                min(max(int(np.floor(y + 0.5)), 0), rows - 1), min(max(int(np.floor(x + 0.5)), 0), columns - 1)
-            ]
-            xx, xy, yy = np.float64(near[0]), np.float64(near[1]), np.float64(near[2])
-            if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
-                continue
-            shape = _shape(xx, xy, yy, np.float64(x) - left, np.float64(y) - top, table.small[0])
-            inside = _inside(table, small, left, top, shape, rows, columns)
-            if inside == 0:
-                continue
-            tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
-            tile_column = min(max(left // TILE, 0), tiles_across - 1)
             for colour in range(3):
                 one = colours.size > 0
                 if (one and colours[r & 1, c & 1] != colour) or not white[r, c, colour] > 0:
                     continue
+                x, y = position[r, c, 0] + apart[colour, 0], position[r, c, 1] + apart[colour, 1]
+                # NaN fails every comparison
+                if not (-BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
+                    continue
+                left, top = int(np.floor(x)), int(np.floor(y))
+                near = spread[
+                    min(max(int(np.floor(y + 0.5)), 0), rows - 1), min(max(int(np.floor(x + 0.5)), 0), columns - 1)
+                ]
+                xx, xy, yy = near[0] + apart[colour, 2], near[1] + apart[colour, 3], near[2] + apart[colour, 4]
+                if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
+                    continue
+                shape = _shape(xx, xy, yy, x - left, y - top, table.small[0])
+                inside = _inside(table, small, left, top, shape, rows, columns)
+                if inside == 0:
+                    continue
+                tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
+                tile_column = min(max(left // TILE, 0), tiles_across - 1)
                 cell = SORTS * (colour * tiles + tile_row * tiles_across + tile_column) + shape[0]
                 e = fill[cell]
                 fill[cell] = e + 1

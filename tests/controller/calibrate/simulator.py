@@ -51,6 +51,8 @@ class Scene:
     no_blue: float = 0.0
     """Share of the camera's width, from the left, where the paint throws back hardly any blue."""
     mixing: tuple[tuple[float, float, float], ...] = ((0.88, 0.10, 0.02), (0.08, 0.85, 0.07), (0.01, 0.12, 0.87))
+    apart_px: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    """How far red, green and blue of the projector lie to the right and down, projector px."""
 
     def projector_of(self, camera: Float64) -> Float64:
         """(..., 2) camera px -> (..., 2) projector px: perspective, rotation and a gentle bulge."""
@@ -130,14 +132,26 @@ class Stage:
         pixel = np.zeros((u, u, 1), np.float32)
         low = (u - lit) // 2
         pixel[low : low + lit, low : low + lit] = 1
-        mixed = linear @ np.array(scene.mixing, np.float32).T
-        large = np.kron(mixed, pixel)
-        if scene.projector_blur_px > 0:
-            large = cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * u)
-        seen = cv2.remap(large, self._lookup, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        seen = cv2.GaussianBlur(seen * self._albedo, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
-        small = cv2.resize(seen, scene.camera_px, interpolation=cv2.INTER_AREA)
+        mixing = np.array(scene.mixing, np.float32)
+        if any(any(shift) for shift in scene.apart_px):
+            parts = [
+                self._seen(np.kron(linear[..., d : d + 1] * mixing[:, d], pixel), scene.apart_px[d]) for d in range(3)
+            ]
+            seen = np.asarray(sum(parts), np.float32)
+        else:
+            seen = self._seen(np.kron(linear @ mixing.T, pixel), (0.0, 0.0))
+        blurred = cv2.GaussianBlur(seen * self._albedo, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
+        small = cv2.resize(blurred, scene.camera_px, interpolation=cv2.INTER_AREA)
         return np.asarray(scene.exposure * small, np.float32)
+
+    def _seen(self, large: FloatImage, apart_px: tuple[float, float]) -> FloatImage:
+        """What falls where the camera's points look, of an enlarged picture that lies so far to the right and down."""
+        scene = self.scene
+        if scene.projector_blur_px > 0:
+            large = np.asarray(cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * ENLARGED), np.float32)
+        at = self._lookup - np.float32(ENLARGED) * np.array(apart_px, np.float32)
+        seen = cv2.remap(large, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(seen, np.float32)
 
     def photograph(self, device: ByteImage) -> FloatImage:
         scene = self.scene

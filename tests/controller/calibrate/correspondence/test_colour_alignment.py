@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
+from controller.calibrate.correspondence.colour_alignment import ColourShifts, colour_shifts, misaligned
 from controller.capture.pattern_frames import frame
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage
@@ -46,7 +46,10 @@ def test_the_formula_is_that_of_the_patterns() -> None:
 def test_shifts_are_found_and_named(shift: tuple[tuple[float, float], ...]) -> None:
     wanted = np.asarray(shift)
     found = colour_shifts(pictures(wanted), PLAN, pictures(wanted)["white"], MIXING)
-    np.testing.assert_allclose(found, wanted - wanted[1], atol=0.01)
+    np.testing.assert_allclose(found.px, wanted - wanted[1], atol=0.01)
+    assert found.sure_px is not None
+    np.testing.assert_array_equal(found.sure_px, found.px)
+    assert np.all(found.error_px < 0.01)
     said = misaligned("left", found)
     assert said is not None
     assert f"red by {wanted[0, 0] - wanted[1, 0]:+.1f} pixels across" in said
@@ -57,6 +60,22 @@ def test_colours_that_lie_on_each_other_are_not_named_however_noisy() -> None:
     for noise in (0.0, 0.05, 0.2):
         made = pictures(np.zeros((3, 2)), noise)
         assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None
+
+
+@pytest.mark.parametrize(
+    ("px", "error_px", "sure"),
+    [(0.3, 0.01, True), (0.03, 0.01, False), (0.03, 0.005, True), (0.015, 0.0, False), (-0.3, 0.1, False),
+     (1.4, 0.01, True), (-1.6, 0.01, False), (np.nan, np.nan, False)],
+)  # fmt: skip
+def test_only_what_is_beyond_doubt_is_corrected(px: float, error_px: float, sure: bool) -> None:
+    shifts = np.zeros((3, 2))
+    shifts[2, 1] = px
+    shifts[0, 0] = np.nan
+    found = ColourShifts(shifts, np.where(shifts == 0, 0.0, error_px)).sure_px
+    assert (found is not None) == sure
+    if found is not None:
+        assert found[2, 1] == px
+        assert found[0, 0] == 0
 
 
 def test_without_light_nothing_is_said() -> None:

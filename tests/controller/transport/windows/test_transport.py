@@ -97,6 +97,17 @@ def expected(calibration: Calibration, frames: list[Floats]) -> Floats:
     return developed((sites / largest).astype(np.float32), calibration.mosaic) * np.float32(largest)
 
 
+def apart(calibration: Calibration, seed: int) -> Calibration:
+    """The same stage with each projector's colours up to half a pixel beside each other."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for part in calibration.projectors:
+        assert part.phase_map is not None
+        phase_map = dataclasses.replace(part.phase_map, colours_px=rng.uniform(-0.5, 0.5, (3, 2)))
+        parts.append(dataclasses.replace(part, phase_map=phase_map))
+    return dataclasses.replace(calibration, projectors=tuple(parts))
+
+
 def whites(calibration: Calibration) -> Floats:
     """All projectors' white images together, at the pixels of the object."""
     total: Floats = np.sum([part.white for part in calibration.projectors], axis=0)
@@ -113,6 +124,47 @@ def test_a_product_follows_the_definition_of_the_model(stage: Stage, mosaic: npt
     # blur is rounded by up to 1 %, places to 1/512 pixel, the cut is square instead of elliptical
     error = np.sqrt(np.mean((got - wanted) ** 2) / np.mean(wanted**2))
     assert error < 0.01
+
+
+@pytest.mark.parametrize("mosaic", [None, RGGB], ids=["none", "RGGB"])
+@pytest.mark.parametrize(("mixed", "limit"), [(False, 0.01), (True, 0.02)], ids=["colours", "mixed, in grey"])
+def test_colours_that_lie_apart_follow_windows_of_their_own(
+    stage: Stage, mosaic: npt.NDArray[np.int64] | None, mixed: bool, limit: float
+) -> None:
+    """The oracle has a window for each colour of the projector in each of the camera; the transport joins the three.
+
+    That is exact where the camera does not mix them. Where it does and they show the same, it is right in mean and
+    variance of the places; uncorrected, the error is 0.07.
+    """
+    plain = on_frame(mapped(stage(5, masked=False, sizes=((40, 50), (17, 15))), 5, mosaic=mosaic, ordered=True))
+    parts = []
+    for part in plain.projectors:
+        # samples of the oracle's development can't be negative
+        mixing = np.abs(part.radiometry.mixing) if mixed else np.eye(3)
+        mixing /= mixing.sum(axis=1, keepdims=True)
+        assert part.phase_map is not None
+        spread = part.phase_map.spread_px2
+        # blur that changes from pixel to pixel, as no lens's does, would differ at the three places
+        phase_map = PhaseMap(part.phase_map.projector_px, np.full_like(spread, (0.3, 0.1, 0.4)) if mixed else spread)
+        radiometry = dataclasses.replace(part.radiometry, mixing=mixing)
+        parts.append(dataclasses.replace(part, radiometry=radiometry, phase_map=phase_map))
+    calibration = apart(dataclasses.replace(plain, projectors=tuple(parts)), 5)
+    transport = build_transport(calibration)
+    frames = random_frames(transport)
+    if mixed:
+        frames = [np.repeat(frame[..., :1], 3, axis=2) for frame in frames]
+    wanted = np.zeros((*transport.camera_shape, 3), np.float32)
+    for part, frame in zip(calibration.projectors, frames, strict=True):
+        assert part.phase_map is not None
+        assert part.phase_map.colours_px is not None
+        for d in range(3):
+            at = (part.phase_map.projector_px - part.phase_map.colours_px[d]).astype(np.float32)
+            moved = dataclasses.replace(part, phase_map=PhaseMap(at, part.phase_map.spread_px2))
+            only = np.zeros_like(frame)
+            only[..., d] = frame[..., d]
+            wanted += expected(dataclasses.replace(calibration, projectors=(moved,)), [only])
+    off = (transport.forward(frames) - wanted)[20:-20, 20:-20]
+    assert np.sqrt(np.mean(off**2) / np.mean(wanted[20:-20, 20:-20] ** 2)) < limit
 
 
 def test_small_windows_follow_the_definition_whatever_their_skew(stage: Stage) -> None:
@@ -137,9 +189,9 @@ def test_small_windows_follow_the_definition_whatever_their_skew(stage: Stage) -
 
 
 @slow_start
-@given(seed=st.integers(0, 2**31), masked=st.booleans(), mosaic=st.booleans(), sharp=st.booleans())
+@given(seed=st.integers(0, 2**31), masked=st.booleans(), mosaic=st.booleans(), sharp=st.booleans(), aside=st.booleans())
 def test_the_adjoint_is_the_transpose_for_any_geometry(
-    stage: Stage, seed: int, masked: bool, mosaic: bool, sharp: bool
+    stage: Stage, seed: int, masked: bool, mosaic: bool, sharp: bool, aside: bool
 ) -> None:
     calibration = mapped(stage(seed, masked=masked, sizes=((70, 90), (7, 5))), seed, mosaic=RGGB if mosaic else None)
     if sharp:
@@ -151,7 +203,7 @@ def test_the_adjoint_is_the_transpose_for_any_geometry(
             if p.phase_map is not None
         ]
         calibration = dataclasses.replace(calibration, projectors=tuple(parts))
-    transport = build_transport(calibration)
+    transport = build_transport(apart(calibration, seed) if aside else calibration)
     frames = random_frames(transport, seed)
     r = np.random.default_rng(seed + 1).random((*transport.camera_shape, 3), np.float32)
     forward, backward = products(transport, frames, r)
@@ -263,7 +315,7 @@ def test_the_mean_over_a_projector_pixel_uses_its_normalised_shares(stage: Stage
 def test_a_part_written_out_as_a_matrix_is_the_same_transport(
     stage: Stage, mosaic: npt.NDArray[np.int64] | None
 ) -> None:
-    transport = build_transport(mapped(stage(7), 7, mosaic=mosaic))
+    transport = build_transport(apart(mapped(stage(7), 7, mosaic=mosaic), 7))
     everything = np.arange(transport.pixels)
     p = np.random.default_rng(7).random((3, transport.pixels), np.float32)
     light = transport.forward_planes(p)
