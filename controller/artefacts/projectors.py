@@ -171,12 +171,14 @@ def read_radiometry_figures(run: Path, projector: str) -> Any:
 class PixelFigures:
     """``pixels-PROJECTOR.json``: of ``pixels`` projector pixels ``fitted`` ones have a metapixel.
 
-    ``camera_pixels``: how many camera pixels see the projector
+    ``camera_pixels``: how many camera pixels see the projector; ``colours_px``: x and y of how far red, green and blue
+    lie apart, projector pixels, where that is corrected
     """
 
     fitted: int
     pixels: int
     camera_pixels: int
+    colours_px: tuple[tuple[float, float], ...] | None = None
 
     def write(self, run: Path, projector: str) -> Path:
         return write_json(json_path(run, StepKind.PIXELS, projector), asdict(self))
@@ -185,7 +187,11 @@ class PixelFigures:
     def read(cls, run: Path, projector: str) -> Self | None:
         """None if there are none."""
         row = _read_figures(json_path(run, StepKind.PIXELS, projector))
-        return cls(int(row["fitted"]), int(row["pixels"]), int(row["camera_pixels"])) if row else None
+        if not row:
+            return None
+        apart = row.get("colours_px")  # not in runs from before it was corrected
+        colours_px = None if apart is None else tuple((float(x), float(y)) for x, y in apart)
+        return cls(int(row["fitted"]), int(row["pixels"]), int(row["camera_pixels"]), colours_px)
 
 
 def write_dot_figures(run: Path, projector: str, figures: Mapping[str, Any]) -> Path:

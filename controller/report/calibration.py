@@ -79,7 +79,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     page = Page(
         title=f"{asked.stage}: calibration of {when(run.name)}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work. "
-        f"By projector: {photographs_sentence(run, asked.projectors)}.",
+        f"By projector: {photographs_sentence(run, asked.projectors)}.{_apart(figures['colours_px'])}",
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),
@@ -115,10 +115,18 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "seconds": sum(steps.values()),
         "geometry": {key: geometry.get(key) for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
         "metapixels": {name: None if one is None else one.fitted for name, one in pixels.items()},
+        "colours_px": {name: None if one is None else one.colours_px for name, one in pixels.items()},
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
         "verification": read_grade_figures(run),
         "steps": {str(step): seconds for step, seconds in steps.items()},
     }
+
+
+def _apart(colours_px: Mapping[str, Sequence[tuple[float, float]] | None]) -> str:
+    """For people: by how many pixels colours lie beside green, where frames correct it; "" where they nowhere do."""
+    parts = [f"{name} red {np.hypot(*apart[0]):.2f}, blue {np.hypot(*apart[2]):.2f}"
+             for name, apart in colours_px.items() if apart is not None]  # fmt: skip
+    return f" Colours beside green, corrected, in pixels: {'; '.join(parts)}." if parts else ""
 
 
 def _steps(run: Path) -> Mapping[StepId, float]:

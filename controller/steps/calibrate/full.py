@@ -156,7 +156,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         colours_px=apart_px,
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
-    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen))
+    apart = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
+    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen), apart)
     return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name)]
 
 

@@ -28,6 +28,7 @@ NAMES = ("left", "<b>right</b>")
 ASKED = StageDescription("A <script>stage</script>", NAMES, 8.0)
 CAMERA = (40, 60)
 PROJECTOR = (12, 16)
+APART = ((0.3, 0.4), (0.0, 0.0), (0.0, -0.25))
 
 
 def write_run(runs: Path, name: str, errors: tuple[float, float]) -> Path:
@@ -56,7 +57,7 @@ def write_run(runs: Path, name: str, errors: tuple[float, float]) -> Path:
                 "modulation": np.ones(CAMERA, np.float32), "seen": np.ones(CAMERA, bool),
             },
         )  # fmt: skip
-        PixelFigures(192, 192, 2400).write(run, projector)
+        PixelFigures(192, 192, 2400, APART if number == 0 else None).write(run, projector)
         why = [{"reason": "moved", "error_share": 0.5, "area_share": 0.1, "sentence": "It <i>moved</i>."}]
         verification[projector] = {"relative_rms": errors[number] / 100, "grade": "A", "reasons": why}
         maps[projector] = ErrorMaps(np.full(CAMERA, errors[number] / 100, np.float32), np.zeros(CAMERA, np.uint8))
@@ -113,12 +114,14 @@ def test_it_is_compared_with_those_before_it_and_not_with_those_after(run: Path)
     assert "4 Jan 2026" not in text
     assert not re.search("[0-9]{8}-[0-9]{6}", text), "names of runs are for programs"
     assert "at most 8 %, not reached" in text
+    assert "Colours beside green, corrected, in pixels: left red 0.50, blue 0.25." in text
 
 
 def test_the_figures_are_for_machines_and_the_pictures_for_the_panel(run: Path) -> None:
     figures = json.loads((run / "report.json").read_text())
     assert figures["verification"]["left"]["relative_rms"] == 0.09
     assert figures["metapixels"] == {"left": 192, "<b>right</b>": 192}
+    assert figures["colours_px"] == {"left": [list(place) for place in APART], "<b>right</b>": None}
     assert figures["geometry"]["reprojection_rms_px"] == 0.025
     for name in ("before.png", "resolution.png"):
         picture = cv2.imread(str(run / name))
