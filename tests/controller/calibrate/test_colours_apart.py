@@ -149,10 +149,17 @@ def test_grey_sinusoids_are_taken_back_to_green(paint: tuple[float, float, float
 
 
 def test_where_white_is_not_known_the_shares_are_those_of_the_picture() -> None:
-    white = np.full((4, 4, 3), (0.2, 0.4, 0.4), np.float32)
+    white = np.full((300, 4, 3), (0.2, 0.4, 0.4), np.float32)
     white[0, 0] = np.nan
-    white[1, 1] = 0
+    white[299, 1] = 0
+    white[150, 2] = (0.0, 0.0, 1e-3)
+    share = shares_of(white)
+    wanted = np.full_like(share, (0.2, 0.4, 0.4))
+    wanted[150, 2] = (0, 0, 1)
+    np.testing.assert_allclose(share, wanted, rtol=1e-3)
+    np.testing.assert_allclose(shares_of(np.zeros((4, 4, 3), np.float32)), 1 / 3)
+
+
+def shares_of(white: FloatImage) -> FloatImage:
     colours = ColourPlaces.of(np.zeros((3, 2)), white, np.eye(3))
-    np.testing.assert_allclose(colours.share[[0, 1], [0, 1]], [(0.2, 0.4, 0.4)] * 2, rtol=1e-5)
-    nothing = ColourPlaces.of(np.zeros((3, 2)), np.zeros((4, 4, 3), np.float32), np.eye(3))
-    np.testing.assert_allclose(nothing.share, 1 / 3)
+    return np.concatenate([share for _, share in colours.shares()])
