@@ -199,6 +199,16 @@ def test_runs_from_before_read_as_they_did(tmp_path: Path) -> None:
     assert Pixels.read(tmp_path, "left").phase_map is None
 
 
+def test_colours_that_lie_apart_are_kept_with_the_phase_map(tmp_path: Path) -> None:
+    one = np.ones((2, 2), np.float32)
+    apart = np.array([(0.3, 0.0), (0.0, 0.0), (-0.1, 0.25)])
+    for colours_px in (apart, None):
+        Pixels(one, one, one > 0, one, one, one > 0, one, one, None, colours_px).write(tmp_path, "left")
+        found = Pixels.read(tmp_path, "left").phase_map
+        assert found is not None
+        np.testing.assert_array_equal(found.colours_px, colours_px)
+
+
 def test_arrays_whose_names_end_like_files_are_told_apart(tmp_path: Path) -> None:
     save_arrays(tmp_path / "a.npz", {"x": image(1), "x.npy": image(2)})
     found = load_arrays(tmp_path / "a.npz")

@@ -36,6 +36,7 @@ def pixels() -> dict[str, npt.NDArray[Any]]:
         "centre_px": camera_of(grid).astype(np.float32),
         "covariance_px2": np.full((ROWS, COLUMNS, 3), 0.4, np.float32),
         "valid": np.ones((ROWS, COLUMNS), np.bool_),
+        "colours_px": np.array([(0.3, 0.0), (0.0, 0.0), (0.0, 0.3)]),
     }
 
 
@@ -56,7 +57,8 @@ def test_correspondences_are_mapped_and_what_is_kept_by_camera_pixel_stays(
     found = update_positions(pixels, TURN)
     for name in ("projector_px", "shown_px"):
         np.testing.assert_allclose(found[name][3, 5], moved(TURN, np.full(2, 7.0)), atol=1e-4)
-    np.testing.assert_array_equal(found["modulation"], pixels["modulation"])
+    for name in ("modulation", "colours_px"):
+        np.testing.assert_array_equal(found[name], pixels[name])
 
 
 def test_pixels_that_were_not_trusted_move_along(
