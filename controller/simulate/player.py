@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,6 +30,10 @@ class Screen:
         self.scheduler, self.disk, self.chance = scheduler, disk, chance
         self.process: SimulatedPlayer | None = None
         self.trouble, self.hung = "", False
+        self.no_server = False
+        """Whether the X server is away."""
+        self.unplugged: set[str] = set()
+        """Outputs whose cable is out."""
         self.dies_at_start = self.dies_at_play = 0
         self.number = 0
         self.vain_starts: dict[str, int] = {}
@@ -40,7 +44,30 @@ class Screen:
     def appearance(self) -> str:
         """What is to be seen; empty: black."""
         process = self.process
-        return "" if process is None or not process.alive or process.showing != "appearance" else process.appearance
+        gone = self.no_server or process is None or not process.alive
+        return "" if gone or process is None or process.showing != "appearance" else process.appearance
+
+    @property
+    def serves(self) -> bool:
+        """Whether the player runs, and answers as it should."""
+        process = self.process
+        return process is not None and process.alive and process.is_ready and not self.hung and not self.trouble
+
+    def lose_server(self) -> None:
+        """The X server ends, and its clients with it. One that hangs does not notice, but its window is gone, too."""
+        self.no_server = True
+        if self.process is not None:
+            self.process.showing, self.process.appearance = "black", ""
+            if not self.hung:
+                self.process.kill()
+
+    def why_dark(self, outputs: Sequence[tuple[str, int, int]]) -> str:
+        """Why a player with these outputs can't start, or nothing: as ``play.display.window.WindowOutput``."""
+        if self.no_server:
+            return "The player found no display: no X server answers."
+        if self.unplugged >= {name for name, _, _ in outputs}:
+            return f"The X server has no output {outputs[0][0]}; it has none."
+        return ""
 
     def launch(self, runtime: Path, settings: PlayerSettings) -> SimulatedPlayer:
         """Start one in the place of the one that runs."""
@@ -76,7 +103,8 @@ class SimulatedPlayer:
         self._start: CountedStart | None = None
         self._bundle = ""
         self._is_ready = self._asked = self._counted = False
-        self._failed = self._load_first()
+        # Its display first: a start without one says nothing about the bundle, and is not counted.
+        self._failed = screen.why_dark(settings.outputs) or self._load_first()
         if screen.dies_at_start > 0:
             screen.dies_at_start -= 1
             self._failed = self._failed or "it crashed."
@@ -84,6 +112,11 @@ class SimulatedPlayer:
     @property
     def socket(self) -> Path:
         return Path("player.sock")
+
+    @property
+    def is_ready(self) -> bool:
+        self._get_ready()
+        return self._is_ready
 
     def wait_until_ready(self, timeout_s: float = 8.0) -> dict[str, Any]:
         screen = self._screen
@@ -224,6 +257,7 @@ class SimulatedPlayer:
         return {
             "bundle": self.identity or None, "showing": self.showing, "appearance": self.appearance or None,
             "brightness": self.brightness, "sequence_running": self.running, "skipped": 0, "warning": None,
+            "missing_outputs": [name for name, _, _ in self._settings.outputs if name in self._screen.unplugged],
         }  # fmt: skip
 
 

@@ -19,6 +19,8 @@ from controller.kiosk.interface import Schedule
 from controller.kiosk.store.bundle_store import slots_without
 
 NAMES: Final = ("left", "right", "above")
+OUTPUTS: Final = {name: f"P{number}" for number, name in enumerate(NAMES, 1)}
+"""The output that each projector is at."""
 APPEARANCES: Final = ("glass", "marble", "shine")
 RUN: Final = "20260101-030000-calibrate"
 _KEY: Final = SigningKey(bytes(range(32)))
@@ -41,11 +43,11 @@ def publish(folder: Path, created_unix_s: int, missing: Collection[str] = ()) ->
     names = [name for name in NAMES if name not in missing]
     write_bundle(
         built, stage="Simulated", calibration=RUN, created_unix_s=created_unix_s, revision=revision, key=_KEY,
-        outputs=[(f"P{number}", _SIDE_PX, _SIDE_PX) for number in range(1, len(NAMES) + 1)],
+        outputs=[(output, _SIDE_PX, _SIDE_PX) for output in OUTPUTS.values()],
         appearances=[
             NewAppearance(name, {
-                f"P{number}": np.full((_SIDE_PX, _SIDE_PX, 3), shade * 40 if lit in names else 0, np.uint8)
-                for number, lit in enumerate(NAMES, 1)
+                output: np.full((_SIDE_PX, _SIDE_PX, 3), shade * 40 if lit in names else 0, np.uint8)
+                for lit, output in OUTPUTS.items()
             })
             for shade, name in enumerate(APPEARANCES, 1)
         ],
@@ -63,12 +65,12 @@ def _text(schedule: Schedule) -> str:
     return toml_text({
         "stage": {"name": "Simulated"},
         "projectors": [
-            {"name": name, "output": f"P{number}", "driver": "pjlink", "address": f"192.0.2.{number}"}
+            {"name": name, "output": OUTPUTS[name], "driver": "pjlink", "address": f"192.0.2.{number}"}
             for number, name in enumerate(NAMES, 1)
         ],
         "camera": {"driver": "ptp", "iso": 100, "address": "ptpip:192.0.2.9", "focal_length_px": 4100.0},
         "display": {"driver": "player", "outputs": [
-            {"name": f"P{number}", "width_px": _SIDE_PX, "height_px": _SIDE_PX} for number in range(1, len(NAMES) + 1)
+            {"name": output, "width_px": _SIDE_PX, "height_px": _SIDE_PX} for output in OUTPUTS.values()
         ]},
         "bundle": {"trusted_keys": [TRUST.keys[0].hex()]},
         "schedule": {"time_zone": schedule.time_zone, "drift_check": schedule.drift_check, "hours": rows},

@@ -25,7 +25,7 @@ from controller.simulate.disk import STAGE, TOTAL_BYTES, Disk
 from controller.simulate.lamps import Lamp, Line, SimulatedProjector
 from controller.simulate.player import Screen, SimulatedPlayer
 from controller.simulate.scheduler import Event, Lock, Program, Scheduler
-from controller.simulate.stage import NAMES
+from controller.simulate.stage import NAMES, OUTPUTS
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone
 from hal.registry import Driver, Drivers, OpenContext
@@ -103,7 +103,7 @@ class _Display:
         self._screen = screen
 
     def outputs(self, *, deadline: Deadline) -> tuple[OutputInfo, ...]:
-        return tuple(OutputInfo(f"P{number}", 8, 8) for number in range(1, len(NAMES) + 1))
+        return tuple(OutputInfo(output, 8, 8) for output in OUTPUTS.values())
 
     def show(self, frames: Mapping[str, Any], *, deadline: Deadline) -> None:
         if self._screen.process is not None and not self._screen.hung:

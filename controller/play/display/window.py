@@ -30,8 +30,9 @@ class WindowOutput:
     """Real outputs of an X server.
 
     Outputs are found by their connector's name (``xrandr``: DP-1, HDMI-2) or their display's serial number. If none of
-    them is there, and none was asked for by ``where``, they lie side by side from the upper left corner, in stage
-    order. An output that is away, or has another size, stays black; when it is back it shows what the others show.
+    them is there, but others are, and none was asked for by ``where``, they lie side by side from the upper left
+    corner, in stage order, until one of them comes. An output that is away, or has another size, stays black; when it
+    is back it shows what the others show.
     """
 
     def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
@@ -44,7 +45,7 @@ class WindowOutput:
         self._server = XServer()
         self._server.claim()
         found, connectors = self._find()
-        self._beside = not found and not self._where
+        self._beside = not found and bool(connectors) and not self._where
         self._missing: tuple[str, ...] = ()
         if not self._beside:
             self._missing = self._checked(found, connectors)
@@ -155,7 +156,7 @@ class WindowOutput:
         return self._missing
 
     def pump(self) -> None:
-        if self._server.changed() and not self._beside:
+        if self._server.changed():
             self._follow()
         self._window.dispatch_events()
         if self._damaged:
@@ -167,6 +168,10 @@ class WindowOutput:
     def _follow(self) -> None:
         """Outputs came, went or moved: place the window and the pictures again."""
         found, _ = self._find()
+        # With all cables out at the start, the stage's outputs look like those of somebody who gave no names.
+        self._beside = self._beside and not found
+        if self._beside:
+            return
         before, self._places = self._places, self._placed(found)
         names = [size.name for size in self._sizes]
         self._missing = tuple(name for name, place in zip(names, self._places, strict=True) if place is None)

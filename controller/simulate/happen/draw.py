@@ -51,7 +51,7 @@ KINDS: Final[_Weights] = {
     "line": 2, "lamp fails": 1, "lamp reports": 1, "lamp switched by hand": 1, "player": 2, "camera gone": 1,
     "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 1, "killed": 1, "bundles unreadable": 1,
     "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 0.5, "network gone": 0.5, "drift": 0.5,
-    "command": 4,
+    "command": 4, "x server": 1, "cable out": 1,
 }  # fmt: skip
 COMMANDS: Final[_Weights] = {
     "start": 6, "stop": 6, "play": 4, "rotate": 2, "next": 3, "black": 3, "pause": 3, "brightness": 3, "identify": 2,
@@ -194,7 +194,7 @@ def _one(chance: random.Random, at_s: float, leaning: Leaning) -> Item:  # noqa:
     lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s
     name = chance.choice(NAMES)
     match what:
-        case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand":
+        case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand" | "cable out":
             return Item(at_s, what, name, how, lasts_s)
         case "player":
             return Item(

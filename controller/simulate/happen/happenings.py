@@ -12,6 +12,7 @@ from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.lamps import RULES, Lamp
+from controller.simulate.stage import OUTPUTS
 
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
@@ -100,6 +101,32 @@ def _player(life: Living, item: Item) -> None:
     witness.disturb(item.for_s, PLAYER_S)
     if fell:
         witness.player_fell()
+
+
+def _x_server(life: Living, item: Item) -> None:
+    """It restarts, crashes again and again, or its computer's graphics are gone for hours."""
+    screen, witness = life.world.screen, life.witness
+    screen.lose_server()
+    witness.disturb(item.for_s, PLAYER_S)
+    witness.disturb_player(item.for_s)
+
+    def repair() -> None:
+        screen.no_server = False
+
+    life.later(item.for_s, repair)
+
+
+def _cable(life: Living, item: Item) -> None:
+    """A projector's video cable is out, or its extender is without power."""
+    screen, witness, output = life.world.screen, life.witness, OUTPUTS[item.who]
+    screen.unplugged.add(output)
+    witness.disturb(item.for_s, PLAYER_S)
+    witness.disturb_player(item.for_s)
+
+    def repair() -> None:
+        screen.unplugged.discard(output)
+
+    life.later(item.for_s, repair)
 
 
 def _camera(life: Living, item: Item) -> None:
@@ -201,7 +228,8 @@ def _command(life: Living, item: Item) -> None:
 
 _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "line": _line, "lamp fails": _lamp_fails, "lamp reports": _lamp_reports, "lamp switched by hand": _by_hand,
-    "player": _player, "camera gone": _camera, "disk full": _disk_full, "disk low": _disk_low,
+    "player": _player, "x server": _x_server, "cable out": _cable, "camera gone": _camera,
+    "disk full": _disk_full, "disk low": _disk_low,
     "file damaged": file_damaged, "bundle damaged": bundle_damaged, "bundles unreadable": bundles_unreadable,
     "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
     "clock set": _clock, "network gone": _no_network, "drift": _drift, "command": _command,

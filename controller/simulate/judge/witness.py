@@ -9,10 +9,12 @@ from controller.kiosk.decide.interfaces import Condition, Request
 from controller.kiosk.decide.live_changes import LiveChanges
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import SHOWN
+from controller.kiosk.supervisors.player_supervisor import OUTPUT_GONE
 from controller.run.state_machine import State
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.promises import Broken
 from controller.simulate.judge.wanted import Wanted
+from controller.simulate.stage import OUTPUTS
 from controller.simulate.world import SimulatedWorld
 
 if TYPE_CHECKING:
@@ -179,7 +181,7 @@ class Witness:
         self._stay_lit(wanted)
         self._works(service)
         self._alerts()
-        self._player()
+        self._player(service)
         self._devices(service)
         self._closed(service, state, wanted)
         self._opened(kiosk, service, state, wanted)
@@ -275,12 +277,22 @@ class Witness:
                 self._alerted_number, self._kills = row.number, 0
         self._alerted = len(world.alerted)
 
-    def _player(self) -> None:
+    def _player(self, service: Service) -> None:
         """A picture that stands still is no sign of a player that lives."""
         screen = self._world.screen
         hangs = screen.hung and screen.process is not None and screen.process.alive
         if self._found_s("hangs", hangs) > HANGS_S:
             raise Broken("picture back", f"the player hangs for {HANGS_S:.0f} s, and was not ended")
+        self._outputs(service)
+
+    def _outputs(self, service: Service) -> None:
+        """What is said of the outputs while the player answers: exactly those that get no picture."""
+        screen, problem = self._world.screen, service.player.view.problem
+        text = problem.text if problem is not None and problem.code == OUTPUT_GONE else ""
+        said = {output for output in OUTPUTS.values() if output in text}
+        wrong = sorted(said ^ screen.unplugged) if screen.serves else []
+        if self._found_s("outputs", bool(wrong)) > BLACK_S:
+            raise Broken("outputs named", f"{', '.join(wrong)} for {BLACK_S:.0f} s, and it says: {text or 'nothing'}")
 
     def _devices(self, service: Service) -> None:
         world, now_s = self._world, self._world.scheduler.now_s
@@ -325,7 +337,8 @@ class Witness:
         world, now_s = self._world, self._world.scheduler.now_s
         live, shown = service.reconciler.live, world.screen.appearance
         asked_black = live.black or service.player.identifying or service.reconciler.working
-        bright = any(lamp.shines for lamp in world.lamps.values()) and bool(shown)
+        dark = {name for name, output in OUTPUTS.items() if output in world.screen.unplugged}
+        bright = any(lamp.shines and name not in dark for name, lamp in world.lamps.items()) and bool(shown)
         if not wanted or bright or asked_black:
             self._black_since_s = None
         elif self._black_since_s is None:

@@ -20,6 +20,7 @@ import pytest
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.errors import WorkError
 from controller.play.control.launch import PlayerProcess
+from tests.controller.play.conftest import write_noise
 from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, Outputs, edid, running_server
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
 
@@ -153,6 +154,35 @@ def test_an_output_that_is_missing_at_the_start_keeps_no_other_dark_and_shows_th
         outputs.place("DUMMY1", WIDTH)
         assert comes_true(lambda: same(shown(outputs), expected))
         assert wire.ask("status")["missing_outputs"] == []
+
+
+def test_outputs_that_are_all_away_at_the_start_show_their_pictures_when_they_come(
+    outputs: Outputs, start: Start, tmp_path: Path
+) -> None:
+    """Named as their connectors, so nothing else tells them from outputs that nobody gave a name."""
+    sizes = [(name, WIDTH, HEIGHT) for name in CONNECTORS[1:]]
+    path = write_noise(tmp_path / "named.vel", outputs=sizes)
+    settings = {"outputs": sizes, "frames": None, "bundle": path, "allow_unsigned": True}
+    for name, _, _ in sizes:
+        outputs.xrandr("--output", name, "--off")
+    with Wire(start(**settings).socket) as wire:
+        assert wire.ask("play", appearance="1")["ok"]
+        assert np.array_equal(outputs.picture(0), noise(sizes, 1)["DUMMY1"]), "beside each other on what there is"
+        outputs.place("DUMMY2", 2 * WIDTH)
+        assert comes_true(lambda: np.array_equal(outputs.picture(2 * WIDTH), noise(sizes, 1)["DUMMY2"]))
+        assert wire.ask("status")["missing_outputs"] == ["DUMMY1"]
+        outputs.place("DUMMY1", WIDTH)
+        assert comes_true(lambda: np.array_equal(outputs.picture(WIDTH), noise(sizes, 1)["DUMMY1"]))
+        assert wire.ask("status")["missing_outputs"] == []
+
+
+def test_a_server_without_any_output_is_refused(outputs: Outputs, start: Start, tmp_path: Path) -> None:
+    sizes = [(CONNECTORS[0], WIDTH, HEIGHT)]
+    path = write_noise(tmp_path / "named.vel", outputs=sizes)
+    for name in CONNECTORS:
+        outputs.xrandr("--output", name, "--off")
+    told = refusal(start, outputs=sizes, frames=None, bundle=path, allow_unsigned=True)
+    assert "no output DUMMY0; it has none" in told
 
 
 def test_outputs_that_are_moved_keep_their_pictures(outputs: Outputs, play: Start) -> None:
