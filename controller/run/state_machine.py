@@ -159,8 +159,12 @@ class Machine:
 
     @property
     def reason(self) -> str:
-        """Why the stage is in this state, as given with the last event."""
+        """Why the stage is in this state, as given with the last event or by ``explain``."""
         return self._reason
+
+    def explain(self, reason: str) -> None:
+        """The stage stays in its state, but for another reason by now. No listener is called."""
+        self._reason = reason
 
     def listen(self, listener: Listener) -> None:
         """Call ``listener`` at every change from now on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -88,8 +88,10 @@ class StageStates:
         elif state is State.DEGRADED:
             if not reasons and not self.missing:
                 self.go(Event.RECOVERED, "every projector gives light again")
+            else:
+                self.machine.explain(reasons or _without_light(self.missing))
         elif reasons or self.missing:
-            self.go(Event.DEGRADE, reasons or f"{', '.join(sorted(self.missing))} gives no light.")
+            self.go(Event.DEGRADE, reasons or _without_light(self.missing))
         elif state is State.READY and need.picture and not need.job:
             self.go(Event.PLAY, "open")
         elif state is State.PLAYING and not need.picture:
@@ -143,6 +145,10 @@ class StageStates:
         text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
         level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
         self._log.add(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+
+
+def _without_light(names: Collection[str]) -> str:
+    return f"{', '.join(sorted(names))} gives no light."
 
 
 def _reasons(views: Sequence[ProjectorView]) -> str:

@@ -286,11 +286,12 @@ class Witness:
         self._outputs(service)
 
     def _outputs(self, service: Service) -> None:
-        """What is said of the outputs while the player answers: exactly those that get no picture."""
+        """What is said of the outputs while the player has no other problem: exactly those that get no picture."""
         screen, problem = self._world.screen, service.player.view.problem
-        text = problem.text if problem is not None and problem.code == OUTPUT_GONE else ""
+        text = "" if problem is None else problem.text
         said = {output for output in OUTPUTS.values() if output in text}
-        wrong = sorted(said ^ screen.unplugged) if screen.serves else []
+        other = problem is not None and problem.code != OUTPUT_GONE
+        wrong = sorted(said ^ screen.unplugged) if screen.serves and not other else []
         if self._found_s("outputs", bool(wrong)) > BLACK_S:
             raise Broken("outputs named", f"{', '.join(wrong)} for {BLACK_S:.0f} s, and it says: {text or 'nothing'}")
 
@@ -350,7 +351,7 @@ class Witness:
         self._back(shown, asked_black)
         open_s = now_s - max(self.changed_s, self._began_s)
         dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
-        unexplained = dark_s > SETTLING_S and open_s > SETTLING_S and not self._explained(kiosk, state)
+        unexplained = dark_s > SETTLING_S and open_s > SETTLING_S and not self._explained(kiosk, service)
         if self._found_s("unexplained", unexplained) > BLACK_S:
             raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
         if not self.calm or open_s < SETTLING_S or asked_black:
@@ -385,8 +386,12 @@ class Witness:
                 raise Broken("picture back", f"it is still black {BACK_S:.0f} s after the player fell")
             self._back_by_s = None
 
-    def _explained(self, kiosk: StageKiosk, state: State) -> bool:
-        snapshot = kiosk.snapshot()
+    def _explained(self, kiosk: StageKiosk, service: Service) -> bool:
+        snapshot, state = kiosk.snapshot(), service.reconciler.machine.state
+        player = service.player.view.problem
+        if state is State.DEGRADED and player is not None:
+            # What was wrong first may be over: people would look for it in the wrong place.
+            return player.reason in snapshot.reason
         if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
             return True
         return (

@@ -55,6 +55,7 @@ class ModelPlayer:
     want: Showing | None = BLACK
     hung_at_s: float | None = None
     broken: bool = False
+    problem: Decision | None = None
     shown: Showing | None = None
 
     @property
@@ -65,7 +66,7 @@ class ModelPlayer:
             return PlayerView(None, Decision("player-hung", "The player did not answer.", "It is started again."))
         if self.want is not None:
             self.shown = self.want
-        return PlayerView(self.shown)
+        return PlayerView(self.shown, self.problem)
 
 
 @dataclass

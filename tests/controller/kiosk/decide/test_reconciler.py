@@ -6,6 +6,7 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import BLACK, Request, Showing
+from controller.kiosk.store.event_log import Decision
 from controller.run.state_machine import State
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import BUNDLE, NAMES, RULES, STEP_S, Kiosk
@@ -78,6 +79,17 @@ def test_a_dead_lamp_degrades_and_the_others_take_over_with_their_own_frames(kio
     kiosk.run_until(State.PLAYING)
     assert kiosk.player.view.shown == Showing(BUNDLE, "shine")
     assert not kiosk.sins
+
+
+def test_a_degraded_stage_says_what_is_wrong_now_not_what_was_wrong_first(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.player.problem = Decision("player-not-started", "No X server answers.", "", "error")
+    kiosk.run_until(State.DEGRADED)
+    kiosk.player.problem = Decision("bundle-damaged", "The bundle is damaged.", "", "error")
+    kiosk.run(2)
+    assert kiosk.reconciler.machine.reason == "The bundle is damaged."
+    kiosk.player.problem = None
+    kiosk.run_until(State.PLAYING)
 
 
 def test_a_lamp_that_never_lights_is_struck_three_times_and_left_alone_until_somebody_opens_again(kiosk: Kiosk) -> None:
