@@ -115,14 +115,25 @@ def test_costly_bumps_that_nobody_notices_wrong_names_and_bad_mending_are_told_a
     _, hand = stage()
     hand.disturb({"what": "camera", "shift_px": (5.0, 0.0)})
     blind = hand.drift("quiet")
-    found = [BumpResult("a projector", 5.0, 9.0, False, False, 0.0, 4.0, 9, 1.2, 95),
+    found = [BumpResult("a projector", 5.0, (9.0, 9.0), False, False, 0.0, (4.0, 4.0), 9, (1.2, 2.0), 95),
              BumpResult("the camera", 5.0, None, False, False, 0.0)]  # fmt: skip
-    undisturbed, noticed, named, mended = _criteria(1.0, blind, found)
+    undisturbed, noticed, named, mended = _criteria((1.0, 2.0), blind, found)
     assert not undisturbed.holds
     assert not noticed.holds
     assert not named.holds
     assert "the camera by 5 px" in named.reason
     assert not mended.holds
+
+
+def test_a_bump_that_only_the_worst_pixels_show_is_costly_and_without_any_costly_one_nothing_holds() -> None:
+    _, hand = stage()
+    quiet = hand.drift("quiet")
+    mended = BumpResult("a projector", 5.0, (1.1, 3.1), False, True, 5.0, (1.0, 2.6), 9)
+    _, noticed, _, again = _criteria((1.0, 2.0), quiet, [mended])
+    assert (noticed.holds, noticed.reached) == (False, "0 of 1")
+    assert again.holds is False, "0.6 more in 95 %"
+    cheap = BumpResult("a projector", 5.0, (1.1, 2.1), False, True, 5.0, (1.0, 2.0), 9)
+    assert _criteria((1.0, 2.0), quiet, [cheap])[1].holds is False
 
 
 def test_photographs_are_counted_for_every_way_to_calibrate() -> None:
