@@ -138,6 +138,19 @@ def test_an_output_that_goes_is_named_and_shows_the_picture_when_it_is_back(outp
         assert wire.ask("status")["missing_outputs"] == []
 
 
+def test_all_outputs_that_go_are_named_and_show_the_picture_when_they_are_back(outputs: Outputs, play: Start) -> None:
+    with Wire(play().socket) as wire:
+        wire.ask("play", appearance="2")
+        for connector in CONNECTORS:
+            outputs.xrandr("--output", connector, "--off")
+        assert comes_true(lambda: wire.ask("status")["missing_outputs"] == list(NAMES))
+        assert wire.ask("play", appearance="3")["ok"]
+        for number, connector in enumerate(CONNECTORS):
+            outputs.place(connector, number * WIDTH)
+        assert comes_true(lambda: same(shown(outputs), noise(SIZES, 3)))
+        assert wire.ask("status")["missing_outputs"] == []
+
+
 @pytest.mark.parametrize("wrong", ["off", "another size"])
 def test_an_output_that_is_missing_at_the_start_keeps_no_other_dark_and_shows_the_picture_when_it_comes(
     outputs: Outputs, play: Start, wrong: str
