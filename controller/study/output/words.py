@@ -91,8 +91,8 @@ Fainter dots were not tried.""",
 It moves the few centres that dots located badly, so the large errors become smaller (RMSE) and the median hardly
 changes.""",
     ("ablation", "+ smoothness"): """\
-Smoothness removes noise from the frames, and a little detail, too: lambda falls with SSIM. This calibration leaves
-little noise.""",
+Smoothness removes noise from the frames, so that CIEDE2000 and RMSE fall, and a little detail, too: SSIM falls, and so
+does lambda.""",
     ("earlier", "ours is better than: bounded, no pixel model"): """\
 Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
 photographs a projector (see the ablation). Ours is smoothed. In the ablation, smoothness costs SSIM, too, but less
