@@ -131,9 +131,19 @@ class Truth:
 
 
 def _direct_alone(truth: BenchTruth) -> BenchTruth:
-    clear = [dataclasses.replace(one, light=dataclasses.replace(one.light, glare=0.0)) for one in truth.projectors]
+    """Without what goes astray in lenses, which the light that goes straight then lacks."""
+    clear = 1 - truth.camera.glare
+    projectors = []
+    for one in truth.projectors:
+        brightness = clear * (1 - one.light.glare) * one.light.brightness
+        projectors.append(
+            dataclasses.replace(one, light=dataclasses.replace(one.light, glare=0.0, brightness=brightness))
+        )
+    red, green, blue = (clear * value for value in truth.ambient)
     camera = dataclasses.replace(truth.camera, glare=0.0)
-    return dataclasses.replace(truth, indirect=0.0, camera=camera, projectors=tuple(clear))
+    return dataclasses.replace(
+        truth, indirect=0.0, ambient=(red, green, blue), camera=camera, projectors=tuple(projectors)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import IndirectLight, down, up
+from controller.transport.indirect_shape import shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
 from controller.transport.indirect_weights import BlockLight, Part, Term, block_light, fit_weights
 
@@ -57,6 +58,8 @@ def fit_indirect(
         np.sum([w * t.matrix for w, t in zip(weights, terms, strict=True) if t.part in (part, "all")], axis=0)
         for part in ("object", "room")
     )
+    if stripes:
+        own, room = shaped(own, room, (*whites, *stripes), len(whites), grid, side, shape)
     arriving = np.sum([own @ one.own + room @ one.room for one in whites], axis=0)
     falling = up(np.asarray(arriving, np.float32), grid, side, shape)
     faint = FAINTEST * falling.max(initial=0)

@@ -93,7 +93,7 @@ def fit_weights(
         return np.asarray(found * alike, np.float32)
     relative = total / np.sqrt(np.maximum(light, 1e-30))
     # sum of terms (falling_n - part_n falling) = 0, which alone would have the answer 0; the sum of all is 1
-    parts = [_part(one) for one in pictures]
+    parts = [measured_part(one) for one in pictures]
     off = [(one - part * every) * known for one, (part, known) in zip(falling, parts, strict=True)]
     together = _together(terms, alike)
     for _ in range(ROUNDS):
@@ -141,7 +141,7 @@ def _root(products: Float64) -> Float64:
     return np.asarray(np.sqrt(np.maximum(values, 0))[:, None] * vectors.T)
 
 
-def _part(one: BlockLight) -> tuple[FloatImage, FloatImage]:
+def measured_part(one: BlockLight) -> tuple[FloatImage, FloatImage]:
     """(blocks, 3): a picture's share of all whites' indirect light, and 1 where that is known."""
     known = ((one.covered[:, None] > LEAST_DARK) & (one.whole > 0)).astype(np.float32)
     return np.divide(one.seen, one.whole, out=np.zeros_like(one.whole), where=one.whole > 0), known

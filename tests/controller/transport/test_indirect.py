@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from controller.calibrate.values import Calibration, PhaseMap
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.transport.indirect import IndirectLight
+from controller.transport.indirect import IndirectLight, down_up
 from controller.transport.indirect_fit import beside, fit_indirect, form_factors
+from controller.transport.indirect_shape import ALIKE_BLOCKS, PART_NOISE, UNSURE, shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, dark_light, stripe_parts
+from controller.transport.indirect_weights import BlockLight
 from tests.controller.solve.conftest import plane_calibration
 
 SHAPE = (22, 27)
@@ -228,3 +230,82 @@ def test_stripes_make_nothing_worse_where_object_and_room_are_alike() -> None:
     known, blind = with_and_without_stripes(0.5, 0.5, 0.0)
     assert known < 0.01 + blind
     assert known < 0.05
+
+
+class Shapes:
+    """A stage of blocks, whose light between blocks is that of the terms times factors that change slowly."""
+
+    grid, side, shape = (9, 12), 5, (45, 60)
+
+    def __init__(self, seed: int, *, strength: float, stripes: bool = True) -> None:
+        rng = np.random.default_rng(seed)
+        count = self.grid[0] * self.grid[1]
+        row, column = np.divmod(np.arange(count), self.grid[1])
+        apart = np.hypot(np.subtract.outer(row, row), np.subtract.outer(column, column))
+        self.terms = np.asarray(np.exp(-apart / 4) / 20, np.float32)
+        bend = np.cos(column / 5 + rng.uniform(0, 6, count)[:, None]) * np.cos(row / 5 + rng.uniform(0, 6))
+        self.true = np.asarray(self.terms * (1 + strength * bend), np.float32)
+        self.room = np.zeros_like(self.terms)
+        lights = [(column < 8), (column > 3), np.ones(count, np.bool_)]
+        cuts = [column < 6, column >= 6, row < 4, row >= 4, (column // 3) % 2 == 0, (row // 2) % 2 == 0]
+        self.whites = [np.repeat(one[:, None], 3, axis=1).astype(np.float32) for one in lights]
+        self.stripes = [white * cut[:, None] for white in self.whites for cut in cuts] if stripes else []
+        self.whole = self.true @ np.sum(self.whites, axis=0)
+
+    def pictures(self) -> list[BlockLight]:
+        """As measured, without the interpolation between blocks."""
+        none, full = np.zeros_like(self.whole), np.ones(len(self.whole), np.float32)
+        return [BlockLight(one, none, self.true @ one, self.whole, full) for one in (*self.whites, *self.stripes)]
+
+    def corrected(self) -> FloatImage:
+        return shaped(self.terms, self.room, self.pictures(), 3, self.grid, self.side, self.shape)[0]
+
+
+def part_of(factors: FloatImage, light: FloatImage, whole: FloatImage) -> FloatImage:
+    """A picture's part of all whites' indirect light, which the scale makes of it."""
+    return np.asarray((factors @ light) / (factors @ whole), np.float32)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.3, 0.8))
+def test_shape_comes_nearer_for_pictures_that_were_not_measured(seed: int, strength: float) -> None:
+    stage = Shapes(seed, strength=strength)
+    rng = np.random.default_rng(seed + 1)
+    waves = np.kron(rng.random((3, 4)), np.ones((3, 3))).reshape(-1, 1)
+    light, whole = np.repeat(waves, 3, axis=1).astype(np.float32), np.sum(stage.whites, axis=0)
+    wanted = part_of(stage.true, light, whole)
+    before, after = (part_of(one, light, whole) - wanted for one in (stage.terms, stage.corrected()))
+    assert np.sqrt(np.mean(after**2)) < 0.7 * np.sqrt(np.mean(before**2))
+    assert (stage.corrected() >= 0).all()
+
+
+def test_no_shape_is_changed_that_already_fits() -> None:
+    stage = Shapes(4, strength=0.0)
+    across = down_up(stage.grid, stage.side, stage.shape)
+    none, full = np.zeros_like(stage.whole), np.ones(len(stage.whole), np.float32)
+    whole = across(stage.whole)
+    pictures = [BlockLight(one, none, across(stage.true @ one), whole, full) for one in (*stage.whites, *stage.stripes)]
+    found, room = shaped(stage.terms, stage.room, pictures, 3, stage.grid, stage.side, stage.shape)
+    np.testing.assert_allclose(found, stage.terms, rtol=1e-4)
+    np.testing.assert_array_equal(room, 0)
+
+
+def test_a_blocks_factors_are_the_mean_of_the_gaussian_process() -> None:
+    """By the whole covariance between sources, instead of its factors."""
+    stage = Shapes(7, strength=0.5)
+    pictures, block = stage.pictures(), 31
+    across, every = down_up(stage.grid, stage.side, stage.shape), np.sum(stage.whites, axis=0)
+    whole = across(stage.terms @ every)
+    row, column = np.divmod(np.arange(len(stage.terms)), stage.grid[1])
+    apart = np.hypot(np.subtract.outer(row, row), np.subtract.outer(column, column)) / ALIKE_BLOCKS
+    covariance = UNSURE**2 * np.exp(-0.5 * apart.astype(np.float64) ** 2)
+    equations, left = [], []
+    for one in pictures:
+        for channel in range(3):
+            part = float(one.seen[block, channel] / one.whole[block, channel])
+            source = (one.own - part * every)[:, channel] * stage.terms[block] / whole[block, channel]
+            equations.append(source)
+            left.append(part - across(stage.terms @ one.own)[block, channel] / whole[block, channel])
+    a, noise = np.array(equations, np.float64), PART_NOISE**2 * np.eye(len(left))
+    factor = covariance @ a.T @ np.linalg.inv(a @ covariance @ a.T + noise) @ np.array(left)
+    np.testing.assert_allclose(stage.corrected()[block] / stage.terms[block], 1 + factor, atol=3e-3)
