@@ -30,7 +30,11 @@ COARSE: Final = ("phase-x", "phase-y")
 FINE: Final = ("blur-x", "blur-y")
 FAINTEST: Final = 1e-3
 """Of the 99th percentile of white: below it nothing is said from the pixel itself."""
-LEAST_FINE_CONTRAST: Final = 0.03
+LEAST_FINE_CONTRAST: Final = 0.003
+OUT_OF_FOCUS: Final = 0.05, 0.1
+"""Fine contrast of a pixel, up to which its neighbourhood alone tells the blur, and from which it does so itself."""
+AROUND: Final = (15, 15)
+"""Out of focus the fine contrast is below a pixel's noise, but blur changes slowly there."""
 NOISE_WINDOW: Final = (7, 7)
 FLOOR: Final = 0.004
 """Standard deviation of a pixel's share besides noise."""
@@ -48,10 +52,14 @@ SOME_PIXELS: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Sinusoids:
-    """``contrast`` (rows, columns, 3): of both axes, of white; ``sigma`` like it: its standard deviation by noise."""
+    """``contrast`` (rows, columns, 3): of both axes, of white; ``sigma`` like it: its standard deviation by noise;
+
+    ``around`` (rows, columns): the contrast of the light of all pixels around, of all channels together
+    """
 
     contrast: FloatImage
     sigma: FloatImage
+    around: FloatImage
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +104,21 @@ def indirect_share(
     full = np.ones(3) if linearity is None else linearity
     with np.errstate(invalid="ignore", divide="ignore"):
         s = seen.coarse.contrast / full.astype(np.float32)
-        f = np.clip(seen.fine.contrast.mean(axis=2, keepdims=True) / np.float32(full.mean()), LEAST_FINE_CONTRAST, 1.0)
-        f = np.where(np.isfinite(f), f, np.float32(1.0))
+        f = _fine_contrast(seen.fine, float(full.mean()))
         share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
     sigma = np.hypot(seen.coarse.sigma, FLOOR).astype(np.float32)
     known = np.isfinite(share).all(axis=2) & (sigma.max(axis=2) < WORST_SIGMA)
     known &= (white > FAINTEST * _bright(white)).all(axis=2)
     smooth = _smoothed(np.where(known[..., None], share, 0).astype(np.float32), sigma, known, position_px)
     return np.clip(_filled(smooth, known), 0, 1).astype(np.float32)
+
+
+def _fine_contrast(fine: Sinusoids, full: float) -> FloatImage:
+    """(rows, columns, 1) over the channels, 1 where it is not known; from around where the pixel is out of focus."""
+    own, around = fine.contrast.mean(axis=2) / np.float32(full), fine.around / np.float32(full)
+    sharp = np.clip((own - OUT_OF_FOCUS[0]) / (OUT_OF_FOCUS[1] - OUT_OF_FOCUS[0]), 0, 1)
+    mean = (sharp * own + (1 - sharp) * np.minimum(around, OUT_OF_FOCUS[1]))[..., None]
+    return np.asarray(np.where(np.isfinite(mean), np.clip(mean, LEAST_FINE_CONTRAST, 1), 1), np.float32)
 
 
 def shown_contrast(radiometry: Radiometry, encoded_with: Float64) -> Float64:
@@ -146,26 +161,37 @@ def _measured(
     camera: CameraNoise,
 ) -> Sinusoids:
     """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise."""
-    product = np.ones_like(white)
-    noise = np.zeros_like(white)
+    powers, sums = [], []
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
         images = (coloured(captures, step.name, black.shape[:2]) - black for step in steps)
         if plan.computed:  # of one strength already, and adding up to white: none has to be kept
             along, across = _amplitude(images, steps)
-            variance = step_variance(np.nan_to_num(white / 2 + black), camera)
         else:
             kept = list(images)
             kept = [image * np.float32(gain) for image, gain in zip(kept, _gains(kept, white), strict=True)]
             along, across = _amplitude(kept, steps)
-            residual = np.nan_to_num(sum(kept) - np.float32(len(steps) / 2) * white)
-            variance = cv2.boxFilter(residual * residual, -1, NOISE_WINDOW) / np.float32(len(steps))
-        product *= np.maximum(along * along + across * across - np.float32(4 / PHASE_STEPS) * variance, 0)
-        noise += variance / np.float32(len(prefixes))
+            sums.append(sum(kept))
+        powers.append(along * along + across * across)
+    if plan.computed:
+        variance = step_variance(np.nan_to_num(white / 2 + black), camera)
+    else:
+        # both axes add up to the same light: what differs is noise, and not white's
+        residual = np.nan_to_num(sums[0] - sums[1])
+        variance = cv2.boxFilter(residual * residual, -1, NOISE_WINDOW) / np.float32(2 * PHASE_STEPS)
+    powers = [power - np.float32(4 / PHASE_STEPS) * variance for power in powers]
+    product = np.maximum(powers[0], 0) * np.maximum(powers[1], 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         contrast = 2 * product**0.25 / white
-        sigma = 2 * np.sqrt(np.float32(2 / PHASE_STEPS / len(prefixes)) * noise) / white
-    return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32))
+        sigma = 2 * np.sqrt(np.float32(2 / PHASE_STEPS / len(prefixes)) * variance) / white
+    around = np.prod([np.maximum(_light_around(power), 0) for power in powers], axis=0)
+    around = 2 * around**0.25 / np.sqrt(np.maximum(_light_around(white * white), 1e-30))
+    return Sinusoids(*(np.asarray(image, np.float32) for image in (contrast, sigma, around)))
+
+
+def _light_around(image: FloatImage) -> FloatImage:
+    """(rows, columns): of all channels, mean of each pixel's neighbourhood."""
+    return np.asarray(cv2.boxFilter(np.nan_to_num(image).sum(axis=2), -1, AROUND), np.float32)
 
 
 def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[FloatImage, FloatImage]:

@@ -33,6 +33,8 @@ class Room:
     flicker: float = 0.0
     most: float = 0.4
     gamma_error: float = 1.0
+    wall_blur_px: float | None = None
+    """Of the right half, where that is out of focus."""
 
     @property
     def position_px(self) -> FloatImage:
@@ -57,7 +59,9 @@ class Room:
         found = {"black": black}
         for pattern in PLAN.of_kind(PatternKind.SINUSOID):
             along = self.position_px @ np.array(pattern.frequency)
-            kept = np.exp(-2 * (np.pi * np.hypot(*pattern.frequency) * self.blur_px) ** 2)
+            blur_px = np.full(SHAPE, self.blur_px)
+            blur_px[:, SHAPE[1] // 2 :] = self.blur_px if self.wall_blur_px is None else self.wall_blur_px
+            kept = np.exp(-2 * (np.pi * np.hypot(*pattern.frequency) * blur_px) ** 2)
             light = (0.5 + 0.5 * kept * np.cos(2 * np.pi * along - pattern.phase_rad))[..., None] ** self.gamma_error
             mean = np.mean((0.5 + 0.5 * np.cos(np.linspace(0, 2 * np.pi, 999))) ** self.gamma_error)
             lamp = 1 + self.flicker * rng.standard_normal()
@@ -78,6 +82,18 @@ def test_share_is_found_whatever_the_blur(blur_px: float) -> None:
     found = room.found()
     np.testing.assert_allclose(found[5:-5, 5:-5], room.share[5:-5, 5:-5], atol=0.004)
     np.testing.assert_allclose(found, room.share, atol=0.01)
+
+
+@pytest.mark.parametrize("blur_px", [1.8, 2.2, 2.5])
+@pytest.mark.parametrize("white_noise", [0.0, 0.004])
+def test_far_out_of_focus_blur_does_not_count_as_indirect_light(blur_px: float, white_noise: float) -> None:
+    """Of the fine sinusoids less is left there than a pixel's noise, and white's own noise is not theirs."""
+    room = Room(noise=0.004, wall_blur_px=blur_px)
+    noise = white_noise * np.random.default_rng(9).standard_normal(room.white.shape)
+    error = room.found(white=(room.white + noise).astype(np.float32)) - room.share
+    wall = error[8:-8, SHAPE[1] // 2 + 12 : -8]
+    assert abs(float(wall.mean())) < 0.01
+    assert float(np.sqrt((wall**2).mean())) < 0.02
 
 
 def test_noise_is_averaged_over_neighbours_of_any_paint() -> None:
