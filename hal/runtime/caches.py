@@ -141,8 +141,17 @@ def _listening() -> set[str]:
     return {words[7] for line in lines if len(words := line.split(maxsplit=7)) == 8}
 
 
-def _size(folder: Path) -> int:
-    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
+def _size(folder: str | Path) -> int:
+    """Bytes of the files in it. Links are not followed."""
+    size = 0
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                size += _size(entry.path)
+            elif entry.is_file(follow_symlinks=False):
+                with contextlib.suppress(FileNotFoundError):  # its program has just removed it
+                    size += entry.stat(follow_symlinks=False).st_size
+    return size
 
 
 def summary(found: Sequence[StoredFolder]) -> list[str]:
