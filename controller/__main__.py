@@ -5,6 +5,7 @@ Heavy imports are inside the commands, so that ``velatura --help`` is fast.
 
 from __future__ import annotations
 
+import functools
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -281,6 +282,12 @@ def application() -> typer.Typer:
     return app
 
 
+@functools.cache
+def _built() -> Callable[..., Any]:
+    """All commands with their options, read once from the functions: that takes longer than most commands."""
+    return typer.main.get_command(application())
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with a code of ``cli.error_reports``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -293,7 +300,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code. Errors have been shown."""
     as_json = "--json" in arguments
     try:
-        outcome = application()(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
+        outcome = _built()(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
         sys.stdout.flush()
     except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
