@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -28,10 +29,27 @@ FOCAL, CENTRE, K1, K2 = 1100.0, (391.5, 255.0), -0.09, 0.01
 TILTS = ((25, 0), (-25, 5), (5, 28), (-5, -28), (20, 20), (-20, -20), (22, -18), (0, 2))
 
 
+@functools.cache
+def ray_through(dx: float, dy: float) -> npt.NDArray[np.float64]:
+    """Of each pixel, at this place in it: before the lens bends it."""
+    column, row = np.meshgrid(np.arange(SIZE[0]) + dx, np.arange(SIZE[1]) + dy)
+    bent = np.stack([column - CENTRE[0], row - CENTRE[1]], axis=2) / FOCAL
+    flat = bent
+    for _ in range(30):
+        r2 = np.sum(flat**2, axis=2, keepdims=True)
+        flat = bent / (1 + K1 * r2 + K2 * r2**2)
+    return np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=2)
+
+
+@functools.cache
+def printed_board() -> npt.NDArray[np.float32]:
+    return board_picture(2200).astype(np.float32)
+
+
 def photograph(tilt_x: float, tilt_y: float, *, noise: float = 2.0, seed: int = 0) -> Grey:
     """The printed board as a camera sees it: 2 x 2 rays a pixel, traced to the board's plane."""
     rng = np.random.default_rng([seed, int(tilt_x) + 100, int(tilt_y) + 100])
-    paper = board_picture(2200).astype(np.float32)
+    paper = printed_board()
     scale = (SQUARES[0] + 1) / paper.shape[1]
     turn = cv2.Rodrigues(np.radians([tilt_x, tilt_y, rng.uniform(-15, 15)]))[0]
     middle = np.array([rng.uniform(-1, 1), rng.uniform(-0.7, 0.7), 20.0 + rng.uniform(-1, 3)])
@@ -39,13 +57,7 @@ def photograph(tilt_x: float, tilt_y: float, *, noise: float = 2.0, seed: int = 
     grey = np.zeros(SIZE[::-1], dtype=np.float32)
     for dx in offsets:
         for dy in offsets:
-            column, row = np.meshgrid(np.arange(SIZE[0]) + dx, np.arange(SIZE[1]) + dy)
-            bent = np.stack([column - CENTRE[0], row - CENTRE[1]], axis=2) / FOCAL
-            flat = bent
-            for _ in range(30):
-                r2 = np.sum(flat**2, axis=2, keepdims=True)
-                flat = bent / (1 + K1 * r2 + K2 * r2**2)
-            ray = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=2)
+            ray = ray_through(dx, dy)
             reach = (turn[:, 2] @ middle) / (ray @ turn[:, 2])
             on_board = (ray * reach[..., None] - middle) @ turn
             x = on_board[..., 0] / scale + (paper.shape[1] - 1) / 2
