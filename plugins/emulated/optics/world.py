@@ -91,6 +91,8 @@ class World:
         self._bumps_seen = seen
         bumps = read_bumps(path, self._set_up)
         truth = bumped(self._set_up, bumps)
+        if truth == self._truth:
+            return len(bumps.bump)
         samples = self._samples
         if bumps.bump:
             samples = samples_of(truth, object_of(self._stage, truth.object), None, lambda share: None)
