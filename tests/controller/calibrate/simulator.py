@@ -107,6 +107,19 @@ class Scene:
         return np.stack([curve / curve[-1] for curve in curves])
 
 
+@functools.lru_cache(maxsize=8)
+def _lookup(
+    camera_px: tuple[int, int], projector_px: tuple[int, int], scale: float, bend: float, step_px: float
+) -> FloatImage:
+    """Where each subsample of the camera looks in the enlarged picture, by the geometry of a scene."""
+    scene, s = Scene(camera_px, projector_px, scale, bend, step_px), SUPERSAMPLED
+    y, x = np.mgrid[0 : camera_px[1] * s, 0 : camera_px[0] * s]
+    sub = np.stack([(x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5], axis=-1)
+    found: FloatImage = ((scene.projector_of(sub) + 0.5) * ENLARGED - 0.5).astype(np.float32)
+    found.setflags(write=False)
+    return found
+
+
 class Stage:
     """Takes photographs of device frames; values in full scale, clipped at 1."""
 
@@ -115,9 +128,7 @@ class Stage:
         self.random = np.random.default_rng(scene.seed)
         columns, rows = scene.camera_px
         s = SUPERSAMPLED
-        y, x = np.mgrid[0 : rows * s, 0 : columns * s]
-        sub = np.stack([(x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5], axis=-1)
-        self._lookup = ((scene.projector_of(sub) + 0.5) * ENLARGED - 0.5).astype(np.float32)
+        self._lookup = _lookup(scene.camera_px, scene.projector_px, scene.scale, scene.bend, scene.step_px)
         smooth = cv2.resize(self.random.uniform(0.4, 1.0, (rows // 16, columns // 16, 3)), (columns * s, rows * s))
         patches = (
             self.random.uniform(0.5, 1.0, (rows // 10 + 1, columns // 10 + 1, 3)).repeat(10 * s, 0).repeat(10 * s, 1)
@@ -128,28 +139,28 @@ class Stage:
     def light(self, linear: FloatImage) -> FloatImage:
         """Noiseless camera image of a linear frame (rows, columns, 3), without the black level."""
         scene = self.scene
-        u, lit = ENLARGED, scene.lit_share_of_pixel
-        pixel = np.zeros((u, u, 1), np.float32)
-        low = (u - lit) // 2
-        pixel[low : low + lit, low : low + lit] = 1
         mixing = np.array(scene.mixing, np.float32)
         if any(any(shift) for shift in scene.apart_px):
-            parts = [
-                self._seen(np.kron(linear[..., d : d + 1] * mixing[:, d], pixel), scene.apart_px[d]) for d in range(3)
-            ]
+            parts = [self._seen(linear[..., d : d + 1] * mixing[:, d], scene.apart_px[d]) for d in range(3)]
             seen = np.asarray(sum(parts), np.float32)
         else:
-            seen = self._seen(np.kron(linear @ mixing.T, pixel), (0.0, 0.0))
+            seen = self._seen(linear @ mixing.T, (0.0, 0.0))
         blurred = cv2.GaussianBlur(seen * self._albedo, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
         small = cv2.resize(blurred, scene.camera_px, interpolation=cv2.INTER_AREA)
         return np.asarray(scene.exposure * small, np.float32)
 
-    def _seen(self, large: FloatImage, apart_px: tuple[float, float]) -> FloatImage:
-        """What falls where the camera's points look, of an enlarged picture that lies so far to the right and down."""
+    def _seen(self, light: FloatImage, apart_px: tuple[float, float]) -> FloatImage:
+        """What falls where the camera's points look, of pixels of light that lie so far to the right and down."""
         scene = self.scene
+        u, lit = ENLARGED, scene.lit_share_of_pixel
+        low = (u - lit) // 2
+        rows, columns = light.shape[:2]
+        pixels = np.zeros((rows, u, columns, u, 3), np.float32)
+        pixels[:, low : low + lit, :, low : low + lit] = light[:, None, :, None]
+        large: cv2.typing.MatLike = pixels.reshape(rows * u, columns * u, 3)
         if scene.projector_blur_px > 0:
-            large = np.asarray(cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * ENLARGED), np.float32)
-        at = self._lookup - np.float32(ENLARGED) * np.array(apart_px, np.float32)
+            large = cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * u)
+        at = self._lookup - np.float32(u) * np.array(apart_px, np.float32) if any(apart_px) else self._lookup
         seen = cv2.remap(large, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(seen, np.float32)
 
