@@ -36,6 +36,7 @@ def _run(name: str) -> Outcome:
         return subprocess.run(
             [
                 sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
+                "-p", "no:schemathesis",
                 f"--basetemp={base}/pytest", str(FOLDER / name),
             ],
             env={**os.environ, **environment(Path(bus))},
