@@ -1,4 +1,4 @@
-"""Light that takes long to work out, kept for every stage that has the same.
+"""Light and shapes that take long to work out, kept for every stage that has the same.
 
 A stage of the same object, size and seed has the same rays, wherever its folder is. So they are kept in the user's
 cache folder, by what they depend on, and the second stage starts at once.
@@ -27,12 +27,17 @@ UNFINISHED_S: Final = 3600.0
 
 def kept_folder(otherwise: Path) -> Path:
     """The user's folder for it, or ``otherwise`` where that can't be written."""
+    return users_folder() or otherwise
+
+
+def users_folder() -> Path | None:
+    """The user's folder for it; None where that can't be written."""
     try:
         folder = cache_folder() / "bench"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
-        return otherwise
-    return folder if os.access(folder, os.W_OK) else otherwise
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
 def read_kept(folder: Path, kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:

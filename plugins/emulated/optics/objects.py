@@ -15,9 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.errors import DeviceError
+from hal.runtime.compute import digest_of
 from hal.runtime.files import LARGEST_MESH, require_regular
+from plugins.emulated.kept_light import read_kept, users_folder, write_kept
 from plugins.emulated.optics.shapes import Floats, Rgb, bust, dot, length, paint_bust, paint_solid, paint_vase, vase
 
+KIND: Final = "object"
+VASE_AND_BUST: Final = "vase-and-bust"
 HEIGHT_M: Final = 0.30
 WIDTH_M: Final = 0.36
 SHARPEST_CREASE: Final = 0.6
@@ -99,12 +103,27 @@ class StageObject:
 
 @functools.cache
 def default_object() -> StageObject:
-    """The vase and the bust side by side as one mesh."""
+    """The vase and the bust side by side as one mesh.
+
+    Shaping them takes seconds, so they are kept in the user's cache folder until their source changes.
+    """
+    folder, key = users_folder(), digest_of(Path(__file__))
+    arrays = None if folder is None else read_kept(folder, KIND, key)
+    if arrays is not None and {*arrays, "paint"} == set(StageObject.__slots__):
+        return StageObject(paint=VASE_AND_BUST, **arrays)
+    made = _vase_and_bust()
+    if folder is not None:
+        names = set(StageObject.__slots__) - {"paint"}
+        write_kept(folder, KIND, key, {name: getattr(made, name) for name in names})
+    return made
+
+
+def _vase_and_bust() -> StageObject:
     (vase_points, vase_faces), (bust_points, bust_faces) = vase(), bust()
     points = np.concatenate([vase_points, bust_points])
     faces = np.concatenate([vase_faces, bust_faces + len(vase_points)]).astype(np.int32)
     world = (points - (0.0, 0.5 * HEIGHT_M, 0.0)) * (1.0, -1.0, -1.0)
-    return _assembled(world, faces, "vase-and-bust", parts=np.array([0, len(vase_faces)], dtype=np.int32))
+    return _assembled(world, faces, VASE_AND_BUST, parts=np.array([0, len(vase_faces)], dtype=np.int32))
 
 
 def load_object(path: Path) -> StageObject:

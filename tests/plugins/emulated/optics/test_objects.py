@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from hal.errors import DeviceError
-from plugins.emulated.optics.objects import HEIGHT_M, WIDTH_M, StageObject, load_object
+from plugins.emulated.optics.objects import HEIGHT_M, WIDTH_M, StageObject, default_object, load_object
+from plugins.emulated.optics.shapes import Surface, bust
 
 PYRAMID = """
 v 0 0 0
@@ -137,3 +138,27 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path, name: str, content: bytes | 
         load_object(tmp_path / name)
     assert refused.value.code == "object-unreadable"
     assert refused.value.remedy
+
+
+def test_the_default_object_is_kept_and_shaped_again_when_its_file_is_damaged(
+    vase_and_bust: StageObject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VELATURA_CACHE", str(tmp_path))
+    shaped: list[int] = []
+
+    def noted() -> Surface:
+        shaped.append(1)
+        return bust()
+
+    monkeypatch.setattr("plugins.emulated.optics.objects.bust", noted)
+
+    def default() -> list[bytes]:
+        return [array.tobytes() for array in default_object.__wrapped__().fingerprint()]
+
+    wanted = [array.tobytes() for array in vase_and_bust.fingerprint()]
+    assert [default(), default()] == [wanted, wanted]
+    assert shaped == [1]
+    (file,) = (tmp_path / "bench").iterdir()
+    file.write_bytes(file.read_bytes()[:-100])
+    assert default() == wanted
+    assert shaped == [1, 1]
