@@ -26,7 +26,7 @@ EXTRAS: Final = {
 _MODULES: Final = {
     "": "cramjam nacl numpy pyglet xxhash zstandard",
     "controller": "OpenEXR PIL StreamDeck cv2 cycler hid jinja2 llvmlite lz4 matplotlib numba pydantic pydantic_core"
-    " rawpy rich scipy serial skimage tomlkit trimesh typer usb",
+    " rawpy rich scipy serial tomlkit trimesh typer usb",
     "panel": "aiomqtt anyio argon2 multipart prometheus_client python_multipart starlette uvicorn",
     "bench": "embreex tifffile",
     "gphoto2": "gphoto2",

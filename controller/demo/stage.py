@@ -109,7 +109,7 @@ def _read_mark(mark: Path) -> object:
 
 
 def _write_photograph(path: Path) -> None:
-    encoded = np.rint(255 * linear_to_srgb(shipped_photograph("astronaut"))).astype(np.uint8)
+    encoded = np.rint(255 * linear_to_srgb(shipped_photograph())).astype(np.uint8)
     ok, data = cv2.imencode(".png", encoded[..., ::-1])
     assert ok
     write_atomically(path, data.tobytes())

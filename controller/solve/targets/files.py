@@ -1,9 +1,9 @@
-"""Target pictures from files, and the photographs that come with scikit-image."""
+"""Target pictures from files, and the photograph that comes with Velatura."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -15,9 +15,10 @@ from controller.core.errors import UsageError
 from controller.core.files import read_picture_bytes
 from controller.solve.targets.colour import SPACES, ColourSpace, Primaries, decoded
 from controller.solve.targets.profiles import Profile, Unsuitable, embedded_profile, read_profile
-from controller.solve.targets.values import Target, srgb_to_linear
+from controller.solve.targets.values import Target
 
-PHOTOGRAPHS: tuple[str, ...] = ("astronaut", "chelsea", "coffee")
+PHOTOGRAPHS: Final = {"astronaut": Path(__file__).with_name("astronaut.png")}
+"""The astronaut Eileen Collins, photographed by NASA: in the public domain (https://flic.kr/p/r9qvLn). sRGB."""
 _ALLOWED = "EXR, PNG or JPEG"
 
 
@@ -86,17 +87,9 @@ def _read_light(path: Path, colour: ColourSpace | None) -> FloatImage:
         raise Unsuitable("its chromaticities are no colours") from error
 
 
-def shipped_photograph(name: Literal["astronaut", "chelsea", "coffee"] = "astronaut") -> FloatImage:
-    """(rows, columns, 3) float32 linear light in [0, 1]; from scikit-image's own files, nothing is downloaded."""
-    import skimage.data
-
-    if name not in PHOTOGRAPHS:
-        raise UsageError(
-            "photograph-unknown",
-            what=f"The photograph {name!r} is unknown.",
-            remedy=f"Choose one of {', '.join(PHOTOGRAPHS)}, or give a file.",
-        )
-    return srgb_to_linear(np.asarray(getattr(skimage.data, name)()))
+def shipped_photograph(name: Literal["astronaut"] = "astronaut") -> FloatImage:
+    """(512, 512, 3) float32 linear light in [0, 1] of the photograph that comes with Velatura."""
+    return read_picture(PHOTOGRAPHS[name], "srgb")
 
 
 def _read_encoded(path: Path, colour: ColourSpace | None) -> FloatImage:

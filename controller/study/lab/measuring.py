@@ -9,12 +9,11 @@ from typing import Final
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
-from skimage.metrics import structural_similarity
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.report.pictures import Crop, crop_around
 from controller.solve.judged import TITLES, PixelSet, by_pixels
-from controller.solve.metrics import compare, sharpness_around
+from controller.solve.metrics import compare, sharpness_around, structural_similarity
 from controller.solve.targets.values import linear_to_srgb
 from controller.study.lab.subject import ReachableTarget, Subject
 from controller.study.output.drawing import LabelledPicture, detail, screen, strip
@@ -54,15 +53,7 @@ def quality(subject: Subject, achieved: FloatImage, wanted: ReachableTarget, mas
         np.where(mask[..., None], linear_to_srgb(image / np.float32(wanted.white)), 0)
         for image in (achieved, wanted.radiance)
     ]
-    _, local = structural_similarity(  # type: ignore[no-untyped-call]
-        *pictures,
-        channel_axis=2,
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
+    local = structural_similarity(*pictures)
     return Quality(
         found.delta_e00_median, found.delta_e00_p95, found.rmse, float(local[mask].mean()), found.sharpness_lambda,
         pixel_sets(subject, achieved, wanted),

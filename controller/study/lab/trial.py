@@ -31,7 +31,7 @@ class Trial:
 
 def photograph_target(subject: Subject) -> Target:
     """The shipped photograph wrapped on the reconstructed object, as the camera can see it."""
-    return through_camera(wrap_photograph(shipped_photograph("astronaut"), subject.geometry, subject.mask))
+    return through_camera(wrap_photograph(shipped_photograph(), subject.geometry, subject.mask))
 
 
 def live_frames(subject: Subject, base: Base, radiance: FloatImage) -> Sequence[FloatImage]:

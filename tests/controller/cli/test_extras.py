@@ -21,7 +21,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NAMES = {
     "OpenEXR": "openexr", "PIL": "pillow", "StreamDeck": "streamdeck", "argon2": "argon2-cffi", "hid": "hidapi",
     "cv2": "opencv-contrib-python-headless", "multipart": "python-multipart", "nacl": "pynacl", "serial": "pyserial",
-    "prometheus_client": "prometheus-client", "python_multipart": "python-multipart", "skimage": "scikit-image",
+    "prometheus_client": "prometheus-client", "python_multipart": "python-multipart",
     "usb": "pyusb", "flip_evaluator": "flip-evaluator", "pythonosc": "python-osc",
 }  # fmt: skip
 """The distribution of a module, where it is called otherwise."""

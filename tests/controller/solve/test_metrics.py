@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from skimage.color import deltaE_ciede2000, rgb2lab
+from skimage.metrics import structural_similarity as scikit_images_similarity
 
 from controller.core.errors import UsageError
-from controller.solve.metrics import colour_difference, compare, lab_of, sharpness
+from controller.solve.metrics import colour_difference, compare, lab_of, sharpness, structural_similarity
 
 SRGB = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
@@ -27,6 +28,17 @@ def test_lab_agrees_with_an_independent_conversion_and_with_any_exposure() -> No
     linear = np.random.default_rng(0).random((5, 6, 3)).astype(np.float32)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(lab_of(linear * 0.3, SRGB, 0.3), rgb2lab(encoded), atol=0.05)
+
+
+def test_structural_similarity_agrees_with_scikit_images() -> None:
+    one = np.clip(linear_picture(), 0, 1)
+    other = np.clip(one + np.random.default_rng(1).normal(0, 0.1, one.shape), 0, 1).astype(np.float32)
+    _, theirs = scikit_images_similarity(  # type: ignore[no-untyped-call]
+        one, other, channel_axis=2, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
+    )
+    ours = structural_similarity(one, other)
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert ours.min() < 0.5 < ours.max()
 
 
 def test_a_published_pair_has_its_published_difference() -> None:
