@@ -61,7 +61,7 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class SearchScope:
     """Where to search. ``stage``: relative paths start there; ``known``: the devices of its stage.toml.
 
     ``serial_ports``: the folder with stable names of serial ports; ``search``: (host, UDP port) of the search
@@ -88,10 +88,10 @@ class Finder:
     """The object of an entry point. ``find`` raises DeviceError if the bus itself can't be searched, and Cancelled."""
 
     bus: str
-    find: Callable[[Wanted, Deadline], Sequence[Found]]
+    find: Callable[[SearchScope, Deadline], Sequence[Found]]
 
 
-def search_bus(finder: Finder, wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def search_bus(finder: Finder, wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """The devices of ``finder``. Raises as ``Finder.find``, and DriverFault for other errors or wrong results."""
     caller = Caller(f"The finder for {finder.bus}")
     return cast("Sequence[Found]", caller.call("find", finder.find, Sequence[Found], wanted, deadline))

@@ -15,7 +15,7 @@ from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.solve import appearance
 from controller.solve.appearance import Base
 from controller.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, Solution, solve_bounded
-from controller.solve.exposed import exposed
+from controller.solve.exposed import expose_target
 from controller.solve.feasibility import target_radiance
 from controller.solve.scaling.dither import to_device
 from controller.transport import LightTransport
@@ -62,7 +62,7 @@ def reachable_target(
     """
     wanted = as_image(picture)
     dark = _black(black, wanted)
-    found = exposed(transport, wanted, dark, share=share, indirect=indirect)
+    found = expose_target(transport, wanted, dark, share=share, indirect=indirect)
     radiance, direct = (target_radiance(image, dark, 1.0) for image in (found.wanted, found.needed))
     return ReachableTarget(radiance, found.exposure, found.possible.reachable, found.possible.share, direct)
 

@@ -7,13 +7,22 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 
 FINEST_PX: Final = 4.0
 """Standard deviation in pixels of the smaller picture: so wide a Gaussian is not seen to have been sampled."""
 
 REACH: Final = 3.0
 """Standard deviations beyond which nothing counts."""
+LEAST_NEAR: Final = 1e-4
+"""Share of a Gaussian that has to be in a mask for a mean over it."""
+
+
+def masked_blur(image: FloatImage, mask: Mask, sigma_px: float) -> FloatImage:
+    """Gaussian means of ``image`` (rows, columns, channels) over the pixels of ``mask`` alone; 0 where none is near."""
+    total = gaussian_blur(np.where(mask[..., None], image, 0).astype(np.float32), sigma_px)
+    near = gaussian_blur(mask.astype(np.float32), sigma_px)[..., None]
+    return np.asarray(np.divide(total, near, out=np.zeros_like(total), where=near > LEAST_NEAR), np.float32)
 
 
 def gaussian_blur(image: FloatImage, sigma_px: float) -> FloatImage:

@@ -23,7 +23,7 @@ from controller.stage.check import Checked, check_stage
 from controller.stage.run import LOCK
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
-from hal.finding import Finder, Found, Known, Problem, Wanted, load_finders, search_bus
+from hal.finding import Finder, Found, Known, Problem, SearchScope, load_finders, search_bus
 from hal.registry import Drivers, load_drivers
 
 LONGEST_S: Final = 300.0
@@ -60,7 +60,7 @@ def examine(
             stack.enter_context(exclusive(folder / LOCK, what_is_running="Velatura"))
         checked, wrong = _checked(folder, tools) if stage is not None else (None, [])
         search = (search_address(network), PJLINK) if network else None
-        wanted = Wanted(folder, _known(checked), **{"search": search, **(tools.wanted or {})})
+        wanted = SearchScope(folder, _known(checked), **{"search": search, **(tools.wanted or {})})
         _say_what_is_sent(wanted, reporter)
         found, problems = _search(wanted, tools.finders, deadline, reporter)
         seen = _compared(checked, found, [*wrong, *problems], tools)
@@ -74,7 +74,7 @@ def examine(
     return seen
 
 
-def _say_what_is_sent(wanted: Wanted, reporter: Reporter) -> None:
+def _say_what_is_sent(wanted: SearchScope, reporter: Reporter) -> None:
     """Name every place outside this computer that gets a message."""
     addresses = [
         str(place) for one in wanted.known for place in (one.settings.get("address"), one.settings.get("port"))
@@ -112,7 +112,7 @@ def _known(checked: Checked | None) -> tuple[Known, ...]:
 
 
 def _search(
-    wanted: Wanted, finders: Sequence[Finder] | None, deadline: Deadline, reporter: Reporter
+    wanted: SearchScope, finders: Sequence[Finder] | None, deadline: Deadline, reporter: Reporter
 ) -> tuple[list[Found], list[Finding]]:
     """Search all buses in parallel, because most of the time is spent waiting for answers."""
     broken: tuple[Problem, ...] = ()

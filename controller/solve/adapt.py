@@ -24,7 +24,7 @@ from controller.core.channels import largest
 from controller.core.errors import UsageError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.smooth_limits import Sheet
+from controller.solve.smooth_limits import SmoothLimits
 from controller.transport import LightTransport
 
 KNEE: Final = 0.8
@@ -74,27 +74,31 @@ def adapted_target(
     drive = DriveLevels(transport) if drive is None else drive
     if strength == 0 or not drive.mask.any():
         return np.asarray(wanted, np.float32)
-    sheet = Sheet.on(drive.mask)
+    limits = SmoothLimits.on(drive.mask)
     asked = np.maximum(wanted, 0)
-    lifted, lowest = _lifted(asked, floor, drive, sheet)
-    paler = _paler(lifted, lowest, floor, drive, sheet)
-    bent = _dimmed(paler, floor, drive, sheet)
+    lifted, lowest = _lifted(asked, floor, drive, limits)
+    paler = _paler(lifted, lowest, floor, drive, limits)
+    bent = _dimmed(paler, floor, drive, limits)
     changed = np.where(drive.mask[..., None], wanted + np.float32(strength) * (bent - wanted), wanted)
     return np.asarray(changed, np.float32)
 
 
-def _lifted(wanted: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sheet) -> tuple[FloatImage, FloatImage]:
+def _lifted(
+    wanted: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits
+) -> tuple[FloatImage, FloatImage]:
     """``wanted`` with its darkest parts raised by grey light, and (rows, columns) the darkest grey of each pixel."""
     grey = wanted @ GREY
     lowest = _quotient(drive.of(floor), drive.of(np.ones_like(wanted)), otherwise=0.0)
     lowest = np.maximum(largest(lowest), 0)
     lacking = drive.mask & (grey < lowest)
-    level = sheet.above(np.where(lacking, lowest, 0).astype(np.float32))
+    level = limits.above(np.where(lacking, lowest, 0).astype(np.float32))
     raised = _soft_maximum(grey, level)
     return np.asarray(wanted + (raised - grey)[..., None], np.float32), np.maximum(lowest, level)
 
 
-def _paler(lifted: FloatImage, lowest: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sheet) -> FloatImage:
+def _paler(
+    lifted: FloatImage, lowest: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits
+) -> FloatImage:
     """With less chroma where a channel would have to be darker than dark.
 
     A channel's share of grey light says how saturated a colour is; the limit is on the smallest of these shares.
@@ -109,14 +113,14 @@ def _paler(lifted: FloatImage, lowest: FloatImage, floor: FloatImage, drive: Dri
     for channel in range(3):
         own = share[..., channel]
         need = own + clear * (1 - kept[..., channel]) * (1 - own)
-        limit = sheet.above(np.where(lacking[..., channel] & (own < 1), need, 0).astype(np.float32))
+        limit = limits.above(np.where(lacking[..., channel] & (own < 1), need, 0).astype(np.float32))
         raised = np.minimum(_soft_maximum(own, limit), 1)
         chroma = np.minimum(chroma, _quotient(1 - raised, 1 - own, otherwise=1.0, where=own < 1))
     # Written so that full chroma leaves every bit as it is.
     return np.asarray(lifted + (1 - np.clip(chroma, 0, 1))[..., None] * (grey - lifted), np.float32)
 
 
-def _dimmed(target: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sheet) -> FloatImage:
+def _dimmed(target: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits) -> FloatImage:
     """With its brightest parts bent below a smooth ceiling."""
     levels = drive.of(target - floor)
     over = drive.mask[..., None] & (levels > 1 + FORGIVEN)
@@ -125,7 +129,7 @@ def _dimmed(target: FloatImage, floor: FloatImage, drive: DriveLevels, sheet: Sh
     most = np.maximum(floor + drive.light(np.clip(levels, 0, 1)), np.float32(1e-12))
     top = np.float32(target[drive.mask].max() / KNEE)
     depth = np.where(over, np.clip(np.log(top / most), 0, DEEPEST), 0).astype(np.float32)
-    ceiling = top * np.exp(-np.stack([sheet.above(depth[..., channel]) for channel in range(3)], axis=2))
+    ceiling = top * np.exp(-np.stack([limits.above(depth[..., channel]) for channel in range(3)], axis=2))
     of_ceiling = target / ceiling
     gain = _quotient(_shoulder(of_ceiling), of_ceiling, otherwise=1.0)
     together = gain.min(axis=2, keepdims=True)

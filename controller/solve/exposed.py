@@ -15,7 +15,7 @@ from controller.transport.indirect import IndirectLight
 
 
 @dataclass(frozen=True, slots=True)
-class Exposed:
+class ExposedTarget:
     """A target at its exposure, (rows, columns, 3) radiance.
 
     ``wanted``: the whole picture; ``needed``: what of it has to come from the projectors directly, with the black
@@ -28,7 +28,7 @@ class Exposed:
     possible: Feasibility
 
 
-def exposed(
+def expose_target(
     transport: LightTransport,
     picture: FloatImage,
     black: FloatImage,
@@ -36,7 +36,7 @@ def exposed(
     share: float,
     drive: DriveLevels | None = None,
     indirect: IndirectLight | None = None,
-) -> Exposed:
+) -> ExposedTarget:
     """Expose ``picture`` (rows, columns, 3), reflectance-like, so that ``share`` of the object can be that bright.
 
     With ``indirect`` light a pixel is too dark, too, where more of it falls than is wanted. Raises what
@@ -46,7 +46,7 @@ def exposed(
     found = exposure(transport, picture, black, share=share, drive=drive, indirect=indirect)
     wanted = np.float32(found) * picture
     needed = direct_part(transport, wanted, black, indirect)
-    return Exposed(found, wanted, needed, feasibility(transport, needed, black, drive=drive))
+    return ExposedTarget(found, wanted, needed, feasibility(transport, needed, black, drive=drive))
 
 
 def direct_part(

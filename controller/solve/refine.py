@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.core.blur import gaussian_blur
+from controller.core.blur import masked_blur
 from controller.core.channels import finite
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
@@ -86,14 +86,14 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     if not measured.any():
         return measured
     scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
-    error = smoothed(photograph.radiance - predicted, measured, EDGE_PX) / scale
+    error = masked_blur(photograph.radiance - predicted, measured, EDGE_PX) / scale
     inside = error[measured]
     middle = np.median(inside, axis=0)
     spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
     limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
     strange = measured & (np.abs(error - middle) > limit).any(axis=2)
     both = measured & finite(photograph.first) & finite(photograph.last)
-    moved = smoothed(np.abs(smoothed(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
+    moved = masked_blur(np.abs(masked_blur(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
     noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
     strange |= both & (moved > CHANGED * scale + noise).any(axis=2)
     core = cv2.morphologyEx(strange.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OUTLIER_PX, OUTLIER_PX), np.uint8))
@@ -118,19 +118,12 @@ def refusal(
     return None
 
 
-def smoothed(image: FloatImage, mask: Mask, sigma_px: float) -> FloatImage:
-    """Gaussian means over the pixels of ``mask`` alone, (rows, columns, 3); 0 where none is near."""
-    total = gaussian_blur(np.where(mask[..., None], image, 0).astype(np.float32), sigma_px)
-    near = gaussian_blur(mask.astype(np.float32), sigma_px)[..., None]
-    return np.asarray(np.divide(total, near, out=np.zeros_like(total), where=near > 1e-4), np.float32)
-
-
 def noise_variance(sigma: FloatImage, mask: Mask, scale_px: float) -> FloatImage:
     """Variance of a photograph's noise in means over a Gaussian of ``scale_px``, 0 for single pixels."""
     variance = np.where(np.isfinite(sigma), sigma, 0) ** 2
     if scale_px <= 0:
         return np.asarray(variance, np.float32)
-    return smoothed(variance, mask, scale_px) * np.float32(min(1.0, SAMPLES_A_SITE / (4 * np.pi * scale_px**2)))
+    return masked_blur(variance, mask, scale_px) * np.float32(min(1.0, SAMPLES_A_SITE / (4 * np.pi * scale_px**2)))
 
 
 def without_noise(error: FloatImage, sigma: FloatImage, mask: Mask) -> FloatImage:
@@ -139,7 +132,7 @@ def without_noise(error: FloatImage, sigma: FloatImage, mask: Mask) -> FloatImag
     In bands from wide to fine; of each, what its local energy has above the noise's (a Wiener filter in each band), so
     that a clear error keeps its edges, and nothing is made of noise.
     """
-    means = [np.where(mask[..., None], error, 0), *(smoothed(error, mask, scale) for scale in SCALES_PX)]
+    means = [np.where(mask[..., None], error, 0), *(masked_blur(error, mask, scale) for scale in SCALES_PX)]
     scales = (0.0, *SCALES_PX)
     found = _shrunk(means[-1], sigma, mask, scales[-1], 2 * scales[-1])
     for finer in reversed(range(len(SCALES_PX))):
@@ -151,7 +144,7 @@ def without_noise(error: FloatImage, sigma: FloatImage, mask: Mask) -> FloatImag
 
 
 def _shrunk(band: FloatImage, sigma: FloatImage, mask: Mask, scale_px: float, window_px: float) -> FloatImage:
-    energy = smoothed(band**2, mask, window_px)
+    energy = masked_blur(band**2, mask, window_px)
     noise = NOISE_FACTOR * noise_variance(sigma, mask, scale_px)
     share = np.maximum(energy - noise, 0) / np.maximum(energy, np.finfo(np.float32).tiny)
     return np.asarray(share * band, np.float32)

@@ -30,7 +30,7 @@ from controller.solve.bounded.solver import TOLERANCE
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
 from controller.solve.engines.processor import Engine
-from controller.solve.exposed import direct_part, exposed
+from controller.solve.exposed import direct_part, expose_target
 from controller.solve.feasibility import Feasibility, feasibility, target_radiance
 from controller.solve.targets.values import Target
 from controller.transport import LightTransport
@@ -169,7 +169,7 @@ def aim_at(
     With ``indirect`` light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
     dark, too, where more indirect light falls than is wanted. Raises what ``choose_exposure`` raises.
     """
-    found = exposed(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
+    found = expose_target(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
     wanted, needed, possible = found.wanted, found.needed, found.possible
     figures: dict[str, float | int | str | None] = {"exposure": found.exposure, "reachable_share": possible.share}
     if options.adapt > 0:

@@ -32,7 +32,7 @@ SOFT_CELLS: Final = 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sheet:
+class SmoothLimits:
     """The cells of one object, for any number of limits.
 
     ``mask`` (rows, columns) of the object; ``side`` of a cell in pixels; ``cells`` (rows, columns of cells): those with

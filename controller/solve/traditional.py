@@ -14,7 +14,7 @@ from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.checks import check_image
 from controller.core.errors import UsageError
-from controller.solve.exposed import Exposed, exposed
+from controller.solve.exposed import ExposedTarget, expose_target
 from controller.transport import build_transport
 from controller.transport.indirect import IndirectLight
 
@@ -53,14 +53,14 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
 
 def exposed_for_one(
     calibration: Calibration, picture: FloatImage, n: int, *, share: float, indirect: IndirectLight | None = None
-) -> Exposed:
+) -> ExposedTarget:
     """``picture`` (rows, columns, 3), like reflectance, as bright as projector ``n`` can make it alone.
 
     By the same rule as for all projectors: ``share`` of the pixels that it lights are in reach. At a higher exposure
-    the comparison would only show that one lamp is darker than several. Raises what ``solve.exposed.exposed`` raises.
+    the comparison would only show that one lamp is darker than several. Raises what ``expose_target`` raises.
     """
     alone = build_transport(dataclasses.replace(calibration, projectors=(calibration.projectors[n],)))
-    return exposed(alone, picture, calibration.black, share=share, indirect=indirect)
+    return expose_target(alone, picture, calibration.black, share=share, indirect=indirect)
 
 
 def _sampled(

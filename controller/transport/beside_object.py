@@ -31,7 +31,7 @@ makes less of it in the dark."""
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class OffObject:
     """``pixels`` (pixels of all projectors) bool: the camera sees their light mostly beside the object.
 
     ``camera`` (projectors, camera rows, columns) bool: camera pixels that see such light of a projector
@@ -41,7 +41,7 @@ class Beside:
     camera: Mask
 
 
-def beside_object(calibration: Calibration) -> Beside | None:
+def beside_object(calibration: Calibration) -> OffObject | None:
     """None if no projector pixel is beside the object: as in a dark room, where the camera sees nothing there."""
     mask = calibration.object_mask.astype(np.uint8)
     around = np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)
@@ -58,7 +58,7 @@ def beside_object(calibration: Calibration) -> Beside | None:
                 camera[n][seen] = found.ravel()[cells[seen]]
         pixels.append(found.ravel())
     every = np.concatenate(pixels)
-    return Beside(every, camera) if every.any() else None
+    return OffObject(every, camera) if every.any() else None
 
 
 def _beside(on: FloatImage, off: FloatImage) -> Mask:

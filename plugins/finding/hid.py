@@ -12,7 +12,7 @@ from hal.codecs.hid import relay as hid_relay
 from hal.codecs.ptp.values import printable
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError, DeviceTimeout
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from plugins.finding.access import forbidden, holders
 from plugins.hid.link import BACKENDS, HidHandle
 from plugins.worker_link import WorkerLink
@@ -39,7 +39,7 @@ class _Hidapi(WorkerLink[Any]):
         """Nothing to close."""
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Every HID device that could be supported. Raises DeviceError if hidapi is missing or hangs."""
     with contextlib.closing(_Hidapi("list of HID devices")) as listing:
         entries = listing.call(lambda hidapi: list(hidapi.enumerate()), deadline=deadline.within(LISTING_S))

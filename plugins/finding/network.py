@@ -10,7 +10,7 @@ from typing import Any, Final
 from hal.codecs.projectors.pjlink import PORT
 from hal.deadline import Deadline
 from hal.errors import DeviceError
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from hal.links import host_and_port
 from hal.registry import OpenContext
 from plugins.projectors.pjlink import open_pjlink_projector
@@ -19,7 +19,7 @@ from plugins.projectors.pjlink_listener import PjLinkListener
 ANSWER_S: Final = 8.0
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Projectors that answer the search (class 2), and those in stage.toml (any class)."""
     known = {str(settings.get("address", "")): settings for settings in wanted.of("projector", "pjlink")}
     found = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
@@ -40,7 +40,7 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
     return found
 
 
-def _searched(wanted: Wanted, deadline: Deadline) -> list[tuple[str, str]]:
+def _searched(wanted: SearchScope, deadline: Deadline) -> list[tuple[str, str]]:
     if wanted.search is None:
         return []
     with PjLinkListener(*wanted.listen) as listener:
@@ -48,7 +48,7 @@ def _searched(wanted: Wanted, deadline: Deadline) -> list[tuple[str, str]]:
         return [(answer.host, answer.mac) for answer in answers]
 
 
-def _tried(address: str, settings: Mapping[str, Any], wanted: Wanted, deadline: Deadline) -> Found:
+def _tried(address: str, settings: Mapping[str, Any], wanted: SearchScope, deadline: Deadline) -> Found:
     table = {"address": address, **{key: value for key, value in settings.items() if key in ("password", "profile")}}
     found = Found("network", address, "PJLink projector", "projector", "pjlink", table)
     try:

@@ -12,7 +12,7 @@ from typing import Final
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceTimeout
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 
 PATIENCE_S: Final = 5.0
 _OUTPUT: Final = re.compile(
@@ -20,7 +20,7 @@ _OUTPUT: Final = re.compile(
 )
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Connected outputs; empty without an X server, for example with frames in memory."""
     program = shutil.which("xrandr")
     if not os.environ.get("DISPLAY") or program is None:

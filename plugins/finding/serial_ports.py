@@ -22,7 +22,7 @@ from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from hal.serial_link import SerialLink
 from plugins.finding.access import forbidden, holders
 from plugins.projectors.messages import read_message
@@ -60,7 +60,7 @@ class Heard:
     unasked: bool = False
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Every serial port of this machine and of stage.toml."""
     profiles = [load_profile(name, wanted.stage) for name in shipped_profiles()]
     profiles = [profile for profile in profiles if profile.serial is not None and profile.serial.baud]
@@ -68,7 +68,7 @@ def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
         return list(pool.map(lambda port: _found(port, wanted, profiles, deadline), _ports(wanted)))
 
 
-def _ports(wanted: Wanted) -> list[Port]:
+def _ports(wanted: SearchScope) -> list[Port]:
     """Each port once, although it has many names: first by its name in stage.toml, then by its stable name."""
     ports: dict[str, Port] = {}
     for settings in wanted.of("projector", "serial"):
@@ -90,7 +90,7 @@ def _ports(wanted: Wanted) -> list[Port]:
     return list(ports.values())[:MOST_PORTS]
 
 
-def _found(port: Port, wanted: Wanted, profiles: Sequence[ProjectorProfile], deadline: Deadline) -> Found:
+def _found(port: Port, wanted: SearchScope, profiles: Sequence[ProjectorProfile], deadline: Deadline) -> Found:
     problem = forbidden(port.path, "serial port", RULES, "tty") if port.path.exists() else None
     if problem is not None:
         return Found("serial", port.name, port.what, identity=port.name, problems=(problem,))

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from plugins.finding.access import forbidden, holders, running
 from plugins.ptp.usb.bus import UsbCamera, usb_cameras
 
@@ -17,7 +17,7 @@ MONITORS: Final = ("gvfs-gphoto2-volume-monitor", "gvfsd-gphoto2", "gphoto2", "d
 """Programs that claim a camera when it is plugged in, or while they run."""
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Every still camera and its problems. Nothing is sent to a camera."""
     found = []
     for camera in usb_cameras():

@@ -7,11 +7,11 @@ from typing import Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from plugins.v4l2.nodes import identify_path, paths
 
 
-def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Every video device that takes pictures, and its problems."""
     found = []
     for path in paths():

@@ -75,7 +75,7 @@ def test_each_bump_is_told_from_the_others_and_measured(bumpy: Bumpy) -> None:
     bumpy.bump(LEFT, Bump("projector", "above", dim=0.1, dim_channels=(0.0, 0.0, 0.1)))
     found = bumpy.drift()
     left, right, above = (found["projectors"][name] for name in ("left", "right", "above"))
-    assert (found["culprit"], found["advice"], found["photographs"]) == ("nobody", "quick", 5)
+    assert (found["culprit"], found["advice"], found["photographs"]) == (None, "quick", 5)
     assert left["shift_px"] == pytest.approx((1.2, -0.7), abs=0.06)
     assert above["gain"] == pytest.approx((0.9, 0.9, 0.81), abs=0.006)
     assert (left["moved"], left["dimmed"]) == (True, False)

@@ -24,7 +24,7 @@ from controller.core.errors import VelaturaError
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
-from hal.finding import Wanted
+from hal.finding import SearchScope
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
 from plugins.finding import video
@@ -202,7 +202,7 @@ def test_a_finished_picture_is_a_jpeg_and_the_camera_has_no_raw(
 
 
 def test_the_finder_names_both_and_how_to_use_them(cable: list[Cable], vivid: Path) -> None:
-    found = video.find(Wanted(Path()), in_seconds(PATIENCE_S))
+    found = video.find(SearchScope(Path()), in_seconds(PATIENCE_S))
     tables = {one.driver: one for one in found}
     assert tables.keys() == {"v4l2"}
     assert {one.identity for one in found} >= {"UVC-7"}

@@ -103,7 +103,7 @@ class ProjectorDrift:
 class DriftCause(enum.Enum):
     """What shifted the picture as a whole."""
 
-    NONE = "nobody"
+    NONE = "none"
     CAMERA = "camera"
     OBJECT = "object"
     UNKNOWN = "unknown"

@@ -104,13 +104,13 @@ def _of_projector(projector: ProjectorDrift) -> list[str]:
 
 
 def drift_to_json(drift: Drift, *, calibration: str, photographs: int) -> dict[str, Any]:
-    """For ``drift.json``; a figure that could not be found is null."""
+    """For ``drift.json``. A figure that is unknown is null; so is ``culprit`` where neither camera nor object moved."""
     content = {
         "calibration": calibration,
         "photographs": photographs,
         "advice": advice(drift),
         "sentences": sentences(drift),
-        "culprit": drift.culprit.value,
+        "culprit": None if drift.culprit is DriftCause.NONE else drift.culprit.value,
         "camera": {**_motion(drift.camera), "moved": drift.culprit in (DriftCause.CAMERA, DriftCause.UNKNOWN)},
         "ambient_share": drift.ambient_share,
         "ambient_ratio": drift.ambient_ratio,
@@ -143,6 +143,10 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _cause(said: str | None) -> DriftCause:
+    return DriftCause.NONE if said in (None, "nobody") else DriftCause(said)  # "nobody": files from before 0.2.0
+
+
 def drift_from_json(content: Mapping[str, Any]) -> Drift:
     """What ``drift_to_json`` made."""
     return Drift(
@@ -154,7 +158,7 @@ def drift_from_json(content: Mapping[str, Any]) -> Drift:
             for name, row in content["projectors"].items()
         ),
         camera=_motion_of(content["camera"]),
-        culprit=DriftCause(content["culprit"]),
+        culprit=_cause(content["culprit"]),
         ambient_share=_number(content["ambient_share"]),
         ambient_ratio=_number(content["ambient_ratio"]),
     )  # fmt: skip

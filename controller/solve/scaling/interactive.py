@@ -34,7 +34,7 @@ from controller.solve.appearance import Base
 from controller.solve.bounded.solver import check_target
 from controller.solve.scaling.kernels import (
     MARGIN,
-    Thrown,
+    ReflectedLight,
     scale_picture,
     scale_plainly,
     scale_twos,
@@ -91,7 +91,7 @@ class Interactive:
         self._gain = _padded(maps.gain.astype(np.float32) * brightness_factor(maps, 1.0))
         self._offset = _padded(maps.offset.astype(np.float32))
         self._used = _used(maps)
-        self._thrown = _thrown(maps)
+        self._reflected = _reflected(maps)
         self._outputs = tuple(self._prepared(output) for output in maps.outputs)
         self._table = light_table()
 
@@ -131,17 +131,17 @@ class Interactive:
         )
         light = np.float32(brightness) * self._table
         pixels = np.ascontiguousarray(picture, np.uint8)
-        indirect, thrown = self.maps.indirect, self._thrown
+        indirect, reflected = self.maps.indirect, self._reflected
         if indirect is not None:
-            thrown = _with(thrown, indirect, light[indirect.samples(pixels)])
+            reflected = _with(reflected, indirect, light[indirect.samples(pixels)])
         maps = self._gain, self._offset, self._used
-        scale_picture(pixels, light, self._block, *maps, self._side, self._scale, thrown)
+        scale_picture(pixels, light, self._block, *maps, self._side, self._scale, reflected)
         self._show(into)
 
-    def _of(self, light: FloatImage) -> Thrown:
+    def _of(self, light: FloatImage) -> ReflectedLight:
         """What surfaces throw back where a radiance (height, width, 3) of the targets' size is seen."""
         indirect = self.maps.indirect
-        return self._thrown if indirect is None else _with(self._thrown, indirect, indirect.samples(light))
+        return self._reflected if indirect is None else _with(self._reflected, indirect, indirect.samples(light))
 
     def _show(self, into: Sequence[ByteImage]) -> None:
         for output, frame in zip(self._outputs, into, strict=True):
@@ -212,21 +212,21 @@ def _used(maps: LiveMaps) -> npt.NDArray[np.int32]:
     return np.stack([np.where(found, first, 0), np.where(found, last, 0)], 1).astype(np.int32)
 
 
-def _thrown(maps: LiveMaps) -> Thrown:
+def _reflected(maps: LiveMaps) -> ReflectedLight:
     """Without what falls, which differs from picture to picture."""
     empty = np.zeros(0, np.float32)
     indirect, gain = maps.indirect, maps.gain.astype(np.float32)
     if indirect is None:
-        return Thrown(empty, np.zeros((0, 0), np.float32), np.zeros(0, np.int32), empty)
+        return ReflectedLight(empty, np.zeros((0, 0), np.float32), np.zeros(0, np.int32), empty)
     surface = np.divide(indirect.surface.astype(np.float32), gain, out=np.zeros_like(gain), where=gain > 0)
     rows = between(maps.target_px[1], indirect.grid[0], indirect.side)
-    return Thrown(surface.ravel(), np.zeros((indirect.grid[0], 3 * maps.target_px[0]), np.float32), *rows)
+    return ReflectedLight(surface.ravel(), np.zeros((indirect.grid[0], 3 * maps.target_px[0]), np.float32), *rows)
 
 
-def _with(thrown: Thrown, indirect: LiveIndirect, light: FloatImage) -> Thrown:
+def _with(reflected: ReflectedLight, indirect: LiveIndirect, light: FloatImage) -> ReflectedLight:
     """With what falls where samples have that radiance."""
     across = indirect.across(indirect.falling(light))
-    return thrown._replace(falling=across.reshape(len(across), -1))
+    return reflected._replace(falling=across.reshape(len(across), -1))
 
 
 def _padded(values: FloatImage) -> FloatImage:

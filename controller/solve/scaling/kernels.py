@@ -25,7 +25,7 @@ _REACH, _RADIUS, _CORRELATION = np.float32(REACH), np.float32(MOST_RADIUS_PX), n
 Used = npt.NDArray[np.int32]
 
 
-class Thrown(NamedTuple):
+class ReflectedLight(NamedTuple):
     """Light by way of other surfaces, as the loops take it off the wanted light; of no size where there is none.
 
     ``surface`` (3 x target pixels,): what a pixel makes of falling light; ``falling`` (grid rows, 3 x columns): that
@@ -40,14 +40,14 @@ class Thrown(NamedTuple):
 
 
 @compiled()
-def thrown_back(thrown: Thrown, row: int, first: Index, last: Index, out: FloatImage) -> None:
+def reflected_row(reflected: ReflectedLight, row: int, first: Index, last: Index, out: FloatImage) -> None:
     """Light by way of other surfaces in a row of the target, at columns ``first`` to ``last``; ``out`` is a row."""
-    i, part, values = np.int64(thrown.up[row]), thrown.part_up[row], thrown.falling.shape[1]
+    i, part, values = np.int64(reflected.up[row]), reflected.part_up[row], reflected.falling.shape[1]
     # slices that begin with the first element: an index that might be negative can't be vectorised
     start, end = 3 * first, 3 * last
-    above = thrown.falling[i, start:end]
-    below = thrown.falling[min(i + 1, thrown.falling.shape[0] - 1), start:end]
-    surface = thrown.surface[row * values + start : row * values + end]
+    above = reflected.falling[i, start:end]
+    below = reflected.falling[min(i + 1, reflected.falling.shape[0] - 1), start:end]
+    surface = reflected.surface[row * values + start : row * values + end]
     taken = out[start:end]
     for k in range(taken.size):
         taken[k] = surface[k] * (above[k] + part * (below[k] - above[k]))
@@ -86,7 +86,7 @@ def scale_plainly(
     used: Used,
     side: int,
     scale: FloatImage,
-    thrown: Thrown,
+    reflected: ReflectedLight,
 ) -> bool:
     """The scale of a radiance (rows, columns, 3) of the targets' size, in blocks; whether all is finite."""
     rows, columns, _ = picture.shape
@@ -96,9 +96,9 @@ def scale_plainly(
     for row in prange(high):
         total = np.float32(0)
         less = np.zeros((block, 3 * columns), np.float32)
-        if thrown.surface.size:
+        if reflected.surface.size:
             for v in range(row * block, min((row + 1) * block, rows)):
-                thrown_back(thrown, v, 0, columns, less[v - row * block])
+                reflected_row(reflected, v, 0, columns, less[v - row * block])
         for x in range(wide):
             k = 4 * ((row + MARGIN) * side + MARGIN + x)
             for c in range(3):
@@ -147,7 +147,7 @@ def scale_picture(
     used: Used,
     side: int,
     scale: FloatImage,
-    thrown: Thrown,
+    reflected: ReflectedLight,
 ) -> None:
     """The scale of a picture (rows, columns, 3) of the targets' size; ``light`` (256,): radiance of its values."""
     rows, columns, _ = picture.shape
@@ -155,9 +155,9 @@ def scale_picture(
     share = np.float32(1 / block**2)
     for row in prange(high):
         into = (row + MARGIN) * side + MARGIN
-        if block == 1 and thrown.surface.size:
+        if block == 1 and reflected.surface.size:
             less = np.empty((1, 3 * columns), np.float32)
-            thrown_back(thrown, row, np.int64(used[row, 0]), np.int64(used[row, 1]), less[0])
+            reflected_row(reflected, row, np.int64(used[row, 0]), np.int64(used[row, 1]), less[0])
             for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
                 r = light[picture[row, x, 0]] - less[0, 3 * x]
                 g = light[picture[row, x, 1]] - less[0, 3 * x + 1]
@@ -170,9 +170,9 @@ def scale_picture(
                 scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
             continue
         taken = np.zeros((block, 3 * columns), np.float32)
-        if thrown.surface.size:
+        if reflected.surface.size:
             for v in range(row * block, min((row + 1) * block, rows)):
-                thrown_back(thrown, v, 0, columns, taken[v - row * block])
+                reflected_row(reflected, v, 0, columns, taken[v - row * block])
         for x in range(wide):
             for c in range(3):
                 found = np.float32(0)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask
+from controller.core.blur import masked_blur
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,5 @@ def through_camera(target: Target, *, sigma_px: float = CAMERA_FILTER_PX) -> Tar
 
     The blur (a Gaussian of ``sigma_px``) is over the mask alone: nothing bleeds in from outside, or out.
     """
-    weight = cv2.GaussianBlur(target.mask.astype(np.float32), (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT)
-    blurred = cv2.GaussianBlur(
-        np.where(target.mask[..., None], target.image, 0), (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT
-    )
-    image = np.where(target.mask[..., None], blurred / np.maximum(weight, 1e-6)[..., None], 0)
+    image = np.where(target.mask[..., None], masked_blur(target.image, target.mask, sigma_px), 0)
     return Target(np.asarray(image, np.float32), target.mask, f"by the camera's own blur, {sigma_px:g} px")

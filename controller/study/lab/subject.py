@@ -15,7 +15,7 @@ from controller.calibrate.verify.drift import Drift
 from controller.core.arrays import FloatImage, Mask
 from controller.run.runner import Context
 from controller.solve.drive_levels import DriveLevels
-from controller.solve.exposed import exposed
+from controller.solve.exposed import expose_target
 from controller.solve.feasibility import target_radiance
 from controller.solve.targets.values import Target
 from controller.steps.modes import DotOptions
@@ -120,7 +120,7 @@ class Subject:
         black = self.calibration.black
         drive = self.drive if transport is None else DriveLevels(transport)
         transport = self.transport if transport is None else transport
-        found = exposed(transport, target.image, black, share=share, drive=drive, indirect=self.indirect)
+        found = expose_target(transport, target.image, black, share=share, drive=drive, indirect=self.indirect)
         mask: Mask = found.possible.reachable & target.mask
         radiance, direct = (target_radiance(image, black, 1.0) for image in (found.wanted, found.needed))
         return ReachableTarget(radiance, mask, found.exposure, direct, target.mask, target.softened)

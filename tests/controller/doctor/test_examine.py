@@ -19,7 +19,7 @@ from controller.doctor.values import Examination
 from controller.stage.run import LOCK
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy
-from hal.finding import Finder, Found, Wanted, load_finders
+from hal.finding import Finder, Found, SearchScope, load_finders
 from hal.registry import BrokenPlugin, Driver, Drivers, load_drivers
 from plugins.dousers.sacn_douser import DRIVER
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
@@ -120,7 +120,7 @@ def codes(seen: Examination) -> list[str]:
 
 
 def on_bus(*found: Found) -> Finder:
-    def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
         return found
 
     return Finder("bus", find)
@@ -250,7 +250,7 @@ def test_a_wrong_stage_toml_is_a_problem_and_the_search_goes_on(hall: Hall) -> N
 
 
 def test_a_bus_that_cannot_be_looked_at_stops_no_other(hall: Hall) -> None:
-    def fail(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    def fail(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
         raise DeviceBusy("bus-taken", what="It is taken.", remedy="Free it.")
 
     hall.plug("left")

@@ -10,7 +10,7 @@ from controller.doctor.examine import Tools
 from controller.kiosk.setup import set_up
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
-from hal.finding import Finder, Found, Wanted
+from hal.finding import Finder, Found, SearchScope
 from hal.registry import load_drivers
 
 OUTPUT = {"name": "P1", "width_px": 1400, "height_px": 1050}
@@ -24,7 +24,7 @@ FOUND = (
 
 
 def tools(*found: Found) -> Tools:
-    def find(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+    def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
         return found
 
     return Tools(finders=(Finder("model", find),), drivers=load_drivers())

@@ -11,6 +11,7 @@ import pytest
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask
+from controller.core.blur import masked_blur
 from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.solve.refine import (
     EDGE_PX,
@@ -22,7 +23,6 @@ from controller.solve.refine import (
     gain,
     photographed_error,
     refusal,
-    smoothed,
     solve_again,
     trusted_pixels,
     without_noise,
@@ -236,6 +236,6 @@ def test_the_filter_drops_noise_and_keeps_an_edge_better_than_one_gaussian() -> 
     assert np.sqrt((without_noise(noise, sigma, mask) ** 2).mean()) < 0.001
     step = np.zeros((*CAMERA, 3), np.float32)
     step[:, 60:] = 0.1
-    kept, blurred = without_noise(step + noise, sigma, mask), smoothed(step + noise, mask, 2.0)
+    kept, blurred = without_noise(step + noise, sigma, mask), masked_blur(step + noise, mask, 2.0)
     assert np.abs(kept - step).mean() < np.abs(blurred - step).mean()
     assert (kept[:, 61] - kept[:, 58]).mean() > (blurred[:, 61] - blurred[:, 58]).mean()

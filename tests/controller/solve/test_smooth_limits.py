@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from controller.solve.smooth_limits import Sheet, _quantile, lowest_above
+from controller.solve.smooth_limits import SmoothLimits, _quantile, lowest_above
 
 
 def test_a_sheet_lies_on_wide_obstacles_falls_off_beside_them_and_leaves_out_narrow_ones() -> None:
@@ -16,7 +16,7 @@ def test_a_sheet_lies_on_wide_obstacles_falls_off_beside_them_and_leaves_out_nar
     need = np.zeros((200, 400), np.float32)
     need[80:120, 80:120] = 1.0
     need[:, 330:331] = 5.0
-    limit = Sheet.on(mask).above(need)
+    limit = SmoothLimits.on(mask).above(need)
     assert limit[90:110, 90:110].min() > 0.99
     fall = limit[100, 125:240]
     assert (np.diff(fall) <= 1e-5).all()
@@ -29,7 +29,7 @@ def test_objects_apart_do_not_limit_each_other() -> None:
     mask[:, :180], mask[:, 220:] = True, True
     need = np.zeros((200, 400), np.float32)
     need[:, 150:180] = 1.0
-    limit = Sheet.on(mask).above(need)
+    limit = SmoothLimits.on(mask).above(need)
     assert limit[100, 170] > 0.95
     assert limit[:, 220:].max() < 1e-6
     assert (limit[~mask] == 0).all()
@@ -37,7 +37,7 @@ def test_objects_apart_do_not_limit_each_other() -> None:
 
 def test_nothing_is_limited_where_nothing_is_needed() -> None:
     mask = np.ones((50, 60), np.bool_)
-    assert not Sheet.on(mask).above(np.zeros((50, 60), np.float32)).any()
+    assert not SmoothLimits.on(mask).above(np.zeros((50, 60), np.float32)).any()
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)

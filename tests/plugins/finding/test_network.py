@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from hal.finding import Found, Known, Wanted
+from hal.finding import Found, Known, SearchScope
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.finding import network
 
 
 def look(folder: Path, *known: dict[str, Any]) -> list[Found]:
-    wanted = Wanted(folder, tuple(Known("projector", "pjlink", table) for table in known), search=None)
+    wanted = SearchScope(folder, tuple(Known("projector", "pjlink", table) for table in known), search=None)
     return list(network.find(wanted, in_seconds(20)))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from hal.finding import Found, Known, Wanted
+from hal.finding import Found, Known, SearchScope
 from plugins.emulated.projectors.boards import BOARDS, baud_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
@@ -49,7 +49,7 @@ def plugged(tmp_path: Path) -> Iterator[Callable[..., EmulatedSerialProjector]]:
 
 
 def look(folder: Path, *known: dict[str, Any]) -> list[Found]:
-    wanted = Wanted(
+    wanted = SearchScope(
         folder,
         tuple(Known("projector", "serial", table) for table in known),
         serial_ports=folder / "by-id",

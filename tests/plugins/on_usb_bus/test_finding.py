@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from hal.deadline import in_seconds
-from hal.finding import Found, Wanted
+from hal.finding import Found, SearchScope
 from plugins.emulated.usb.process import UsbBusProcess
 from plugins.finding import access, hid, usb_cameras
 
 
 def looked(finder: object, folder: Path) -> list[Found]:
     find = {"hid": hid.find, "usb": usb_cameras.find}[str(finder)]
-    return list(find(Wanted(folder), in_seconds(20)))
+    return list(find(SearchScope(folder), in_seconds(20)))
 
 
 def test_every_hid_device_that_has_a_driver_is_found_and_no_relay_moves(bus: UsbBusProcess, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from controller.doctor.examine import Tools
 from controller.kiosk.api.finding import find, findings, try_device
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone
-from hal.finding import Finder, Found, Problem, Wanted
+from hal.finding import Finder, Found, Problem, SearchScope
 from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity
 from tests.controller.rig.rig_model import ModelCamera
@@ -42,7 +42,7 @@ class Bus:
     def __init__(self, *found: Found, opens: Callable[[], Device] | None = None) -> None:
         self.found = list(found)
 
-        def look(wanted: Wanted, deadline: Deadline) -> Sequence[Found]:
+        def look(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
             return tuple(self.found)
 
         def opened(settings: Any, context: object, deadline: Deadline) -> Device:
