@@ -117,6 +117,22 @@ def read_captures(
         raise unfit(folder, "it does not give the size of the projector", "Give projector_px = [width, height].")
     named = pictures if pictures is not None else _pictures(folder, said.get("pictures"))
     each_s = float(exposure_s if exposure_s is not None else said.get("exposure_s", 1.0))
+    files = _existing_files(folder, named, each_s)
+    first = next(iter(files.values()), None)
+    if first is None:
+        raise unfit(folder, "it has no picture of a pattern", "Name the files after the patterns, or list them.")
+    sample = develop(first[0][0], camera=camera)
+    width, height = size
+    return CaptureSet(
+        _Folder(files, camera), (int(width), int(height)), sample.camera_to_xyz, from_bayer=sample.bayer is not None
+    )
+
+
+def _existing_files(folder: Path, named: Pictures, each_s: float) -> dict[str, list[tuple[Path, float]]]:
+    """The files of each pattern with their exposures in seconds; ``each_s`` where none is given.
+
+    Raises UsageError("capture-file-missing").
+    """
     files: dict[str, list[tuple[Path, float]]] = {}
     for name, value in named.items():
         taken = [(value, each_s)] if isinstance(value, str) else value
@@ -128,14 +144,7 @@ def read_captures(
                 what=f"The file {missing} for the pattern {name} does not exist.",
                 remedy="Correct its name in captures.toml, or copy the file into the folder.",
             )
-    first = next(iter(files.values()), None)
-    if first is None:
-        raise unfit(folder, "it has no picture of a pattern", "Name the files after the patterns, or list them.")
-    sample = develop(first[0][0], camera=camera)
-    width, height = size
-    return CaptureSet(
-        _Folder(files, camera), (int(width), int(height)), sample.camera_to_xyz, from_bayer=sample.bayer is not None
-    )
+    return files
 
 
 class _Folder(Mapping[str, FloatImage]):
