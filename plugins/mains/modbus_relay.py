@@ -10,7 +10,7 @@ from hal.errors import DeviceGone, DeviceRefused, PluginError
 from hal.links import host_and_port
 from hal.registry import Driver, OpenContext, setting
 from hal.values import DeviceIdentity
-from plugins.mains.outlets import Outlets, require_library
+from plugins.mains.outlets import Outlets, answering, require_library
 
 PORT: Final = 502
 _ANSWER_S: Final = 1.0
@@ -104,13 +104,7 @@ def _read(settings: Mapping[str, Any]) -> dict[str, Any]:
 def open_modbus_relays(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ModbusRelays:
     """Open the board of a stage's table: read its first coil."""
     require_library("pymodbus")
-    board = ModbusRelays(**_read(settings))
-    try:
-        board.identity(deadline=deadline)
-    except BaseException:
-        board.close()
-        raise
-    return board
+    return answering(ModbusRelays(**_read(settings)), deadline)
 
 
 def check_modbus_relays(settings: Mapping[str, Any], context: OpenContext) -> None:

@@ -13,10 +13,22 @@ from typing import Any, Final, TypeVar
 
 from hal.deadline import SLICE_S, Deadline, turn
 from hal.errors import DeviceGone, DeviceRefused, PluginError
+from hal.interfaces import PowerSwitch
 
 Result = TypeVar("Result")
+AnySwitch = TypeVar("AnySwitch", bound=PowerSwitch)
 _END_S: Final = 0.7
 _LEFT_S: Final = 5.0
+
+
+def answering(switch: AnySwitch, deadline: Deadline) -> AnySwitch:
+    """``switch``, if it answers; else it is closed, and its error raised."""
+    try:
+        switch.identity(deadline=deadline)
+    except BaseException:
+        switch.close()
+        raise
+    return switch
 
 
 def require_library(name: str) -> None:

@@ -14,7 +14,7 @@ from hal.errors import DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.links import host_and_port
 from hal.registry import Driver, OpenContext, setting
 from hal.values import DeviceIdentity
-from plugins.mains.outlets import Outlets, require_library
+from plugins.mains.outlets import Outlets, answering, require_library
 
 PORT: Final = 161
 PDUS: Final = {
@@ -142,13 +142,7 @@ def _wrong(key: str, why: str) -> PluginError:
 def open_snmp_pdu(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SnmpPdu:
     """Open the PDU of a stage's table: ask it for its description."""
     require_library("pysnmp")
-    pdu = SnmpPdu(**_read(settings))
-    try:
-        pdu.identity(deadline=deadline)
-    except BaseException:
-        pdu.close()
-        raise
-    return pdu
+    return answering(SnmpPdu(**_read(settings)), deadline)
 
 
 def check_snmp_pdu(settings: Mapping[str, Any], context: OpenContext) -> None:
