@@ -254,12 +254,18 @@ class ProjectorSupervisor:
             self._strike_failed()
         if self._failed_strikes >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
+        strikes = guard.use().strikes
         try:
             guard.switch_on(deadline=self._deadline(guard.switch_s), failed=self._failed_strikes + 1)
         except DeviceRefused as error:
             if error.code in ("lamp-cooling", "lamp-resting"):
                 return self._see(Condition.COOLING, status, self._view.problem)
             return self._see(Condition.BROKEN, status, _decision(error))
+        except DeviceError:
+            # The projector may have received the command: without its answer, too, this is an attempt.
+            if guard.use().strikes > strikes:
+                self._struck_at_s = now_s
+            raise
         except VelaturaError as error:
             # The lamp counter can't be saved, so the lamp was not switched on.
             return self._see(Condition.BROKEN, status, _unrecorded(error))

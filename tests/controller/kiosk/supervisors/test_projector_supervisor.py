@@ -9,7 +9,7 @@ from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES, REOPEN_AFTER_FAULT_S, ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
-from hal.errors import DeviceGone
+from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import FragileLamp
 from tests.controller.rig.lamp_model import Shelf, World
@@ -36,6 +36,14 @@ class TellingLamp(FragileLamp):
 
     def close(self) -> None:
         self.heard = False
+
+
+class LateLamp(FragileLamp):
+    """Switches, and does not answer in time."""
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        super().switch_on(deadline=deadline)
+        raise DeviceTimeout("projector-not-confirmed", what="It did not switch in time.", remedy="Check its cable.")
 
 
 class ShutMeanwhile(FragileLamp):
@@ -140,6 +148,22 @@ def test_a_lamp_that_stays_dead_and_says_so_is_struck_as_often_as_one_that_does_
     kept.supervisor.want_lit = True
     kept.run(3600)
     assert kept.lamp.strikes == struck + 1
+
+
+def test_a_dead_lamp_whose_projector_answers_late_is_struck_as_often_as_any() -> None:
+    kept = Kept(LateLamp)
+    kept.lamp.dud = True
+    kept.supervisor.want_lit = True
+    assert kept.run(2 * 3600) is Condition.BROKEN
+    assert kept.lamp.strikes == MOST_STRIKES
+    assert kept.codes.count("lamp-given-up") == 1
+
+
+def test_a_lamp_whose_projector_answers_late_lights_by_one_strike() -> None:
+    kept = Kept(LateLamp)
+    kept.supervisor.want_lit = True
+    assert kept.run(600) is Condition.LIT
+    assert kept.lamp.strikes == 1
 
 
 def test_a_service_that_is_restarted_again_and_again_strikes_no_dead_lamp_anew(kept: Kept) -> None:
