@@ -19,7 +19,8 @@ _ROUNDING_S: Final = 1e-6
 class Lamp:
     """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports;
     ``by_hand``: it burns because somebody switched it on;
-    ``lasts_s``: after so long it goes out by itself, infinite for a good one.
+    ``lasts_s``: after so long it goes out by itself, infinite for a good one; ``doubled``: strikes of ``strikes`` by
+    the second of one command.
 
     ``sins``: what was done to it against the rules.
     """
@@ -30,7 +31,7 @@ class Lamp:
         self.off_at_s = self.struck_at_s = -1e9
         self.dud, self.by_hand, self.fault = False, False, ""
         self.lasts_s = float("inf")
-        self.strikes = 0
+        self.strikes = self.doubled = 0
         self.sins: list[str] = []
 
     @property
@@ -85,22 +86,27 @@ class Line:
         self.owner: SimulatedProjector | None = None
         self.connection = 0
         self.turn = Lock(scheduler, again=False)
-        self._late: list[tuple[float, bool]] = []
+        self._late: list[tuple[float, bool, bool]] = []
+        """When it arrives, whether it switches on, and whether it is the second of one command."""
 
     @property
     def delayed(self) -> int:
         """Commands that are still under way."""
-        return len(self._late)
+        return sum(not doubled for _, _, doubled in self._late)
 
     def pass_on(self) -> None:
         """What was delayed reaches the projector now, which refuses a strike while it is hot."""
         now_s = self._scheduler.now_s
-        for at_s, on in [one for one in self._late if one[0] <= now_s]:
-            self._late.remove((at_s, on))
+        for one in [one for one in self._late if one[0] <= now_s]:
+            self._late.remove(one)
+            _, on, doubled = one
             if not on:
                 self.lamp.go_dark()
             elif now_s - self.lamp.off_at_s >= RULES.minimum_off_s:
+                before = self.lamp.strikes
                 self.lamp.strike()
+                if doubled:
+                    self.lamp.doubled += self.lamp.strikes - before
 
     def talk(self, deadline: Deadline) -> None:
         """The question's way there and back. Raises what a line may raise."""
@@ -127,13 +133,13 @@ class Line:
         if trouble == "loses" and self._chance.random() < 0.5:
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
         if trouble == "delays":
-            self._late.append((self._scheduler.now_s + self._chance.uniform(1.0, 90.0), on))
+            self._late.append((self._scheduler.now_s + self._chance.uniform(1.0, 90.0), on, False))
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
         if on and lamp.power() is Power.COOLING:
             lamp.sins.append(f"the lamp of {lamp.name} was switched on while it cooled")
         do()
         if trouble == "doubles":
-            self._late.append((self._scheduler.now_s + self._chance.uniform(0.1, 20.0), on))
+            self._late.append((self._scheduler.now_s + self._chance.uniform(0.1, 20.0), on, True))
         if trouble == "late":
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
 

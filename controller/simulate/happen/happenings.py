@@ -33,8 +33,20 @@ def _line(life: Living, item: Item) -> None:
 
     def repair() -> None:
         line.trouble = ""
+        _open_if_given_up(life, item.who)
 
     life.later(item.for_s, repair)
+
+
+def _open_if_given_up(life: Living, name: str) -> None:
+    """Who repaired a line looks at the panel, and does what it says of a lamp that stays off after three attempts."""
+    if life.service is None:
+        return
+    for supervisor in life.service.devices.projectors:
+        problem = supervisor.view.problem
+        if supervisor.name == name and problem is not None and problem.code == "lamp-given-up":
+            supervisor.forgive()
+            life.witness.forgive()
 
 
 def _lamp_fails(life: Living, item: Item) -> None:

@@ -147,7 +147,9 @@ class Witness:
     def ledger_lost(self) -> None:
         """The counts of strikes start again."""
         self.forgive()
-        self._uncounted = {name: line.lamp.strikes + line.delayed for name, line in self._world.lines.items()}
+        self._uncounted = {
+            name: line.lamp.strikes - line.lamp.doubled + line.delayed for name, line in self._world.lines.items()
+        }
 
     # -- judging
 
@@ -246,8 +248,10 @@ class Witness:
             lamp, view = self._world.lamps[supervisor.name], supervisor.view
             # A look at it after the strike has ended.
             seen = view.condition in _SEEN and self._world.scheduler.now_s - lamp.struck_at_s > LOOKED_S
-            if seen and view.strikes < lamp.strikes - self._uncounted.get(lamp.name, 0):
-                raise Broken("strikes counted", f"{view.strikes} instead of {lamp.strikes} for {lamp.name}")
+            # Nobody can count a strike by the second of one command, after the first one's light went out.
+            commanded = lamp.strikes - lamp.doubled
+            if seen and view.strikes < commanded - self._uncounted.get(lamp.name, 0):
+                raise Broken("strikes counted", f"{view.strikes} instead of {commanded} for {lamp.name}")
         for name, lamp in self._world.lamps.items():
             if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.bad:
                 raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
