@@ -92,6 +92,8 @@ def _by_hand(life: Living, item: Item) -> None:
 def _player(life: Living, item: Item) -> None:
     screen, witness = life.world.screen, life.witness
     fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
+    # One that died again and again already is started after longer and longer pauses.
+    again_s = PLAYER_S if life.world.scheduler.now_s < witness.player_disturbed_until_s else 0.0
     if item.how in ("killed", "crashes"):
         screen.dies_at_start = max(screen.dies_at_start, int(item.number))
         if screen.process is not None:
@@ -109,8 +111,8 @@ def _player(life: Living, item: Item) -> None:
             screen.trouble = ""
 
         life.later(item.for_s, repair)
-    witness.disturb_player(item.for_s)
-    witness.disturb(item.for_s, PLAYER_S)
+    witness.disturb_player(item.for_s + again_s)
+    witness.disturb(item.for_s + again_s, PLAYER_S)
     if fell:
         witness.player_fell()
 
