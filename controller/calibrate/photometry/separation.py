@@ -52,22 +52,22 @@ SOME_PIXELS: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Sinusoids:
-    """``contrast`` (rows, columns, 3): of both axes, of white; ``sigma`` like it: its standard deviation by noise;
-
-    ``around`` (rows, columns): the contrast of the light of all pixels around, of all channels together
-    """
+    """``contrast`` (rows, columns, 3): of both axes, of white; ``sigma`` like it: its standard deviation by noise."""
 
     contrast: FloatImage
     sigma: FloatImage
-    around: FloatImage
 
 
 @dataclass(frozen=True, slots=True)
 class SinusoidContrast:
-    """What the photographs show of the ``coarse`` and the ``fine`` sinusoids, whatever response they were shown by."""
+    """What the photographs show of the ``coarse`` and the ``fine`` sinusoids, whatever response they were shown by.
+
+    ``fine_around`` (rows, columns): the fine contrast of the light of all pixels around, of all channels together
+    """
 
     coarse: Sinusoids
     fine: Sinusoids
+    fine_around: FloatImage
 
 
 def sinusoid_contrast(
@@ -85,9 +85,9 @@ def sinusoid_contrast(
     """
     black = coloured(captures, "black", white.shape[:2])
     noise = noise or CameraNoise()
-    return SinusoidContrast(
-        _measured(captures, plan, COARSE, black, white, noise), _measured(captures, plan, FINE, black, white, noise)
-    )
+    coarse, _ = _measured(captures, plan, COARSE, black, white, noise)
+    fine, powers = _measured(captures, plan, FINE, black, white, noise)
+    return SinusoidContrast(coarse, fine, _contrast_around(powers, white))
 
 
 def indirect_share(
@@ -104,7 +104,7 @@ def indirect_share(
     full = np.ones(3) if linearity is None else linearity
     with np.errstate(invalid="ignore", divide="ignore"):
         s = seen.coarse.contrast / full.astype(np.float32)
-        f = _fine_contrast(seen.fine, float(full.mean()))
+        f = _fine_contrast(seen, float(full.mean()))
         share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
     sigma = np.hypot(seen.coarse.sigma, FLOOR).astype(np.float32)
     known = np.isfinite(share).all(axis=2) & (sigma.max(axis=2) < WORST_SIGMA)
@@ -113,9 +113,9 @@ def indirect_share(
     return np.clip(_filled(smooth, known), 0, 1).astype(np.float32)
 
 
-def _fine_contrast(fine: Sinusoids, full: float) -> FloatImage:
+def _fine_contrast(seen: SinusoidContrast, full: float) -> FloatImage:
     """(rows, columns, 1) over the channels, 1 where it is not known; from around where the pixel is out of focus."""
-    own, around = fine.contrast.mean(axis=2) / np.float32(full), fine.around / np.float32(full)
+    own, around = seen.fine.contrast.mean(axis=2) / np.float32(full), seen.fine_around / np.float32(full)
     sharp = np.clip((own - OUT_OF_FOCUS[0]) / (OUT_OF_FOCUS[1] - OUT_OF_FOCUS[0]), 0, 1)
     mean = (sharp * own + (1 - sharp) * np.minimum(around, OUT_OF_FOCUS[1]))[..., None]
     return np.asarray(np.where(np.isfinite(mean), np.clip(mean, LEAST_FINE_CONTRAST, 1), 1), np.float32)
@@ -159,8 +159,11 @@ def _measured(
     black: FloatImage,
     white: FloatImage,
     camera: CameraNoise,
-) -> Sinusoids:
-    """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise."""
+) -> tuple[Sinusoids, list[FloatImage]]:
+    """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise.
+
+    And (rows, columns, 3) of each axis: their squared amplitude, without noise.
+    """
     powers, sums = [], []
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
@@ -184,9 +187,12 @@ def _measured(
     with np.errstate(invalid="ignore", divide="ignore"):
         contrast = 2 * product**0.25 / white
         sigma = 2 * np.sqrt(np.float32(2 / PHASE_STEPS / len(prefixes)) * variance) / white
+    return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32)), powers
+
+
+def _contrast_around(powers: Sequence[FloatImage], white: FloatImage) -> FloatImage:
     around = np.prod([np.maximum(_light_around(power), 0) for power in powers], axis=0)
-    around = 2 * around**0.25 / np.sqrt(np.maximum(_light_around(white * white), 1e-30))
-    return Sinusoids(*(np.asarray(image, np.float32) for image in (contrast, sigma, around)))
+    return np.asarray(2 * around**0.25 / np.sqrt(np.maximum(_light_around(white * white), 1e-30)), np.float32)
 
 
 def _light_around(image: FloatImage) -> FloatImage:
