@@ -274,18 +274,18 @@ GROUPS: Final[Mapping[str, tuple[str, tuple[Callable[..., Any], ...]]]] = {
 """Commands of two words: the first word, what the group is for, and its commands."""
 
 
-def application() -> typer.Typer:
-    """The command line with all commands and groups."""
-    app = group("velatura", SUMMARY, COMMANDS, whole=True)
-    for name, (summary, commands) in GROUPS.items():
-        app.add_typer(group(name, summary, commands), name=name)
+def application(commands: tuple[Callable[..., Any], ...] = COMMANDS) -> typer.Typer:
+    """The command line with these commands and all groups."""
+    app = group("velatura", SUMMARY, commands, whole=True)
+    for name, (summary, members) in GROUPS.items():
+        app.add_typer(group(name, summary, members), name=name)
     return app
 
 
 @functools.cache
-def _built() -> Callable[..., Any]:
+def _built(commands: tuple[Callable[..., Any], ...]) -> Callable[..., Any]:
     """All commands with their options, read once from the functions: that takes longer than most commands."""
-    return typer.main.get_command(application())
+    return typer.main.get_command(application(commands))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -300,7 +300,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code. Errors have been shown."""
     as_json = "--json" in arguments
     try:
-        outcome = _built()(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
+        outcome = _built(COMMANDS)(args=list(arguments) or ["--help"], prog_name="velatura", standalone_mode=False)
         sys.stdout.flush()
     except SystemExit as exiting:  # raised by the command-line library when the reader of our output has closed it
         return exiting.code if isinstance(exiting.code, int) else FAILED
