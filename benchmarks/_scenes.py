@@ -1,4 +1,4 @@
-"""Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust."""
+"""Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust, steps."""
 
 from __future__ import annotations
 
@@ -54,7 +54,31 @@ def two_objects() -> Part:
     return _together(left, right)
 
 
-SCENES: Final[Mapping[str, Callable[[], Part]]] = {"corner": corner, "bowl": bowl, "two-objects": two_objects}
+def steps() -> Part:
+    """Three steps of painted bricks, which the camera sees from the side, and striped balls that lie on them."""
+    paints = (
+        ((0.80, 0.78, 0.72), (0.50, 0.20, 0.18)),
+        ((0.70, 0.75, 0.80), (0.20, 0.35, 0.30)),
+        ((0.80, 0.60, 0.30), (0.30, 0.30, 0.32)),
+    )
+    wide, high, parts = 0.30, 0.07, []
+    for number in range(3):
+        front = np.array([-0.5 * wide, high * number, 0.08 - high * number])
+        across, up, back = (np.array(edge) for edge in ((wide, 0.0, 0.0), (0.0, high, 0.0), (0.0, 0.0, -high)))
+        parts.append(_plane(front, across, up, *paints[number], 9))
+        parts.append(_plane(front + up, across, back, *paints[(number + 1) % 3], 6))
+    for x, step, radius in ((-0.08, 0, 0.030), (0.05, 1, 0.032), (0.09, 0, 0.025)):
+        middle = np.array([x, high * (step + 1) + radius, 0.045 - high * step])
+        ball = trimesh.creation.icosphere(5, radius)
+        turn = np.arctan2(ball.vertices[:, 0], ball.vertices[:, 2])
+        colours = np.where((np.floor(turn / 0.5) % 2 < 1)[:, None], (0.85, 0.85, 0.85), (0.60, 0.10, 0.30))
+        parts.append((np.asarray(ball.vertices) + middle, np.asarray(ball.faces, np.float64), colours))
+    return _together(*parts)
+
+
+SCENES: Final[Mapping[str, Callable[[], Part]]] = {
+    "corner": corner, "bowl": bowl, "two-objects": two_objects, "steps": steps,
+}  # fmt: skip
 
 
 def write_scene(name: str, file: Path) -> Path:

@@ -17,7 +17,7 @@ from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from plugins.emulated.kept_light import kept_folder
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject
-from plugins.emulated.optics.rays import SIGMA_STEP_PX, directions, samples_of
+from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, directions, samples_of
 from plugins.emulated.optics.render import Renderer, response
 from plugins.emulated.optics.truth import FOLDER, BenchTruth, read_truth
 from plugins.emulated.optics.world import object_of
@@ -39,7 +39,7 @@ class Truth:
         indirect = Indirect(self.stage_object, kept)
         transfer = indirect.transfer(self.bench, self.samples.pixels, lambda share: None, keep=True)
         self._renderer = Renderer(self.bench, self.samples, transfer)
-        self._direct = Renderer(_direct_alone(self.bench), self.samples)
+        self._direct = Renderer(*_direct_alone(self.bench, self.samples))
         width, height = self.bench.camera.lens.size_px
         self.shape = (height, width)
 
@@ -130,20 +130,18 @@ class Truth:
         return mean.reshape(*self.shape, -1)
 
 
-def _direct_alone(truth: BenchTruth) -> BenchTruth:
+def _direct_alone(truth: BenchTruth, samples: Samples) -> tuple[BenchTruth, Samples]:
     """Without what goes astray in lenses, which the light that goes straight then lacks."""
     clear = 1 - truth.camera.glare
-    projectors = []
-    for one in truth.projectors:
-        brightness = clear * (1 - one.light.glare) * one.light.brightness
-        projectors.append(
-            dataclasses.replace(one, light=dataclasses.replace(one.light, glare=0.0, brightness=brightness))
-        )
+    straight = np.array([clear * (1 - one.light.glare) for one in truth.projectors], np.float32)
+    projectors = tuple(
+        dataclasses.replace(one, light=dataclasses.replace(one.light, glare=0.0)) for one in truth.projectors
+    )
     red, green, blue = (clear * value for value in truth.ambient)
     camera = dataclasses.replace(truth.camera, glare=0.0)
-    return dataclasses.replace(
-        truth, indirect=0.0, ambient=(red, green, blue), camera=camera, projectors=tuple(projectors)
-    )
+    alone = dataclasses.replace(truth, indirect=0.0, ambient=(red, green, blue), camera=camera, projectors=projectors)
+    # the samples hold the projectors' brightness already
+    return alone, dataclasses.replace(samples, gain=samples.gain * straight[:, None])
 
 
 @dataclass(frozen=True, slots=True)

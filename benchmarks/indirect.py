@@ -1,7 +1,8 @@
 """Appearances on stages whose surfaces light each other, by paths through Mitsuba: against the light without noise.
 
-Stages: a bust in a painted corner, a bowl, a vase beside a bust (``_scenes``). Each is calibrated and refined as the
-command line would, through its devices; then its frames are judged in the optical model. The worst stage counts.
+Stages: a bust in a painted corner, a bowl, a vase beside a bust, balls on steps (``_scenes``). Each is calibrated and
+refined as the command line would, through its devices; then its frames are judged in the optical model. The worst
+stage counts.
 ``BENCH_SCENES`` and ``BENCH_SEEDS`` choose some; ``BENCH_FOLDER`` keeps the stages, and measures kept ones again.
 """
 
@@ -48,6 +49,8 @@ OUTLINE_PX: Final = 3
 RESPONSE_AT: Final = 64
 FORGIVEN: Final = 0.02
 """Drive beyond [0, 1] that counts as in reach yet."""
+UNLIT: Final = 1e-12
+"""Of the brightest light's determinant: three colours of light that are none."""
 APPEARANCES: Final = """
 [[appearances]]
 name = "grey"
@@ -207,7 +210,12 @@ class Judge:
         to_xyz = self.calibration_.camera_to_xyz
         error = colour_difference(shown, solved.target, to_xyz, solved.exposure, self.lit)
         inside = error[mask]
-        drive = np.linalg.solve(self.light[mask], self._needed(solved, shown, direct)[mask][..., None])[..., 0]
+        light = self.light[mask]
+        some = np.abs(np.linalg.det(light)) > UNLIT * np.abs(light).max() ** 3
+        # where no projector's light falls in truth, nothing is in reach
+        drive = np.full((len(light), 3), np.inf)
+        needed = self._needed(solved, shown, direct)[mask][some]
+        drive[some] = np.linalg.solve(light[some], needed[..., None])[..., 0]
         beyond = (drive < -FORGIVEN) | (drive > 1 + FORGIVEN)
         return {
             "median": float(np.median(inside)),

@@ -155,6 +155,7 @@ def _calibrated(
         return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
     encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
+    white = np.nan_to_num(seen.white)
     for _ in range(PASSES):
         linearity = shown_contrast(radiometry, encoded_with)
         share = indirect_share(seen, white, correspondence.projector_px, linearity=linearity)

@@ -10,7 +10,14 @@ import numpy.typing as npt
 
 from controller.artefacts.geometry import known_points_m, read_geometry_figures
 from controller.artefacts.photographs import BLACK, Taken, codes_of, light_of
-from controller.artefacts.projectors import Light, Pixels, mode_of, read_indirect, read_metapixels
+from controller.artefacts.projectors import (
+    Light,
+    Pixels,
+    mode_of,
+    read_indirect,
+    read_metapixels,
+    read_white_gain,
+)
 from controller.calibrate.geometry.background import room_pixels
 from controller.calibrate.values import (
     Calibration,
@@ -63,6 +70,8 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         phase_map, mosaic = read_phase_map(folder, name)
         # in place: of a mapped file, only the pages with saturated pixels become memory of this process
         white, radiometry = np.nan_to_num(light.white, copy=False), light.radiometry
+        if (gain := read_white_gain(folder, name)) is not None:
+            white = _times(white, gain, folder)
         indirect = stripes = None
         if found is not None:
             radiometry = found[number].radiometry
@@ -77,6 +86,15 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     if (points_m := known_points_m(folder)) is not None:
         mask &= ~room_pixels(points_m)
     return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
+
+
+def _times(white: FloatImage, gain: npt.NDArray[np.floating], folder: Path) -> FloatImage:
+    """Their product, in a nameless file of the run's disk where it is large."""
+    product = array_in_file(folder, white.shape)
+    for first in range(0, len(white), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        np.multiply(gain[rows].astype(np.float32), white[rows], out=product[rows])
+    return product
 
 
 def _parted(white: FloatImage, share: npt.NDArray[np.floating], folder: Path) -> tuple[FloatImage, FloatImage]:

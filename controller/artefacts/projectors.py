@@ -223,7 +223,8 @@ class Indirect:
     """``indirect-PROJECTOR.npz``: the share of its white that is indirect, and its radiometry in direct light.
 
     ``share`` (camera rows, columns, 3), 0 to 1, float16 in the file; ``response``, ``mixing``, ``segment``: as of
-    ``Light``; ``stripes``: as of ``ProjectorCalibration``
+    ``Light``; ``stripes``: as of ``ProjectorCalibration``; ``white_gain`` like ``share``: the white image with less
+    noise over that of ``Light``, None where there is no better one
     """
 
     share: npt.NDArray[np.floating]
@@ -231,6 +232,7 @@ class Indirect:
     mixing: Float64
     segment: Float64 | None = None
     stripes: FloatImage | None = None
+    white_gain: npt.NDArray[np.floating] | None = None
 
     @property
     def radiometry(self) -> Radiometry:
@@ -240,7 +242,8 @@ class Indirect:
         path = npz_path(run, StepKind.INDIRECT, projector)
         kept: dict[str, npt.NDArray[Any]] = {"response": self.response, "mixing": self.mixing}
         kept["share"] = self.share.astype(np.float16)
-        more = {"segment": self.segment, "stripes": self.stripes}
+        gain = None if self.white_gain is None else self.white_gain.astype(np.float16)
+        more = {"segment": self.segment, "stripes": self.stripes, "white_gain": gain}
         save_arrays(path, kept | {name: array for name, array in more.items() if array is not None})
         return path
 
@@ -248,7 +251,7 @@ class Indirect:
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(npz_path(run, StepKind.INDIRECT, projector))
         found = arrays["share"], arrays["response"], arrays["mixing"]
-        return cls(*found, arrays.get("segment"), arrays.get("stripes"))
+        return cls(*found, arrays.get("segment"), arrays.get("stripes"), arrays.get("white_gain"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,6 +289,13 @@ def read_indirect(run: Path, projectors: Sequence[str]) -> list[Indirect] | None
     if any(one is None for one in figures) or not any(one is not None and one.matters for one in figures):
         return None
     return [Indirect.read(run, name) for name in projectors]
+
+
+def read_white_gain(run: Path, projector: str) -> npt.NDArray[np.floating] | None:
+    """See ``Indirect``; None for a run that did not measure it."""
+    if not npz_path(run, StepKind.INDIRECT, projector).exists():
+        return None
+    return Indirect.read(run, projector).white_gain
 
 
 def write_mode(run: Path, mode: Mapping[str, str]) -> Path:

@@ -6,11 +6,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.capture.patterns import plan_patterns
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask
+from controller.transport.form_factors import form_factors
 from controller.transport.indirect import IndirectLight, down, up
 from controller.transport.indirect_shape import shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
@@ -18,8 +18,6 @@ from controller.transport.indirect_weights import BlockLight, Part, Term, block_
 
 NEAR_BLOCKS: Final = (1.0, 3.0)
 """Standard deviations of near light, in blocks: what spreads under the surface, or between neighbours."""
-LEAST_KNOWN: Final = 0.2
-"""Share of a block's pixels with a point, for light to be exchanged by shape."""
 FAINTEST: Final = 1e-4
 """Of the brightest: less falling light says nothing of what a surface makes of it."""
 
@@ -92,52 +90,6 @@ def beside(part: ProjectorCalibration, frame: FloatImage, lit: Mask) -> FloatIma
         light = cv2.remap(frame, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     mixed = part.white * (light @ part.radiometry.mixing.T.astype(np.float32))
     return np.where(lit[..., None], np.float32(0), mixed).astype(np.float32)
-
-
-def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
-    """(blocks, blocks): cos cos A / (pi r^2 + A), of which nothing is hidden; the source's area by its solid angle.
-
-    A block without a shape receives what its nearest neighbour with one does, and sends nothing.
-    """
-    known: Mask = np.asarray((np.isfinite(points_m) & np.isfinite(normals)).all(axis=2))
-    share = down(known[..., None].astype(np.float32), grid, side)[:, 0]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        point, normal = (
-            down(np.where(known[..., None], image, 0).astype(np.float32), grid, side).astype(np.float64)
-            / share[:, None]
-            for image in (points_m, normals)
-        )
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    good = (share > LEAST_KNOWN) & np.isfinite(point).all(axis=1) & np.isfinite(normal).all(axis=1)
-    out = np.zeros((len(good), len(good)), np.float32)
-    if np.count_nonzero(good) < 2:
-        return out
-    p, n = point[good], normal[good]
-    # the camera, at the origin, sees outward normals
-    n = np.where(np.sum(n * p, axis=1, keepdims=True) > 0, -n, n)
-    area = _areas(point, good, grid, n)
-    apart = p[None] - p[:, None]
-    square = np.maximum(np.sum(apart * apart, axis=2), 1e-12)
-    receiving = np.maximum(np.einsum("ijk,ik->ij", apart, n), 0)
-    sending = np.maximum(np.einsum("ijk,jk->ij", -apart, n), 0)
-    between = receiving * sending / square * area / (np.pi * square + area)
-    out[np.ix_(good, good)] = between
-    nearest = distance_transform_edt(~good.reshape(grid), return_distances=False, return_indices=True)
-    rows = np.ravel_multi_index(tuple(nearest.reshape(2, -1)), grid)
-    return np.ascontiguousarray(out[rows])
-
-
-def _areas(point: Float64, good: Mask, grid: tuple[int, int], normal: Float64) -> Float64:
-    """Area of each good block: what it covers before the camera, over the cosine to its normal."""
-    depth = np.linalg.norm(point[good], axis=1)
-    ray = point[good] / depth[:, None]
-    # how far apart the rays of adjacent blocks are, from all pairs of them
-    rays = np.full((*grid, 3), np.nan)
-    rays[good.reshape(grid)] = ray
-    steps = [np.linalg.norm(np.diff(rays, axis=axis), axis=2) for axis in (0, 1)]
-    across = [float(np.nanmedian(step)) if np.isfinite(step).any() else 0.0 for step in steps]
-    slant = np.maximum(np.abs(np.sum(ray * normal, axis=1)), 0.1)
-    return np.asarray(across[0] * across[1] * depth**2 / slant, np.float64)
 
 
 def _even(grid: tuple[int, int]) -> FloatImage:

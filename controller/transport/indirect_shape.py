@@ -17,9 +17,9 @@ from controller.core.arrays import Float64, FloatImage
 from controller.transport.indirect import down_up
 from controller.transport.indirect_weights import FAINTEST, BlockLight, measured_part
 
-UNSURE: Final = 0.5
+UNSURE: Final = 1.0
 """Standard deviation of a factor: how much of a source's light arrives, over what the terms say."""
-ALIKE_BLOCKS: Final = 6.0
+ALIKE_BLOCKS: Final = 4.0
 """Distance of sources, in blocks, within which factors are alike (standard deviation of the correlation's Gaussian)."""
 PART_NOISE: Final = 0.045
 """Standard deviation of a picture's part of a block's indirect light, from noise and what factors can't tell."""

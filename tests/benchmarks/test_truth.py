@@ -75,3 +75,22 @@ def test_response_and_mixing_have_the_calibrations_form(truth: Truth) -> None:
     assert response.shape == (3, 256)
     np.testing.assert_allclose(response[:, [0, -1]], [[0, 1]] * 3, atol=1e-9)
     np.testing.assert_allclose(mixing.sum(axis=1), 1)
+
+
+def test_direct_light_is_what_a_fine_pattern_modulates(tmp_path: Path, truth: Truth) -> None:
+    """What a lens spreads over the picture has no detail, and the light that goes straight lacks it."""
+    camera = dataclasses.replace(truth.bench.camera, glare=0.05)
+    first, *others = truth.bench.projectors
+    first = dataclasses.replace(first, light=dataclasses.replace(first.light, glare=0.03))
+    write_truth(tmp_path, dataclasses.replace(truth.bench, camera=camera, projectors=(first, *others)))
+    veiled = Truth(tmp_path)
+    frames = np.zeros((2, PROJECTOR_PX[1], PROJECTOR_PX[0], 3), np.uint8)
+    frames[0, :, ::2], frames[1, :, 1::2] = 255, 255
+    # one column of pixels more or less: half the picture each, so the veil is the same
+    whole, direct = (
+        np.subtract(*(veiled.light(0, frame, direct=alone) for frame in frames)) for alone in (False, True)
+    )
+    detail = veiled.one_surface(0, 2)
+    change = np.sum(whole[detail] * direct[detail]) / np.sum(direct[detail] ** 2)
+    assert change == pytest.approx(1, abs=2e-3)
+    assert np.all(veiled.white(0, direct=True)[detail] < veiled.white(0)[detail])

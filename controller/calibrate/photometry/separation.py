@@ -18,6 +18,7 @@ import numpy as np
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.decode import FINE_TO_COARSE
 from controller.calibrate.correspondence.opposites import step_variance
+from controller.calibrate.photometry.averaged_white import WhiteSums
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PHASE_STEPS, Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
@@ -63,11 +64,13 @@ class SinusoidContrast:
     """What the photographs show of the ``coarse`` and the ``fine`` sinusoids, whatever response they were shown by.
 
     ``fine_around`` (rows, columns): the fine contrast of the light of all pixels around, of all channels together
+    ``white`` (rows, columns, 3): the white image with less noise, from all steps, which add up to it
     """
 
     coarse: Sinusoids
     fine: Sinusoids
     fine_around: FloatImage
+    white: FloatImage
 
 
 def sinusoid_contrast(
@@ -85,9 +88,15 @@ def sinusoid_contrast(
     """
     black = coloured(captures, "black", white.shape[:2])
     noise = noise or CameraNoise()
-    coarse, _ = _measured(captures, plan, COARSE, black, white, noise)
-    fine, powers = _measured(captures, plan, FINE, black, white, noise)
-    return SinusoidContrast(coarse, fine, _contrast_around(powers, white))
+    sums = WhiteSums()
+    coarse, _ = _measured(captures, plan, COARSE, black, white, noise, sums)
+    fine, powers = _measured(captures, plan, FINE, black, white, noise, sums)
+    averaged = sums.averaged(white)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        noise_of_white = white / averaged
+        for one in (coarse, fine):
+            np.multiply(one.contrast, noise_of_white, out=one.contrast)
+    return SinusoidContrast(coarse, fine, _contrast_around(powers, averaged), averaged)
 
 
 def indirect_share(
@@ -159,12 +168,15 @@ def _measured(
     black: FloatImage,
     white: FloatImage,
     camera: CameraNoise,
+    white_sums: WhiteSums,
 ) -> tuple[Sinusoids, list[FloatImage]]:
     """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise.
 
-    And (rows, columns, 3) of each axis: their squared amplitude, without noise.
+    And (rows, columns, 3) of each axis: their squared amplitude, without noise. What the steps of each axis add up to
+    goes into ``white_sums``.
     """
-    powers, sums = [], []
+    powers: list[FloatImage] = []
+    sums: list[FloatImage] = []
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
         images = (coloured(captures, step.name, black.shape[:2]) - black for step in steps)
@@ -174,7 +186,8 @@ def _measured(
             kept = list(images)
             kept = [image * np.float32(gain) for image, gain in zip(kept, _gains(kept, white), strict=True)]
             along, across = _amplitude(kept, steps)
-            sums.append(sum(kept))
+            sums.append(np.asarray(sum(kept), np.float32))
+            white_sums.add(sums[-1] * np.float32(2 / len(steps)))
         powers.append(along * along + across * across)
     if plan.computed:
         variance = step_variance(np.nan_to_num(white / 2 + black), camera)

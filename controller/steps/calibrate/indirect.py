@@ -22,6 +22,7 @@ from controller.calibrate.photometry.separation import (
     shown_contrast,
     sinusoid_contrast,
 )
+from controller.core.arrays import FloatImage
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -30,6 +31,8 @@ from controller.transport.indirect_stripes import dark_light
 
 PASSES: Final = 2
 """The share follows from the response by which sinusoids were shown, the response from the share."""
+GAIN_LIMITS: Final = 0.5, 2.0
+"""Noise changes no white image by more, where it says anything."""
 TOLD_AT: Final = 64
 """Device value at which the change of the response is reported."""
 
@@ -56,25 +59,34 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     known_px = used.known_px(folder, name)
     radiometry = light.radiometry
     seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
+    white = seen.white
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
-        share = indirect_share(seen, light.white, pixels.projector_px, linearity=linearity)
+        share = indirect_share(seen, white, pixels.projector_px, linearity=linearity)
         radiometry, _ = measure_radiometry(
             captures,
             plan,
-            indirect=KnownIndirect(share * light.white, radiometry),
+            indirect=KnownIndirect(share * white, radiometry),
             known_px=known_px,
             noise=noise,
         )
-    median, p95 = indirect_figures(share, light.white)
+    median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
     segment = np.array([radiometry.segment]) if radiometry.segment else None
     known = pixels.phase_map
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
-    found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes)
+    found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, _gain(white, light.white))
     return [found.write(folder, name), figures.write(folder, name)]
+
+
+def _gain(white: FloatImage, photographed: FloatImage) -> FloatImage | None:
+    """``white`` over that ``photographed``, 1 where one of them is not known; None where they are the same."""
+    if white is photographed:
+        return None
+    gain = np.divide(white, photographed, out=np.ones_like(white), where=photographed > 0)
+    return np.asarray(np.clip(np.nan_to_num(gain, nan=1.0), *GAIN_LIMITS), np.float32)
 
 
 __all__ = ["indirect_step"]

@@ -167,8 +167,8 @@ def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context
     elif step.kind == StepKind.INDIRECT:
         found = Indirect.read(context.folder, name)
         mixing = update_radiometry(found.radiometry, one.gain).mixing if one.dimmed else found.mixing
-        # its stripes lay elsewhere or were brighter; those of the others are enough
-        dataclasses.replace(found, mixing=mixing, stripes=None).write(context.folder, name)
+        # its stripes lay elsewhere or were brighter; those of the others are enough. Its white is photographed again.
+        dataclasses.replace(found, mixing=mixing, stripes=None, white_gain=None).write(context.folder, name)
     else:
         _correct_light(context.folder, name, one)
     return kept

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.artefacts.projectors import Indirect, IndirectFigures, read_indirect
+from controller.artefacts.projectors import Indirect, IndirectFigures, read_indirect, read_white_gain
 
 NAMES = ("left", "right")
 
@@ -53,3 +53,15 @@ def test_what_stripes_tell_is_kept(tmp_path: Path) -> None:
     found = Indirect.read(tmp_path, "left")
     np.testing.assert_array_equal(found.stripes, stripes)
     assert found.segment is None
+
+
+def test_a_white_image_with_less_noise_is_kept(tmp_path: Path) -> None:
+    gain = (1 + 0.02 * np.random.default_rng(2).standard_normal((2, 3, 3))).astype(np.float32)
+    share, response = np.zeros((2, 3, 3), np.float32), np.full((3, 256), 0.5)
+    Indirect(share, response, np.eye(3), white_gain=gain).write(tmp_path, "left")
+    write(tmp_path, "right", 0.2, 0.4)
+    kept = read_white_gain(tmp_path, "left")
+    assert kept is not None
+    np.testing.assert_allclose(kept, gain, atol=5e-4)
+    assert read_white_gain(tmp_path, "right") is None
+    assert read_white_gain(tmp_path, "above") is None
