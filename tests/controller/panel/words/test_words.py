@@ -82,6 +82,16 @@ def test_the_kiosks_own_words_are_all_known() -> None:
     assert {role.name.lower() for role in Role} == set(spoken.ROLES)
 
 
+def test_every_reason_that_is_translated_is_one_that_the_kiosk_gives() -> None:
+    given = {
+        part.value
+        for file in KIOSK.rglob("*.py")
+        for part in ast.walk(ast.parse(file.read_text()))
+        if isinstance(part, ast.Constant)
+    }
+    assert set(spoken.REASONS) <= given, "change the sentence in spoken.py, too"
+
+
 def test_what_the_devices_say_is_known() -> None:
     """Every pattern that stands in the kiosk's code; those that it puts together are named here."""
     said = {condition.value for condition in Condition} | {DARK_ENOUGH, TOO_BRIGHT}
