@@ -33,7 +33,7 @@ from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.kiosk.supervisors.lamp_history import LampHistory
-from controller.kiosk.supervisors.player_supervisor import OUTPUT_GONE, PlayerSupervisor
+from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Thread, World
 from controller.play.control.attached import AttachedPlayer
@@ -117,6 +117,7 @@ class Service:
             stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log,
             monotonic=world.monotonic, wall=world.wall, ways=world.ways_out,
         )  # fmt: skip
+        self.good_settings = settings_change.GoodSettings()
         self.changed: Callable[[], None] = lambda: None
         self._stop = world.event()
         self._threads: list[Thread] = []
@@ -140,7 +141,7 @@ class Service:
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S, sooner=self._decided)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
-        self._thread("disk", self.disk.step, DISK_S)
+        self._thread("disk", self._watch_disk, DISK_S)
         self._thread("alerts", self.alerts.step, LOOK_S)
         self._thread("backups", self.backups.step, BACKUP_S)
         self._thread("inventories", self.inventories.step, INVENTORY_S, first_s=INVENTORY_S)
@@ -204,7 +205,7 @@ class Service:
         """Use settings that differ only in what no device depends on (``settings_change``)."""
         self.checked, self.problem = checked, None
         self.devices.use(checked)
-        settings_change.keep_good(checked)
+        self.good_settings.keep(checked)
 
     def rows(self) -> tuple[DeviceRow, ...]:
         """Every device as the panel shows it."""
@@ -218,6 +219,10 @@ class Service:
         self.reconciler.submit(*requests)
 
     # -- inside
+
+    def _watch_disk(self) -> None:
+        self.disk.step()
+        self.good_settings.step()
 
     def _go_on(self) -> None:
         for request, again in self.reconciler.go_on():
@@ -259,8 +264,8 @@ class Service:
 
     def _missing_for_work(self) -> Decision | None:
         """The device that photographs need and that is missing, or None."""
-        problem = self.player.view.problem
-        if problem is not None and problem.code == OUTPUT_GONE:
+        problem = self.player.view.outputs
+        if problem is not None:
             return replace(problem, reason=f"No photographs are possible without it. {problem.reason}")
         return self.devices.missing_for_work()
 

@@ -67,7 +67,7 @@ def serving(
                 service.start()
                 loop.start()
                 if problem is None:
-                    settings_change.keep_good(checked)
+                    service.good_settings.keep(checked)
                 yield service
             finally:
                 ended.set()

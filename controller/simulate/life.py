@@ -48,6 +48,7 @@ while all is well.
 CALMER: Final = 3.0
 END_S: Final = 150.0
 SERVES_S: Final = 60.0
+KEEPS_S: Final = 30.0
 GOOD: Final = "kiosk/stage.toml.good"
 
 
@@ -102,6 +103,7 @@ class Life:
         self.sound: dict[str, bytes] = {}
         """What people will write again into files that are damaged."""
         self.repaired_s = 0.0
+        self._keep_by_s: float | None = None
         self._repairs: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
 
@@ -231,14 +233,13 @@ class Life:
 
     def _follow(self, kiosk: StageKiosk, service: Service) -> None:
         self.service = service
-        if "stage.toml" not in self.unreadable:
-            # A good one is kept again.
-            self.unreadable.clear()
+        self._keep_by_s = None
         self.witness.begins()
         refresh = service.changed
 
         def stepped() -> None:
             refresh()
+            self._keeps_good()
             if self.broken is None and self.service is service:
                 try:
                     self._calm(service, news=self.witness.judge(kiosk, service))
@@ -254,6 +255,16 @@ class Life:
             self.news.set()
         self.damaged.clear()
         service.changed = stepped
+
+    def _keeps_good(self) -> None:
+        """A service that runs with a sound stage.toml has a copy of it, soon after the disk takes one."""
+        now_s = self.world.scheduler.now_s
+        if self.world.disk.full or "stage.toml" in self.unreadable:
+            self._keep_by_s = None
+        elif self._keep_by_s is None:
+            self._keep_by_s = now_s + KEEPS_S
+        elif now_s > self._keep_by_s:
+            self.unreadable.clear()
 
     def _calm(self, service: Service, *, news: bool) -> None:
         """Stretch pauses while nothing happens."""

@@ -17,6 +17,10 @@ DISK_FULL: Final = "disk-full"
 """The code of the one problem that several devices may have because nothing can be written."""
 
 
+NOT_YET: Final = "camera-not-yet"
+"""The code of the refusal of work while nobody knows whether the camera is there: the kiosk has just started."""
+
+
 class Condition(enum.Enum):
     """The state of a projector, as far as its control line shows it."""
 
@@ -92,6 +96,7 @@ BLACK: Final = Showing(None)
 class PlayerView:
     """``shown``: what the player showed at its last answer; ``problem``: why it does not show what it should.
 
+    ``outputs``: that some of them get no picture, which is also part of ``problem``;
     ``warning``: what people must know although it plays, for example that its bundle is not signed.
     """
 
@@ -99,6 +104,7 @@ class PlayerView:
     problem: Decision | None = None
     restarts: int = 0
     warning: Decision | None = None
+    outputs: Decision | None = None
 
 
 class PlayerPort(Protocol):

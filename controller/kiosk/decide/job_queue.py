@@ -10,7 +10,7 @@ from typing import Final
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide import kept_work
-from controller.kiosk.decide.interfaces import Condition, Finished, Jobs, ProjectorView, Request
+from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
 
@@ -108,9 +108,6 @@ class JobQueue:
             finished = replace(finished, then=())
             self._log.add(_CANCELLED)
         self._cancelled = False
-        key = finished.request.key
-        if key and not any(request.key == key for request in finished.then):
-            self._log.mark_done(key, finished.outcome.code)
         self._queue.extendleft(reversed(finished.then))
         self._keep()
         return finished
@@ -125,6 +122,8 @@ class JobQueue:
             if playing or self.head is not None or self._holder is not None:
                 continue
             if (why := self._jobs.refusal(request)) is not None:
+                if why.code == NOT_YET:
+                    continue
                 self._log.mark_done(task.key, why.code)
                 reason = f"The {task.what} ({task.key}) is skipped. {why.reason}"
                 self._log.add(replace(why, reason=reason, level="warning"))
@@ -158,7 +157,12 @@ class JobQueue:
         return None
 
     def begin(self) -> None:
-        self._jobs.begin(self._queue.popleft())
+        request = self._queue.popleft()
+        if request.key:
+            # Before it begins: one that ends the whole computer would be begun again and again all night.
+            self._log.mark_done(request.key, "begun")
+        self._jobs.begin(request)
+        self._keep()
 
     def drop(self, why: Decision) -> None:
         """Drop all waiting jobs."""
@@ -175,7 +179,10 @@ class JobQueue:
 
     def _keep(self) -> None:
         running = () if self._jobs.running is None or self._cancelled else (self._jobs.running,)
-        kept_work.keep(self._log, (*running, *self._queue), self._again)
+        # A task of the schedule that was not begun is due again anyway.
+        begun = self._log.done()
+        waiting = [request for request in self._queue if not request.key or request.key in begun]
+        kept_work.keep(self._log, (*running, *waiting), self._again)
 
     def _tell(self, outcome: Decision) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""

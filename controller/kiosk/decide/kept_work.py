@@ -16,7 +16,7 @@ _BACKGROUND: Final = "takeover"
 
 
 def keep(log: EventLog, requests: Iterable[Request], again: frozenset[Request]) -> None:
-    """Keep these requests, but those of the schedule, which are due again anyway.
+    """Keep these requests, but those that are asked for again as long as they are needed.
 
     ``again``: those that were begun a second time.
     """
@@ -39,4 +39,4 @@ def unfinished(log: EventLog) -> list[tuple[Request, bool]]:
 
 
 def _is_kept(request: Request) -> bool:
-    return not request.key and request.kind != _BACKGROUND
+    return request.kind != _BACKGROUND

@@ -16,11 +16,12 @@ from controller.kiosk.store.event_log import Decision, EventLog
 class Override:
     """An operator ``wanted`` the stage open (or closed) while the schedule ``said`` otherwise.
 
-    ``until_s``: the next scheduled change, as last computed; None if there was none.
+    ``said``: None while the time was unknown; ``until_s``: the next scheduled change, as last computed; None if there
+    was none.
     """
 
     wanted: bool
-    said: bool
+    said: bool | None
     until_s: float | None = None
 
 
@@ -31,7 +32,8 @@ class OperatorOverrides:
         self._log = log
         self._without_time = without_time
         self._override = _override_in(log.value("override"))
-        self._restored = self._override is not None
+        self._missed = self._override is not None
+        """Whether scheduled changes may have passed unseen."""
         self._chosen = log.value("chosen") or ""
         self._scheduled = log.value("scheduled") or ""
 
@@ -41,11 +43,11 @@ class OperatorOverrides:
     def would_be_open(self, plan: Plan) -> bool:
         """As ``open``, if this were the plan: an operator's wish ends when the schedule says something new."""
         override, says = self._override, self._says(plan)
-        return override.wanted if override is not None and override.said is says else says
+        return override.wanted if override is not None and override.said in (None, says) else says
 
     def override(self, wanted: bool, plan: Plan) -> None:
-        """Open or closed until the next scheduled change."""
-        self._set(Override(wanted, self._says(plan), plan.changes_s) if wanted is not self._says(plan) else None)
+        """Open or closed until the next scheduled change. Without the time: until the first one after it is known."""
+        self._set(Override(wanted, plan.open, plan.changes_s) if wanted is not plan.open else None)
         action = "open" if wanted else "close"
         self._log.add(Decision("asked", f"An operator asked to {action} the stage."))
 
@@ -61,16 +63,19 @@ class OperatorOverrides:
                 self._choose(plan.appearance)
 
     def _follow(self, override: Override, plan: Plan) -> None:
-        # A stage without power may have missed two changes that cancel each other out.
+        if plan.open is None:
+            self._missed = True
+            return
+        # Without power, or without the time, two changes that cancel each other out may have been missed.
         now_s, then_s = plan.changes_s, override.until_s
-        slept = self._restored and now_s is not None and then_s is not None and now_s > then_s
-        if override.said is not self._says(plan) or slept:
+        missed = self._missed and now_s is not None and then_s is not None and now_s > then_s
+        self._missed = False
+        needless = override.said is None and override.wanted is plan.open
+        if needless or missed or override.said not in (None, plan.open):
             self._set(None)
             self._log.add(Decision("schedule-rules", "The stage follows the schedule again."))
-        elif plan.open is not None:
-            self._restored = False
-            if plan.changes_s != override.until_s:
-                self._set(replace(override, until_s=plan.changes_s))
+        elif (override.said, override.until_s) != (plan.open, plan.changes_s):
+            self._set(replace(override, said=plan.open, until_s=plan.changes_s))
 
     def choose(self, appearance: str, plan: Plan) -> None:
         self._choose(appearance)
@@ -104,6 +109,6 @@ def _override_in(text: str | None) -> Override | None:
     if not isinstance(stored, list) or len(stored) not in (2, 3):
         return None
     wanted, said, until_s = (*stored, None)[:3]
-    if not isinstance(wanted, bool) or not isinstance(said, bool):
+    if not isinstance(wanted, bool) or not isinstance(said, bool | None):
         return None
     return Override(wanted, said, float(until_s) if isinstance(until_s, int | float) else None)

@@ -111,12 +111,13 @@ class StageStates:
             if not any(view.condition is Condition.LIT or view.maybe_lit for view in views):
                 self.go(Event.STOP, "closed")
         elif self._answers_again(views):
-            self.go(Event.START, "a projector answers again")
+            self.go(Event.START, f"a projector answers again. Before: {self.machine.reason}")
         elif any(view.condition is Condition.LIT for view in views) or self._waited(
             RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
         ):
             self._attempts += 1
-            self.go(Event.START, "trying again")
+            # Lamps take minutes, and until then people ask why it is dark.
+            self.go(Event.START, f"trying again. Before: {self.machine.reason}")
 
     def _answers_again(self, views: Sequence[ProjectorView]) -> bool:
         """Whether one does that was silent in this fault: after a power cut, projectors boot longer than computers."""

@@ -60,19 +60,36 @@ def change(before: StageTables, after: StageTables) -> Change:
     return Change(frozenset(names), tuple(moved))
 
 
-def keep_good(checked: Checked, source: Path | None = None) -> None:
-    """Copy the stage.toml that the kiosk runs with, to start with it if the next one is damaged.
+class GoodSettings:
+    """Keeps the stage.toml that the kiosk runs with, to start with it if the next one is damaged.
 
-    A disk that can't be written keeps the older copy.
+    A disk that can't be written keeps the older copy until it can: ``step`` tries again.
     """
-    stage = checked.stage.folder
-    try:
-        content = read_bytes(source or stage / FILE)
-        if not (stage / GOOD).exists() or read_bytes(stage / GOOD) != content:
-            (stage / GOOD).parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(stage / GOOD, content, mode=0o600)
-    except (OSError, VelaturaError):
-        return
+
+    def __init__(self) -> None:
+        self._waiting: tuple[Path, bytes] | None = None
+
+    def keep(self, checked: Checked) -> None:
+        """Keep the stage.toml that ``checked`` was just read from."""
+        stage = checked.stage.folder
+        try:
+            self._waiting = stage / GOOD, read_bytes(stage / FILE)
+        except (OSError, VelaturaError):
+            return
+        self.step()
+
+    def step(self) -> None:
+        """Write what could not be written yet."""
+        if self._waiting is None:
+            return
+        path, content = self._waiting
+        try:
+            if not path.exists() or read_bytes(path) != content:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(path, content, mode=0o600)
+        except (OSError, VelaturaError):
+            return
+        self._waiting = None
 
 
 def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) -> tuple[Checked, Decision]:

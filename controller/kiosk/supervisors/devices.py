@@ -12,7 +12,7 @@ from typing import Any, Final, cast
 from controller.core.text import printable
 from controller.kiosk.changes.devices import camera_facts, projector_facts
 from controller.kiosk.changes.inventory import Fact
-from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
+from controller.kiosk.decide.interfaces import DISK_FULL, NOT_YET, Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
@@ -106,9 +106,7 @@ class Devices:
     def missing_for_work(self) -> Decision | None:
         """The missing device that photographs need, or None."""
         if self.camera.device is None or self.camera.problem is not None:
-            problem = self.camera.problem or Decision(
-                "camera-missing", "The camera is not connected yet.", "Wait for it."
-            )
+            problem = self.camera.problem or Decision(NOT_YET, "The camera is not connected yet.", "Wait for it.")
             reason = f"No photographs are possible without the camera. {problem.reason}"
             return replace(problem, reason=reason, level="error")
         views = [supervisor.view for supervisor in self.projectors]

@@ -202,13 +202,15 @@ class PlayerSupervisor:
         # One that died after it had shown its picture says nothing about the bundle.
         self._starts_without_picture += self._dark and self.want != BLACK
         self._start_at_s = self._monotonic() + BACK_OFF_S[min(max(self._failed - 1, 0), len(BACK_OFF_S) - 1)]
-        self._view = replace(self._view, shown=None, problem=why, restarts=self._view.restarts + 1)
+        self._view = replace(self._view, shown=None, problem=why, outputs=None, restarts=self._view.restarts + 1)
         if self._monotonic() >= self._start_at_s:
             self._start()
 
     # -- showing
 
     def _follow(self, status: dict[str, Any]) -> None:
+        # First: a bundle that can't be read ends this step, and people need to know of the cable, too.
+        self._see_outputs(status)
         path = self._identities.get(str(status["bundle"]))
         name = status["appearance"] if status["showing"] == "appearance" else ""
         shown = BLACK if status["showing"] == "black" else None
@@ -235,12 +237,16 @@ class PlayerSupervisor:
             shown = want
         if self._monotonic() - self._started_at_s >= HEALTHY_S:
             self._failed = 0
-        problem = _outputs_problem(status)
-        if problem is not None and problem != self._view.problem:
-            self._tell(problem)
-        elif problem is None and self._view.problem is not None:
+        outputs = self._view.outputs
+        if outputs is None and self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
-        self._view = replace(self._view, shown=shown, problem=problem, warning=self._warning(status))
+        self._view = replace(self._view, shown=shown, problem=outputs, warning=self._warning(status))
+
+    def _see_outputs(self, status: dict[str, Any]) -> None:
+        outputs = _outputs_problem(status)
+        if outputs is not None and outputs != self._view.outputs:
+            self._tell(outputs)
+        self._view = replace(self._view, outputs=outputs)
 
     def _is_shown(self, want: Showing, shown: Showing | None, status: dict[str, Any]) -> bool:
         running = bool(status["sequence_running"])
@@ -295,6 +301,9 @@ class PlayerSupervisor:
     def _trouble(self, problem: Decision) -> None:
         if self._view.problem is None or self._view.problem.code != problem.code:
             self._tell(problem)
+        if (outputs := self._view.outputs) is not None:
+            problem = replace(problem, reason=f"{problem.reason} {outputs.reason}",
+                              remedy=f"{problem.remedy} {outputs.remedy}")  # fmt: skip
         self._view = replace(self._view, problem=problem, shown=None)
 
     def _ask(self, request: dict[str, Any], timeout_s: float = ANSWER_S) -> dict[str, Any]:

@@ -70,6 +70,8 @@ class ProjectorSupervisor:
         self._silent_since_s: float | None = None
         self._reopen_at_s = 0.0
         self._struck_at_s: float | None = None
+        """Since when its light is awaited: the attempt, then the first answer that it warms up."""
+        self._warms = False
         self._failed_strikes, self._remembered = 0, False
         self._burning = False
         self._faulty_since_s: float | None = None
@@ -238,19 +240,26 @@ class ProjectorSupervisor:
         self._guard = None
 
     def _await_light(self, guard: LampGuard, status: ProjectorStatus) -> None:
-        if self._struck_at_s is None:
-            self._struck_at_s = self._clock.now_s()
+        if self._struck_at_s is None or not self._warms:
+            # A command may arrive late, and a lamp is not switched off in the middle of its warm-up.
+            self._struck_at_s, self._warms = self._clock.now_s(), True
         if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
             self._strike_failed()
             guard.switch_off(deadline=self._deadline(guard.switch_s))
-        self._see(Condition.LIGHTING, status, self._view.problem)
+        self._see(Condition.LIGHTING, status, self._awaited)
+
+    @property
+    def _awaited(self) -> Decision | None:
+        """The problem of a lamp that was switched on: what prevented it is over, what was wrong with it perhaps not."""
+        problem = self._view.problem
+        return None if problem is not None and problem.code == DISK_FULL else problem
 
     def _strike(self, guard: LampGuard, status: ProjectorStatus) -> None:
         self._went_dark(status)
         now_s = self._clock.now_s()
         if self._struck_at_s is not None:
             if now_s - self._struck_at_s <= self._light_limit_s(guard):
-                return self._see(Condition.LIGHTING, status, self._view.problem)
+                return self._see(Condition.LIGHTING, status, self._awaited)
             self._strike_failed()
         if self._failed_strikes >= MOST_STRIKES:
             return self._see(Condition.BROKEN, status, _unlit(self.name))
@@ -264,14 +273,14 @@ class ProjectorSupervisor:
         except DeviceError:
             # The projector may have received the command: without its answer, too, this is an attempt.
             if guard.use().strikes > strikes:
-                self._struck_at_s = now_s
+                self._struck_at_s, self._warms = now_s, False
             raise
         except VelaturaError as error:
             # The lamp counter can't be saved, so the lamp was not switched on.
             return self._see(Condition.BROKEN, status, _unrecorded(error))
-        self._struck_at_s = now_s
+        self._struck_at_s, self._warms = now_s, False
         self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
-        return self._see(Condition.LIGHTING, status, self._view.problem)
+        return self._see(Condition.LIGHTING, status, self._awaited)
 
     def _went_dark(self, status: ProjectorStatus) -> None:
         if self._burning:
@@ -330,7 +339,8 @@ class ProjectorSupervisor:
         code_before = before.problem.code if before.problem else ""
         if view.problem is not None and view.problem.code != code_before:
             self._tell(replace(view.problem, level="error"))
-        elif view.problem is None and before.problem is not None:
+        elif view.problem is None and before.problem is not None and code_before != DISK_FULL:
+            # The disk itself says when it has room again.
             self._tell(Decision("projector-back", f"Projector {self.name} works again ({view.condition.value})."))
 
 

@@ -11,7 +11,7 @@ from controller.kiosk.api.kiosk import StageKiosk
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.calendar import Calendar
-from controller.simulate.judge.witness import SETTLING_S
+from controller.simulate.judge.wanted import SETTLING_S
 from controller.simulate.scheduler import Killed
 
 
@@ -21,7 +21,7 @@ def whole(life: Living) -> Iterator[None]:
     try:
         yield
     except Killed:
-        life.witness.unsure_until_hours()
+        life.witness.wanted.unsure_until_hours()
         raise
 
 
@@ -53,7 +53,7 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
         witness.wanted.say(True)
         witness.disturb(0.0, SETTLING_S)
         if item.who == "start":
-            witness.forgive()
+            witness.lamps.forgive()
     elif item.who == "stop":
         witness.wanted.say(False)
         witness.disturb(0.0, SETTLING_S)
@@ -68,4 +68,4 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
     else:
         witness.disturb(0.0, 60.0)
     if life.world.disk.full:
-        life.witness.unsure_until_hours()
+        life.witness.wanted.unsure_until_hours()

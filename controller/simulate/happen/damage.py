@@ -36,14 +36,14 @@ def file_damaged(life: Living, item: Item) -> None:
             path.write_bytes(_damaged(before, item))
         if item.who.startswith("kiosk/events"):
             life.witness.begun_checks.clear()
-            life.witness.unsure_until_hours()
+            life.witness.wanted.unsure_until_hours()
         if item.who.endswith("lamps.json"):
-            life.witness.ledger_lost()
+            life.witness.lamps.ledger_lost()
         if item.who == "schedule.toml":
             # With other hours for a while, what people said may have ended.
-            life.witness.unsure_until_hours()
+            life.witness.wanted.unsure_until_hours()
         if item.who in ("stage.toml", "schedule.toml"):
-            life.witness.unsure(MEND_FILE_S + REPAIR_S)
+            life.witness.wanted.wrong(MEND_FILE_S + REPAIR_S)
             if item.who not in life.sound:  # of a file that is damaged twice, what it was before the first time
                 life.sound[item.who] = before
                 life.later(MEND_FILE_S, partial(_put_right, life, path))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
+from controller.kiosk.decide.planner import EARLIEST_S
 from controller.simulate.disk import TOTAL_BYTES
 from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
 from controller.simulate.happen.living import Living
@@ -46,7 +47,7 @@ def _open_if_given_up(life: Living, name: str) -> None:
         problem = supervisor.view.problem
         if supervisor.name == name and problem is not None and problem.code == "lamp-given-up":
             supervisor.forgive()
-            life.witness.forgive()
+            life.witness.lamps.forgive()
 
 
 def _lamp_fails(life: Living, item: Item) -> None:
@@ -67,7 +68,7 @@ def _new_lamp(life: Living, lamp: Lamp) -> None:
     if life.service is not None:
         for supervisor in life.service.devices.projectors:
             supervisor.forgive()
-    life.witness.forgive()
+    life.witness.lamps.forgive()
 
 
 def _lamp_reports(life: Living, item: Item) -> None:
@@ -111,18 +112,16 @@ def _player(life: Living, item: Item) -> None:
             screen.trouble = ""
 
         life.later(item.for_s, repair)
-    witness.disturb_player(item.for_s + again_s)
-    witness.disturb(item.for_s + again_s, PLAYER_S)
+    witness.disturb_picture(item.for_s + again_s)
     if fell:
         witness.player_fell()
 
 
 def _x_server(life: Living, item: Item) -> None:
     """It restarts, crashes again and again, or its computer's graphics are gone for hours."""
-    screen, witness = life.world.screen, life.witness
+    screen = life.world.screen
     screen.lose_server()
-    witness.disturb(item.for_s, PLAYER_S)
-    witness.disturb_player(item.for_s)
+    life.witness.disturb_picture(item.for_s)
 
     def repair() -> None:
         screen.no_server = False
@@ -132,10 +131,9 @@ def _x_server(life: Living, item: Item) -> None:
 
 def _cable(life: Living, item: Item) -> None:
     """A projector's video cable is out, or its extender is without power."""
-    screen, witness, output = life.world.screen, life.witness, OUTPUTS[item.who]
+    screen, output = life.world.screen, OUTPUTS[item.who]
     screen.unplugged.add(output)
-    witness.disturb(item.for_s, PLAYER_S)
-    witness.disturb_player(item.for_s)
+    life.witness.disturb_picture(item.for_s)
 
     def repair() -> None:
         screen.unplugged.discard(output)
@@ -180,7 +178,7 @@ def _killed(life: Living, item: Item) -> None:
     life.end_of_program()
     life.world.scheduler.sleep(2.0)
     life.boot()
-    life.witness.stays_lit = lit
+    life.witness.lamps.stays_lit = lit
 
 
 def _killed_writing(life: Living, item: Item) -> None:
@@ -198,26 +196,32 @@ def _power_cut(life: Living, item: Item) -> None:
     world.scheduler.sleep(item.for_s + 1.0)
     world.reboot()
     life.witness.disturb(0.0)
-    life.witness.forgive()
+    life.witness.lamps.forgive()
     life.boot()
 
 
 def _restarted(life: Living, item: Item) -> None:
     lit = life.witness.lamps_that_stay() if item.how == "lamps stay lit" else {}
     life.restart(lit=item.how == "lamps stay lit")
-    life.witness.stays_lit = lit
+    life.witness.lamps.stays_lit = lit
 
 
 def _clock(life: Living, item: Item) -> None:
-    world, witness = life.world, life.witness
+    world, wanted = life.world, life.witness.wanted
     world.clock_off_s, world.is_synchronised = item.number, False
-    life.witness.unsure(item.for_s + HOLD_S + REPAIR_S)
+    if world.wall() < EARLIEST_S and wanted.sure:
+        wanted.lose_time()
+    else:
+        wanted.wrong(item.for_s + HOLD_S + REPAIR_S)
 
     def repair() -> None:
+        if world.is_synchronised:
+            return
         world.clock_off_s, world.is_synchronised = 0.0, True
-        life.witness.unsure(HOLD_S + REPAIR_S)
-        if witness.wanted.override is not None:
-            life.witness.unsure_until_hours()
+        if wanted.unknown:
+            wanted.find_time()
+        else:
+            wanted.wrong(HOLD_S + REPAIR_S)
 
     life.later(item.for_s, repair)
 

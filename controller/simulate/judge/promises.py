@@ -19,7 +19,7 @@ PROMISES: Final = {
     "off is off": "When a stage says that every lamp is off, none burns that it struck.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",
-    "outputs named": "Outputs without a picture, and no others, are named while the player has no other problem.",
+    "outputs named": "Outputs without a picture, and no others, are named while the player answers.",
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
     "nothing lost": "Events, settings and counts survive each end of the service.",
     "once a night": "The nightly check is begun at most once a night.",

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
-from controller.kiosk.decide.interfaces import Condition, Request
+from controller.kiosk.decide.interfaces import Request
 from controller.kiosk.decide.live_changes import LiveChanges
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import SHOWN
-from controller.kiosk.supervisors.player_supervisor import OUTPUT_GONE
 from controller.run.state_machine import State
 from controller.simulate.judge.calendar import Calendar
+from controller.simulate.judge.lamps import BACK_S, LampWitness
 from controller.simulate.judge.promises import Broken
-from controller.simulate.judge.wanted import Wanted
+from controller.simulate.judge.wanted import SETTLING_S, Wanted
 from controller.simulate.stage import OUTPUTS
 from controller.simulate.world import SimulatedWorld
 
@@ -21,30 +21,23 @@ if TYPE_CHECKING:
     from controller.kiosk.api.kiosk import StageKiosk
     from controller.kiosk.service import Service
 
-SETTLING_S: Final = 200.0
-"""After a change of any kind, the stage may be between what it did and what it is to do: warm-up, rests, cooling."""
 REPAIR_S: Final = 2000.0
 """After a fault: the longest retry out of the state fault, and the lamps' times."""
 PLAYER_S: Final = 120.0
 """After trouble with the player: its longest pause before a start, and a start that fails."""
 BLACK_S: Final = 30.0
 DARK_S: Final = 240.0
-BACK_S: Final = 15.0
 HANGS_S: Final = 45.0
 """A start, two questions without an answer, and the pauses between them."""
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
-MOST_STRIKES: Final = 5
+CHECK_BEGINS: Final = "Started: Drift check."
 MOST_WORDS: Final = 240
 MOST_AGAIN: Final = 20
 """Of the same words; the longest pause between two starts of the player is 30 s."""
 WORDS_S: Final = 300.0
-STAYS_S: Final = 120.0
 WORK_S: Final = 3600.0
-LOOKED_S: Final = 300.0
-FAR_S: Final = 9 * 86_400.0
 _RESTING: Final = (State.OFF, State.COOLING, State.FAULT)
-_SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
 
 class Witness:
@@ -56,8 +49,9 @@ class Witness:
 
     def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
         self._world, self.wanted = world, Wanted(calendar, lambda: world.truth_s)
+        self.lamps = LampWitness(world)
         self.paused_long = False
-        self.disturbed_until_s, self.clock_wrong_until_s = SETTLING_S, 0.0
+        self.disturbed_until_s = SETTLING_S
         self.player_disturbed_until_s = 0.0
         self.changed_s = 0.0
         self._was_open: bool | None = None
@@ -67,20 +61,18 @@ class Witness:
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self.digested: list[str] = []
         self.here = "\0"
-        self._logged_state = ""
+        self._logged_state = self._logged_fault = ""
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
         self._found_since_s: dict[str, float] = {}
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
-        self._strikes_since: dict[str, int] = {}
-        self.begun_checks: dict[str, int] = {}
-        self._uncounted: dict[str, int] = {}
+        self.begun_checks: set[str] = set()
+        self._due_check = ""
         self._recent: deque[tuple[float, str]] = deque()
         self._often: Counter[str] = Counter()
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
-        self.stays_lit: dict[str, float | None] = {}
         self._work: Request | None = None
         self._work_since_s = 0.0
 
@@ -112,7 +104,7 @@ class Witness:
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
         now_s = self._world.scheduler.now_s
-        self._back_by_s, self.stays_lit = None, {}
+        self._back_by_s, self.lamps.stays_lit = None, {}
         self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
 
     def disturb_player(self, for_s: float) -> None:
@@ -121,35 +113,20 @@ class Witness:
             self.player_disturbed_until_s, self._world.scheduler.now_s + for_s + PLAYER_S
         )
 
+    def disturb_picture(self, for_s: float) -> None:
+        """Something between player and projectors fails for so long: both excuses end when the player shows again."""
+        self.disturb(for_s, PLAYER_S)
+        self.disturb_player(for_s)
+
     def next_edge_s(self) -> float:
         """When hours change next, in the world's time."""
         return self.wanted.edge_s() - self._world.begins_unix_s
-
-    def unsure(self, for_s: float) -> None:
-        """For so long nobody knows from outside whether the kiosk takes itself for open."""
-        self.clock_wrong_until_s = max(self.clock_wrong_until_s, self._world.scheduler.now_s + for_s)
-
-    def unsure_until_hours(self) -> None:
-        """As ``unsure``, until the hours change next; what people said before may have ended."""
-        self.wanted.override = None
-        self.unsure(min(self.next_edge_s() - self._world.scheduler.now_s, FAR_S) + SETTLING_S)
 
     def lamps_that_stay(self) -> dict[str, float | None]:
         """Those that a restart now must leave lit, and since when they are."""
         if not (self.calm and self.wanted.open()):
             return {}
-        return {name: lamp.lit_at_s for name, lamp in self._world.lamps.items() if lamp.shines}
-
-    def forgive(self) -> None:
-        """Lamps may be tried again."""
-        self._strikes_since = {name: lamp.strikes for name, lamp in self._world.lamps.items()}
-
-    def ledger_lost(self) -> None:
-        """The counts of strikes start again."""
-        self.forgive()
-        self._uncounted = {
-            name: line.lamp.strikes - line.lamp.doubled + line.delayed for name, line in self._world.lines.items()
-        }
+        return self.lamps.lit()
 
     # -- judging
 
@@ -164,9 +141,6 @@ class Witness:
         if scheduler.crashes:
             name, error = scheduler.crashes[0]
             raise Broken("no crash", f"{name}: {type(error).__name__}: {error}")
-        for lamp in world.lamps.values():
-            if lamp.sins:
-                raise Broken("lamp rules", lamp.sins[0])
         if now_s - self._stepped_s > DECIDES_S and not self.paused_long:
             raise Broken("decides always", f"it did not for {now_s - self._stepped_s:.1f} s")
         self._stepped_s = now_s
@@ -175,12 +149,12 @@ class Witness:
         if wanted is not self._was_open:
             self._was_open, self.changed_s = wanted, now_s
             if wanted:
-                self.forgive()
+                self.lamps.forgive()
         state = service.reconciler.machine.state
         if self._logged_state != state.value:
             raise Broken("state", f"it says {self._logged_state}, but it is {state.value}")
-        self._strikes(service)
-        self._stay_lit(wanted)
+        surely = wanted and self.wanted.sure
+        self.lamps.judge(service, serving_s=now_s - self._began_s, open_surely=surely)
         self._works(service)
         self._alerts()
         self._player(service)
@@ -213,17 +187,25 @@ class Witness:
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
                 raise Broken("remedy", f"{row.code}: {row.text}")
             if row.code == "state":
-                self._off(row)
+                self.lamps.off(row)
+                if row.text.startswith("The stage is fault"):
+                    self._logged_fault = row.text
                 self._logged_state = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
             elif row.code == "task-due":
                 open_s = now_s - self.changed_s
-                if self._was_open and self.wanted.open() and open_s > BLACK_S and now_s > self.clock_wrong_until_s:
+                if self._was_open and self.wanted.open() and open_s > BLACK_S and self.wanted.sure:
                     raise Broken("at night", row.text)
-                key = row.text.partition("(")[2].partition(")")[0]
-                self.begun_checks[key] = self.begun_checks.get(key, 0) + 1
-                if self.begun_checks[key] > 1:
-                    raise Broken("once a night", row.text)
+                self._due_check = row.text.partition("(")[2].partition(")")[0]
+            elif row.text == CHECK_BEGINS:
+                self._check_begins(service)
         return True
+
+    def _check_begins(self, service: Service) -> None:
+        if self._due_check in self.begun_checks:
+            raise Broken("once a night", f"{self._due_check} begins again")
+        if service.log.problem is None:
+            # What can't be written may be done again after a kill.
+            self.begun_checks.add(self._due_check)
 
     def _said(self, row: EventRow) -> None:
         now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
@@ -235,35 +217,6 @@ class Witness:
             raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
         if often[row.text] >= MOST_AGAIN:
             raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
-
-    def _off(self, row: EventRow) -> None:
-        for name, line in self._world.lines.items():
-            # A look is some seconds old; a command that was under way may have struck it since.
-            seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
-            if line.lamp.lit and seen and not line.lamp.by_hand and row.text.startswith("The stage is off: every lamp"):
-                raise Broken("off is off", f"the lamp of {name} burns")
-
-    def _strikes(self, service: Service) -> None:
-        for supervisor in service.devices.projectors:
-            lamp, view = self._world.lamps[supervisor.name], supervisor.view
-            # A look at it after the strike has ended.
-            seen = view.condition in _SEEN and self._world.scheduler.now_s - lamp.struck_at_s > LOOKED_S
-            # Nobody can count a strike by the second of one command, after the first one's light went out.
-            commanded = lamp.strikes - lamp.doubled
-            if seen and view.strikes < commanded - self._uncounted.get(lamp.name, 0):
-                raise Broken("strikes counted", f"{view.strikes} instead of {commanded} for {lamp.name}")
-        for name, lamp in self._world.lamps.items():
-            if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.bad:
-                raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
-            if not lamp.bad:
-                self._strikes_since[name] = lamp.strikes
-
-    def _stay_lit(self, wanted: bool) -> None:
-        if not wanted or self._world.scheduler.now_s - self._began_s > STAYS_S:
-            self.stays_lit = {}
-        for name, since_s in self.stays_lit.items():
-            if self._world.lamps[name].lit_at_s != since_s:
-                raise Broken("lit through a restart", f"the lamp of {name} went off")
 
     def _works(self, service: Service) -> None:
         now_s, running = self._world.scheduler.now_s, service.jobs.running
@@ -290,12 +243,11 @@ class Witness:
         self._outputs(service)
 
     def _outputs(self, service: Service) -> None:
-        """What is said of the outputs while the player has no other problem: exactly those that get no picture."""
+        """What is said of the outputs while the player answers: exactly those that get no picture."""
         screen, problem = self._world.screen, service.player.view.problem
         text = "" if problem is None else problem.text
         said = {output for output in OUTPUTS.values() if output in text}
-        other = problem is not None and problem.code != OUTPUT_GONE
-        wrong = sorted(said ^ screen.unplugged) if screen.serves and not other else []
+        wrong = sorted(said ^ screen.unplugged) if screen.serves else []
         if self._found_s("outputs", bool(wrong)) > BLACK_S:
             raise Broken("outputs named", f"{', '.join(wrong)} for {BLACK_S:.0f} s, and it says: {text or 'nothing'}")
 
@@ -312,11 +264,11 @@ class Witness:
     def calm(self) -> bool:
         """Whether no fault, and nothing that follows of one, excuses anything now."""
         now_s = self._world.scheduler.now_s
-        return now_s > self.disturbed_until_s and now_s > self.clock_wrong_until_s
+        return now_s > self.disturbed_until_s and self.wanted.sure
 
     def _closed(self, service: Service, state: State, wanted: bool) -> None:
         world, now_s = self._world, self._world.scheduler.now_s
-        if wanted or now_s <= self.clock_wrong_until_s:
+        if wanted or not self.wanted.sure:
             self._found_s("restless", False)
             return
         shut_s = now_s - max(self.changed_s, self._began_s)
@@ -348,7 +300,7 @@ class Witness:
             self._black_since_s = None
         elif self._black_since_s is None:
             self._black_since_s = now_s
-        if not wanted or now_s <= self.clock_wrong_until_s:
+        if not wanted or not self.wanted.sure:
             self._back_by_s = None
             self._found_s("unexplained", False)
             return
@@ -397,6 +349,9 @@ class Witness:
             # What was wrong first may be over: people would look for it in the wrong place.
             return player.reason in snapshot.reason
         if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
+            return True
+        before = snapshot.reason.partition("Before: ")[2].rstrip(".")
+        if state in (State.POWERING, State.WARMING) and before and before in self._logged_fault:
             return True
         return (
             bool(snapshot.warnings)

@@ -13,17 +13,27 @@ from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import Life
 
 FOUND = Path(__file__).parent / "found"
+ROOT = Path(__file__).parents[3]
 ONE = "from controller.simulate.life import Life; print(Life('same', 0.5).live().digest)"
 
 
-def digest(hash_seed: str) -> str:
-    environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
-    done = subprocess.run([sys.executable, "-c", ONE], env=environment, capture_output=True, text=True, check=True)
+def digest(folder: Path, cores: int, **variables: str) -> str:
+    """Of a life in a process of its own: in ``folder``, on so many cores, with a mask of its own for file modes."""
+    some = sorted(os.sched_getaffinity(0))[:cores]
+    begin = f"import os; os.sched_setaffinity(0, {some}); os.umask({cores + 0o22}); {ONE}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    done = subprocess.run(
+        [sys.executable, "-c", begin], cwd=folder, env=environment, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip()
 
 
-def test_the_same_seed_gives_the_same_event_log_in_every_process() -> None:
-    first, second = digest("1"), digest("77")
+def test_the_same_seed_gives_the_same_event_log_in_every_process(tmp_path: Path) -> None:
+    first = digest(ROOT, 8, PYTHONHASHSEED="1", TZ="UTC", LC_ALL="C.UTF-8")
+    second = digest(
+        tmp_path, 1, PYTHONHASHSEED="77", TZ="Australia/Lord_Howe", LC_ALL="POSIX", PYTHONUTF8="0",
+        HOME=str(tmp_path), TMPDIR=str(tmp_path), XDG_RUNTIME_DIR=str(tmp_path), COLUMNS="20",
+    )  # fmt: skip
     assert len(first) == 64
     assert first == second
 
@@ -60,5 +70,5 @@ def test_a_short_life_keeps_every_promise() -> None:
 
 
 def test_every_promise_is_on_the_page() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "how-to" / "simulate.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "simulate.md").read_text("utf-8")
     assert [name for name, sentence in PROMISES.items() if f"| {name} | {sentence} |" not in page] == []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.interfaces import Condition, Finished, ProjectorView, Request
+from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, ProjectorView, Request
 from controller.kiosk.decide.job_queue import JobQueue
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
@@ -114,20 +114,35 @@ def test_work_that_a_power_cut_ended_is_told_and_done_again_once_unless_it_needs
 
 
 @pytest.mark.parametrize("cancelled_while", ["it waits", "it runs"])
-def test_work_that_was_cancelled_or_belongs_to_the_schedule_is_not_done_again(desk: Desk, cancelled_while: str) -> None:
+def test_work_that_was_cancelled_is_not_done_again(desk: Desk, cancelled_while: str) -> None:
     desk.queue.submit(PUBLISH, REPORT)
     if cancelled_while == "it runs":
         desk.begin()
     desk.queue.cancel()
     desk.begin_anew()
     assert desk.queue.go_on() == []
+
+
+def test_a_nightly_check_that_a_power_cut_ended_is_told_and_not_begun_again_that_night(desk: Desk) -> None:
+    desk.queue.take_due(Plan(None, due=(DRIFT,)), playing=False)
+    assert desk.log.done() == frozenset(), "until it begins, it is due again anyway"
+    desk.begin_anew()
+    assert desk.queue.go_on() == []
+    desk.queue.take_due(Plan(None, due=(DRIFT,)), playing=False)
+    assert desk.begin(LIT) is not None
+    assert desk.log.done() == {DRIFT.key}
+    desk.begin_anew()
+    assert [(request.kind, again) for request, again in desk.queue.go_on()] == [("drift", False)]
+    assert desk.begin(LIT) is None
+
+
+def test_what_follows_a_nightly_check_is_done_again_after_a_power_cut(desk: Desk) -> None:
     desk.queue.take_due(Plan(None, due=(DRIFT,)), playing=False)
     desk.begin(LIT)
     desk.jobs.end(replace(PUBLISH, key=DRIFT.key))
     desk.queue.take_finished()
-    desk.begin()
     desk.begin_anew()
-    assert desk.queue.go_on() == []
+    assert desk.queue.go_on() == [(PUBLISH, True)]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '[["publish"]]', "7", '[["publish", false, 3, false]]', "null"])
@@ -222,18 +237,18 @@ def test_cancelling_nothing_tells_nothing(desk: Desk) -> None:
     assert (desk.told, desk.jobs.cancelled) == ([], 0)
 
 
-def test_a_nightly_task_is_done_when_the_last_work_with_its_key_is(desk: Desk) -> None:
+def test_a_nightly_task_is_due_once_and_what_follows_it_is_done(desk: Desk) -> None:
     desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     assert desk.told == ["task-due"], "once"
     assert desk.begin(LIT) == Request("drift", light=True, key=DRIFT.key)
     desk.jobs.end(replace(QUICK, key=DRIFT.key))
     desk.queue.take_finished()
-    assert desk.log.done() == frozenset()
-    desk.begin(LIT)
+    assert desk.log.done() == {DRIFT.key}
+    assert desk.begin(LIT) == replace(QUICK, key=DRIFT.key)
     desk.jobs.end(REPORT)
     desk.queue.take_finished()
-    assert desk.log.done() == {DRIFT.key}
+    assert desk.begin() == REPORT
 
 
 def test_a_task_is_not_due_while_the_stage_plays_and_is_left_out_when_its_time_is_over(desk: Desk) -> None:
@@ -242,6 +257,15 @@ def test_a_task_is_not_due_while_the_stage_plays_and_is_left_out_when_its_time_i
     desk.queue.take_due(Plan(True, expired=(DRIFT,)), playing=True)
     assert desk.log.done() == {DRIFT.key}
     assert desk.told == ["task-left-out"]
+
+
+def test_a_task_that_is_due_when_the_kiosk_starts_waits_for_the_camera(desk: Desk) -> None:
+    desk.jobs.refused = Decision(NOT_YET, "The camera is not connected yet.", "Wait for it.")
+    desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
+    assert (desk.log.done(), desk.told) == (frozenset(), [])
+    desk.jobs.refused = None
+    desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
+    assert desk.told == ["task-due"]
 
 
 def test_a_task_that_can_not_be_done_is_left_out_with_the_reason(desk: Desk) -> None:

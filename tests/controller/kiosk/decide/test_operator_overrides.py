@@ -106,6 +106,40 @@ def test_an_override_is_kept_while_nobody_knows_the_time_after_a_power_cut(memor
     assert open_at(overrides, "05T11:00") == [True]
 
 
+@pytest.mark.parametrize(("asked_at", "wanted"), [("04T15:00", False), ("04T20:00", True)])
+def test_a_time_that_is_lost_for_a_while_ends_no_override(memory: Memory, asked_at: str, wanted: bool) -> None:
+    overrides = memory.overrides()
+    overrides.follow(at(asked_at))
+    overrides.override(wanted, at(asked_at))
+    overrides.follow(Plan(None))
+    assert overrides.open(Plan(None)) is wanted
+    assert open_at(overrides, asked_at, "05T02:00") == [wanted, wanted and asked_at == "04T20:00"]
+
+
+def test_a_time_that_is_lost_outlives_no_override_that_had_ended_meanwhile(memory: Memory) -> None:
+    overrides = memory.overrides()
+    overrides.follow(at("04T15:00"))
+    overrides.override(False, at("04T15:00"))
+    overrides.follow(Plan(None))
+    assert open_at(overrides, "05T11:00") == [True]
+
+
+@pytest.mark.parametrize("without_time", [False, True])
+@pytest.mark.parametrize("wanted", [False, True])
+def test_what_is_asked_without_the_time_lasts_until_the_first_change_after_it_is_known(
+    memory: Memory, wanted: bool, without_time: bool
+) -> None:
+    for known_at, then in (("04T15:00", "04T18:00"), ("04T20:00", "05T10:00")):
+        overrides = memory.overrides(without_time=without_time)
+        overrides.follow(Plan(None))
+        overrides.override(wanted, Plan(None))
+        assert overrides.open(Plan(None)) is wanted
+        overrides = memory.overrides(without_time=without_time)
+        overrides.follow(Plan(None))
+        assert open_at(overrides, known_at, then) == [wanted, then == "05T10:00"]
+        overrides.override(then == "05T10:00", at(then))
+
+
 def test_hours_that_are_edited_end_no_override_of_the_same_day(memory: Memory) -> None:
     longer = Schedule("Europe/Vienna", tuple(ScheduleRow(day, "10:00", "20:00") for day in DAYS))
     overrides = memory.overrides()

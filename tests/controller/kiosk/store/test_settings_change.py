@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from controller.config import load_stage
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.kiosk.store import settings
-from controller.kiosk.store.settings_change import GOOD, Change, change, keep_good, last_good
+from controller.kiosk.store import settings, settings_change
+from controller.kiosk.store.settings_change import GOOD, Change, GoodSettings, change, last_good
 from controller.services.calibrate import signing_key
 from controller.stage.check import check_stage
 from tests.controller.kiosk.vase import TEXT, vase
@@ -78,7 +78,7 @@ def test_a_projector_whose_mains_change_cools() -> None:
 def test_the_last_good_settings_stand_in_for_damaged_ones_which_stay_as_they_are(tmp_path: Path) -> None:
     stage = vase(tmp_path / "stage")
     (stage / "stage.toml").write_text(TEXT.replace("The vase", "The bust"))
-    keep_good(check_stage(stage))
+    GoodSettings().keep(check_stage(stage))
     (stage / "stage.toml").write_text(TEXT + "\n[camra]\n")
     with pytest.raises(UsageError) as damaged:
         check_stage(stage)
@@ -92,6 +92,25 @@ def test_the_last_good_settings_stand_in_for_damaged_ones_which_stay_as_they_are
     with pytest.raises(UsageError) as still:
         last_good(stage, damaged.value)
     assert still.value is damaged.value
+
+
+def test_good_settings_that_a_full_disk_did_not_take_are_kept_once_it_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, good = vase(tmp_path / "stage"), GoodSettings()
+    (stage / "stage.toml").write_text(TEXT)
+
+    def full(path: Path, content: bytes, mode: int) -> None:
+        raise WorkError("no-space", what="The disk is full.", remedy="Free some space.")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(settings_change, "write_atomically", full)
+        good.keep(check_stage(stage))
+        good.step()
+        assert not (stage / GOOD).exists()
+    (stage / "stage.toml").write_text("damaged since")
+    good.step()
+    assert (stage / GOOD).read_text() == TEXT
 
 
 def test_a_stage_that_the_panel_sets_up_trusts_its_own_key(tmp_path: Path) -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
+from controller.kiosk.decide.interfaces import Showing
+from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors import player_supervisor as player_keeper
+from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 
@@ -40,3 +45,69 @@ def test_a_player_that_starts_after_its_keeper_was_closed_is_ended(
     supervisor = PlayerSupervisor(tmp_path, settings, lambda _: None)
     supervisor.step()
     assert [process.alive for process in running] == [False]
+
+
+class Refusing:
+    """The socket of a player whose bundle is damaged; ``missing``: its outputs without a picture."""
+
+    def __init__(self) -> None:
+        self.missing: list[str] = []
+        self._answer = b""
+
+    def settimeout(self, seconds: float) -> None:
+        """It answers at once."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def sendall(self, data: bytes) -> None:
+        request = json.loads(data)
+        answer: dict[str, Any] = {"id": request["id"], "ok": False, "error": {
+            "code": "bundle-damaged", "what": "The bundle is damaged.", "remedy": "Publish it again."}}  # fmt: skip
+        if request["op"] == "status":
+            answer = {"id": request["id"], "ok": True, "bundle": None, "showing": "black", "appearance": None,
+                      "brightness": 1.0, "sequence_running": False, "skipped": 0,
+                      "missing_outputs": self.missing}  # fmt: skip
+        self._answer = json.dumps(answer).encode() + b"\n"
+
+    def recv(self, _: int) -> bytes:
+        return self._answer
+
+
+class ReadyProcess(ModelProcess):
+    socket = Path("player.sock")
+
+    def kill(self) -> None:
+        self.alive = False
+
+
+def test_an_output_without_a_picture_is_told_beside_a_damaged_bundle(tmp_path: Path) -> None:
+    wire, told, now_s = Refusing(), list[Decision](), [0.0]
+    supervisor = PlayerSupervisor(
+        tmp_path, lambda _: PlayerSettings([("P1", 8, 8), ("P2", 8, 8)], tmp_path / "outputs.frame"), told.append,
+        monotonic=lambda: now_s[0], launch=lambda runtime, settings: cast("Any", ReadyProcess(runtime, settings)),
+        channel=PlayerChannel(lambda *_: cast("Any", wire)),
+    )  # fmt: skip
+    supervisor.want = Showing(tmp_path / "b.vel", "1")
+    supervisor.identifying = False
+    for _ in range(60):
+        # After starts that show nothing, one runs without the bundle, and answers.
+        supervisor.step()
+        now_s[0] += 5.0
+        if not supervisor._with_bundle:
+            break
+    wire.missing = ["P2"]
+    supervisor.step()
+    problem, outputs = supervisor.view.problem, supervisor.view.outputs
+    assert problem is not None
+    assert outputs is not None
+    assert problem.code == "bundle-damaged"
+    assert "The bundle is damaged." in problem.reason
+    assert "P2" in problem.reason
+    assert "cable" in problem.remedy
+    supervisor.step()
+    assert [one.code for one in told].count("output-gone") == 1
+    wire.missing = []
+    supervisor.step()
+    assert supervisor.view.problem is not None
+    assert supervisor.view.problem.reason == "The bundle is damaged."

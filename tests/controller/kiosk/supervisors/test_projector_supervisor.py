@@ -4,15 +4,20 @@ from collections.abc import Callable
 
 import pytest
 
-from controller.kiosk.decide.interfaces import Condition
+from controller.kiosk.decide.interfaces import DISK_FULL, Condition
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES, REOPEN_AFTER_FAULT_S, ProjectorSupervisor
+from controller.kiosk.supervisors.projector_supervisor import (
+    LIGHT_MARGIN_S,
+    MOST_STRIKES,
+    REOPEN_AFTER_FAULT_S,
+    ProjectorSupervisor,
+)
 from controller.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import FragileLamp
-from tests.controller.rig.lamp_model import Shelf, World
+from tests.controller.rig.lamp_model import RULES, Shelf, World
 
 FAULT = ProjectorStatus(Power.FAULT, ("lamp-failed",))
 
@@ -44,6 +49,22 @@ class LateLamp(FragileLamp):
     def switch_on(self, *, deadline: Deadline) -> None:
         super().switch_on(deadline=deadline)
         raise DeviceTimeout("projector-not-confirmed", what="It did not switch in time.", remedy="Check its cable.")
+
+
+class SlowToStart(FragileLamp):
+    """Takes the command at once, and begins to warm up shortly before its light is awaited no longer."""
+
+    after_s = 2 * RULES.warm_up_s + LIGHT_MARGIN_S - 1.0
+    starts_at_s = float("inf")
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        self.starts_at_s = self.world.time_s + self.after_s
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        if self.world.time_s >= self.starts_at_s:
+            self.starts_at_s = float("inf")
+            self.strike(sin=True)
+        return super().status(deadline=deadline)
 
 
 class ShutMeanwhile(FragileLamp):
@@ -164,6 +185,28 @@ def test_a_lamp_whose_projector_answers_late_lights_by_one_strike() -> None:
     kept.supervisor.want_lit = True
     assert kept.run(600) is Condition.LIT
     assert kept.lamp.strikes == 1
+
+
+def test_a_lamp_whose_command_arrives_late_is_not_switched_off_while_it_warms_up() -> None:
+    kept = Kept(SlowToStart)
+    kept.supervisor.want_lit = True
+    assert kept.run(SlowToStart.after_s + 2.0) is Condition.LIGHTING
+    assert kept.run(120.0) is Condition.LIT
+    assert kept.lamp.strikes == 1
+    assert "lamp-not-lit" not in kept.codes
+
+
+def test_a_lamp_that_could_not_be_recorded_has_no_problem_once_it_is_struck(kept: Kept) -> None:
+    kept.shelf.full = True
+    kept.supervisor.want_lit = True
+    kept.run(5.0)
+    assert kept.supervisor.view.problem is not None
+    assert kept.supervisor.view.problem.code == DISK_FULL
+    kept.shelf.full = False
+    assert kept.run(2.0) is Condition.LIGHTING
+    assert kept.supervisor.view.problem is None
+    kept.run(300.0)
+    assert "projector-back" not in kept.codes
 
 
 def test_a_service_that_is_restarted_again_and_again_strikes_no_dead_lamp_anew(kept: Kept) -> None:
