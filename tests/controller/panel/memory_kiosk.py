@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import io
 import itertools
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,14 +24,11 @@ from controller.kiosk.interface import (
     Comparison,
     DriftCheck,
     EventLevel,
-    EventRow,
     Finding,
     Fit,
     FoundDevice,
     Grade,
     Job,
-    JobStep,
-    KioskState,
     LampDay,
     Reach,
     RecalibrationKind,
@@ -41,19 +37,18 @@ from controller.kiosk.interface import (
     Schedule,
     ScheduleRow,
     TriedDevice,
-    Unsubscribe,
 )
 from controller.kiosk.store import settings, targets
 from controller.kiosk.store.schedule_file import check
 from tests.controller.kiosk.vase import TEXT
 from tests.controller.panel import example_values as examples
 from tests.controller.panel.example_values import BORN, OUTPUTS
+from tests.controller.panel.memory_work import MemoryWork
 
-STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")
 TOML = TEXT.replace("The vase", "Head of a boy")
 
 
-class MemoryKiosk:
+class MemoryKiosk(MemoryWork):
     """``step_s`` how long a step of a job takes. ``pictures`` a folder for what it draws. ``names``: its appearances,
     of which it plays the first; ``run``: the finished calibration; ``toml``: stage.toml.
     """
@@ -62,15 +57,11 @@ class MemoryKiosk:
         self, pictures: Path, *, step_s: float = 0.05, names: Sequence[str] = ("marble", "warm wood"),
         run: str = "first", toml: str = TOML,
     ) -> None:  # fmt: skip
-        self._folder, self._step_s = pictures, step_s
+        super().__init__(step_s, examples.state(names[0]))
+        self._folder = pictures
         pictures.mkdir(parents=True, exist_ok=True)
         # Requests draw side by side, each into a file of its own.
         self._drawings = itertools.count()
-        self._lock = threading.RLock()
-        self._callbacks: list[Callable[[], None]] = []
-        self._cancel = threading.Event()
-        self._worker: threading.Thread | None = None
-        self._events: list[EventRow] = []
         self._schedule = Schedule("Europe/Vienna", (ScheduleRow("mon", "10:00", "18:00", names[0]),), "03:00")
         self._toml = toml
         self.asked: list[tuple[str, object]] = []
@@ -81,7 +72,6 @@ class MemoryKiosk:
         }
         self._results: dict[str, Results] = {}
         self._comparisons: dict[str, Comparison] = {}
-        self._state = examples.state(names[0])
         self.change(
             dose_klx_h=12.34,
             drifts=tuple(DriftCheck(f"night-{n}", BORN - n * 86400, "nothing", 0.04 + 0.01 * n) for n in range(5)),
@@ -92,34 +82,10 @@ class MemoryKiosk:
         self.note("warning", "The projector right was struck twice.", "lamp-struck")
         self.note("error", "The projector right does not answer.", "projector-no-answer")
 
-    def change(self, **values: object) -> None:
-        with self._lock:
-            self._state = replace(self._state, revision=self._state.revision + 1, **values)  # type: ignore[arg-type]
-        for callback in tuple(self._callbacks):
-            callback()
-
-    def note(self, level: str, text: str, code: str = "") -> None:
-        with self._lock:
-            number = len(self._events) + 1
-            self._events.append(EventRow(number, BORN + number, level, text, code))  # type: ignore[arg-type]
-        for callback in tuple(self._callbacks):
-            callback()
-
     def _drawn(self, name: str, shade: int = 120) -> Path:
         file = self._folder / f"{next(self._drawings)}.png"
         examples.draw_ball(file, name, shade)
         return file
-
-    def snapshot(self) -> KioskState:
-        return self._state
-
-    def events(self, after: int = 0) -> Sequence[EventRow]:
-        with self._lock:
-            return [row for row in self._events if row.number > after][-2000:]
-
-    def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
-        self._callbacks.append(callback)
-        return lambda: self._callbacks.remove(callback) if callback in self._callbacks else None
 
     def recalibrate(self, kind: RecalibrationKind, projector: str | None = None) -> Job:
         if projector is not None and projector not in [
@@ -128,63 +94,12 @@ class MemoryKiosk:
             raise UsageError("projector-unknown", what=f"There is no projector {projector}.", remedy="Choose another.")
         return self._begin(f"Recalibration ({kind})", "calibrating", lambda run: self._finish(run, kind))
 
-    def _begin(self, name: str, state: str, finish: Callable[[str], None], appearance: str = "") -> Job:
-        with self._lock:
-            self._check_idle()
-            old = self._state.job
-            number = 1 if old is None else old.number + 1
-            job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}",
-                      appearance=appearance)  # fmt: skip
-            self._cancel.clear()
-            self.change(job=job, state=state, reason=f"{name} is running.")
-            self._worker = threading.Thread(target=self._work, args=(job, finish), daemon=True)
-            self._worker.start()
-            return job
-
-    def _check_idle(self) -> None:
-        if self._state.job is not None and not self._state.job.ended:
-            what, remedy = "Another job is running or waiting.", "Wait until it ends, or cancel it."
-            raise WorkError("busy", what=what, remedy=remedy)
-
-    def job(self, number: int) -> Job | None:
-        job = self._state.job
-        if job is None or job.number != number:
-            raise WorkError("job-given-up", what="The job will not start.", remedy="See the events.")
-        return job
-
-    def close(self) -> None:
-        """End the job that is running."""
-        self._cancel.set()
-        if self._worker is not None:
-            self._worker.join(20)
-
-    def _work(self, job: Job, finish: Callable[[str], None]) -> None:
-        for at in range(len(STEPS)):
-            for done in (0.5, 1.0):
-                if self._cancel.wait(self._step_s / 2):
-                    ended = replace(job, ended=True, failed=True, outcome="It was cancelled.")
-                    self.change(job=ended, state="playing", reason="The job was cancelled; the old calibration stays.")
-                    return
-                share = [1.0] * at + [done] + [0.0] * (len(STEPS) - at - 1)
-                steps = tuple(JobStep(title, part) for title, part in zip(STEPS, share, strict=True))
-                job = replace(job, steps=steps, left_s=(len(STEPS) - at) * self._step_s)
-                self.change(job=job)
-        finish(job.run)
-        done_job = replace(job, ended=True, outcome="It ended well.", left_s=0.0)
-        self.change(job=done_job, state="playing", reason="All is well.")
-
     def _finish(self, run: str, kind: str) -> None:
         grade = Grade(run, BORN + len(self._results) * 86400, kind, "A", True, 1.23, "", 0.9 + 0.1 * len(self._results))
         names = ("before", "target", "achieved", "error", "resolution")
         pictures = {name: self._drawn(name, 60 + 30 * at) for at, name in enumerate(names)}
         self._results[run] = Results(run, grade, pictures, (("Reprojection", "0.08 px"), ("Photographs", "35")))
         self.change(grades=(*self._state.grades, grade))
-
-    def cancel(self) -> None:
-        job = self._state.job
-        if job is None or job.ended:
-            raise WorkError("nothing-to-cancel", what="No job is running.", remedy="There is nothing to cancel.")
-        self._cancel.set()
 
     def play(self, name: str, fade_s: float | None = None) -> None:
         self._known(name)
