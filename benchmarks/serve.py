@@ -31,8 +31,8 @@ from controller.core.errors import VelaturaError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.decide.hours import WEEKDAYS
-from controller.services.calibrate import KEY_FILE, output_sizes
 from controller.stage.bench import BenchProcess
+from controller.stage.calibrations import KEY_FILE, output_sizes
 from controller.stage.check import check_stage
 from tests.controller.play.wire import Wire
 

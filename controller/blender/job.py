@@ -12,10 +12,9 @@ from typing import Any, Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from controller.calibrate.mesh.blender import TO_BLENDER, margin_px, places_in_rendering
-from controller.calibrate.mesh.grid_mesh import grid_mesh
+from controller.calibrate.mesh.grid_mesh import Mesh, grid_mesh
 from controller.calibrate.values import Geometry, Pinhole
 from controller.core.arrays import FloatImage, Mask, save_arrays
 from controller.core.errors import WorkError
@@ -67,16 +66,7 @@ def write_job(
 
     Raises WorkError("target-no-geometry") when too little of the object's shape is known.
     """
-    normals, _, known = smooth_normals(geometry, mask, SMOOTHING_PX, reach_px=0)
-    shape = dataclasses.replace(geometry, normals=np.where(known[..., None], normals, np.nan).astype(np.float32))
-    step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MOST_VERTICES)))
-    mesh = grid_mesh(shape, step=step)
-    if len(mesh.triangles) == 0:
-        raise WorkError(
-            "target-no-geometry",
-            what="Too little of the object's shape is known for a rendering.",
-            remedy="Calibrate again with better overlap of the projectors, or use a finished picture as the target.",
-        )
+    mesh = _surface(geometry, mask)
     rows, columns = mask.shape
     column, row = np.round(mesh.camera_px).astype(int).T
     paint = own_paint(geometry, light)[row, column]
@@ -117,6 +107,21 @@ def _camera_of(view: Pinhole, depth_m: FloatImage) -> dict[str, Any]:
 def upright(vectors: FloatImage) -> FloatImage:
     """(..., 3) from the camera's frame to Blender's world."""
     return np.ascontiguousarray(vectors @ TO_BLENDER.T, dtype=np.float32)
+
+
+def _surface(geometry: Geometry, mask: Mask) -> Mesh:
+    """The object's known surface, smoothed, with at most about ``MOST_VERTICES``. Raises as ``write_job``."""
+    normals, _, known = smooth_normals(geometry, mask, SMOOTHING_PX, reach_px=0)
+    shape = dataclasses.replace(geometry, normals=np.where(known[..., None], normals, np.nan).astype(np.float32))
+    step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MOST_VERTICES)))
+    mesh = grid_mesh(shape, step=step)
+    if len(mesh.triangles) == 0:
+        raise WorkError(
+            "target-no-geometry",
+            what="Too little of the object's shape is known for a rendering.",
+            remedy="Calibrate again with better overlap of the projectors, or use a finished picture as the target.",
+        )
+    return mesh
 
 
 def _behind(vertices_m: FloatImage) -> FloatImage:
@@ -163,6 +168,8 @@ def as_seen(picture: FloatImage, camera: Pinhole, mask: Mask) -> Target:
 
     The picture is scaled so that all but its highlights lie below 1, and clipped at 1.5; the exposure is the solver's.
     """
+    from scipy import ndimage
+
     at = places_in_rendering(camera).astype(np.float32)
     # linear, since splines would ring around highlights and silhouettes
     picture = np.asarray(cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float32)

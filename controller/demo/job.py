@@ -21,10 +21,11 @@ from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
-from controller.services.calibrate import calibrating, output_sizes, signing_key, worst_grade
+from controller.services.calibrate import calibrating
 from controller.solve.feasibility import target_radiance
 from controller.solve.traditional import exposed_for_one, traditional_compensation
 from controller.stage.bench import BenchProcess
+from controller.stage.calibrations import output_sizes, signing_key, worst_grade
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import marker
 from controller.stage.session import OwnSession
@@ -34,7 +35,7 @@ from controller.steps.appearance.publishing import publish_step
 from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import device_frames, options_of, solve_steps
-from controller.steps.calibrate.grade import gate_step
+from controller.steps.calibrate.gate import gate_step
 
 PLAYBACK_S = 2.0
 

@@ -149,7 +149,7 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
     if checked is not None:
         problems += _not_in_stage(new, kinds)
         problems += _unplugged_outputs(found, outputs)
-    for plugin in (tools.drivers or load_drivers()).broken:
+    for plugin in (tools.drivers or load_drivers(benches=False)).broken:
         what = f"The plugin {plugin.entry_point} of {plugin.distribution} can't be used: {plugin.reason}."
         problems.append(Finding("", Problem("plugin-broken", what, plugin.remedy)))
     return Examination(tuple(found), (), tuple(problems), tuple(new))

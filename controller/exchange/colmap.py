@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from controller.calibrate.values import Pinhole
 from controller.core.arrays import Float64
@@ -45,6 +44,8 @@ class _View:
     @property
     def pose(self) -> list[float]:
         """Quaternion w, x, y, z, and translation, from the world to the view."""
+        from scipy.spatial.transform import Rotation
+
         x, y, z, w = Rotation.from_matrix(self.pinhole.rotation).as_quat()
         return [float(one) for one in (w, x, y, z, *self.pinhole.translation_m)]
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import erf
 
 from controller.core.arrays import Float64
 from controller.solve.bounded.solver import SMOOTHNESS
@@ -112,6 +111,8 @@ def solved(lights: Sequence[Float64], wanted: Float64, smoothness: float) -> Flo
 
 def _light_of(one: LineProjector, place: float, x: Float64) -> Float64:
     """(X, pixels): light at ``x`` of each pixel; the first one's middle lies ``place`` pixels off a whole one."""
+    from scipy.special import erf
+
     count = int(np.ceil((LENGTH_PX + 2 * MARGIN_PX) / one.pitch)) + 1
     middle = one.pitch * (place + np.arange(count)) - MARGIN_PX
     distance = (x[:, None] - middle) / one.pitch

@@ -10,13 +10,14 @@ import numpy as np
 
 from controller.capture.acquire import Acquirer
 from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
 from controller.rig.ambient_light import AmbientLightLimit
 from controller.rig.lamp_faults import START_AGAIN, faulty
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.mains_relays import Circuit
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
-from hal.interfaces import Camera, Display
+from hal.interfaces import BundleDisplay, Camera, Display
 from hal.values import Power
 
 
@@ -69,3 +70,13 @@ class Rig:
     def on_outputs(self, frames: Mapping[str, ByteImage]) -> dict[str, ByteImage]:
         """Frames by output from frames by projector; projectors without a frame show black."""
         return {projector.output: frames.get(projector.name, projector.black()) for projector in self.projectors}
+
+    def bundle_display(self) -> BundleDisplay:
+        """The display, if it plays bundles. Raises UsageError("display-plays-no-bundles")."""
+        if not isinstance(self.display, BundleDisplay):
+            raise UsageError(
+                "display-plays-no-bundles",
+                what="The display driver of this stage can't play bundles.",
+                remedy='Write driver = "player" under [display] in stage.toml.',
+            )
+        return self.display

@@ -17,7 +17,7 @@ from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.core.errors import BundleError, UsageError
 from controller.run.progress import Level, Reporter
-from controller.services.calibrate import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
+from controller.stage.calibrations import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.stage.check import check_stage
 from controller.stage.run import stage_lock
 from controller.steps.appearance.publishing import hints_ms, publish_solved

@@ -12,9 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.grade import is_graded, passes
 from controller.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
 from controller.bundle.install import current
-from controller.bundle.signing import Trust, load_signing_key
 from controller.config.models import SolveTable
-from controller.core.errors import UsageError
 from controller.rig.ambient_light import dark_after
 from controller.rig.rig import Rig
 from controller.run.compiling import kernels_compiled
@@ -27,11 +25,10 @@ from controller.solve.appearance import BaseChoice
 from controller.solve.engines.choice import choose_engine
 from controller.solve.request import SolveOptions
 from controller.stage.calibrations import (
-    KEY_FILE,
-    finished_calibration,
     finished_calibrations,
     output_sizes,
-    stage_trust,
+    signing_key,
+    usable_calibration,
     worst_grade,
 )
 from controller.stage.check import Checked, check_stage
@@ -45,14 +42,8 @@ from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.steps.calibrate.dots import dot_steps
 from controller.steps.calibrate.full import calibration_steps
-from controller.steps.calibrate.grade import (
-    accept,
-    below_grade,
-    compare_with_last,
-    gate_step,
-    grade_figures,
-    verify_step,
-)
+from controller.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
+from controller.steps.calibrate.grade import verify_step
 from controller.steps.capture.device_checks import device_checks
 from controller.steps.modes import DotOptions, dot_options
 from hal.deadline import in_seconds
@@ -155,8 +146,7 @@ def make_appearances(
         requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
         options = _options(checked.stage.tables.solve, chosen, quick=quick)
-        outputs = output_sizes(checked)
-        scale = costs.scale(size for _, size in outputs.values())
+        scale = costs.scale(size for _, size in output_sizes(checked).values())
         with (
             kernels_compiled(reporter) as compiled,
             answering_on(scheduler, calibrated, requests) as answering,
@@ -169,8 +159,7 @@ def make_appearances(
                 *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
-            publish = publish_step(folder, outputs, names, stage=checked.stage.tables.stage.name, calibration=run.name,
-                                   key=signing_key(checked))  # fmt: skip
+            publish = _publishing(checked, run, names)
             whole = [*steps, publish] if refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}
@@ -182,6 +171,18 @@ def make_appearances(
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
 
 
+def _publishing(checked: Checked, run: Path, names: Sequence[str]) -> Step:
+    stage = checked.stage
+    return publish_step(
+        stage.folder,
+        output_sizes(checked),
+        names,
+        stage=stage.tables.stage.name,
+        calibration=run.name,
+        key=signing_key(checked),
+    )
+
+
 def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> SolveOptions:
     """``chosen``: the base image instead of the table's; ``quick``: base times scale alone."""
     kept = base_choice(table.base)
@@ -189,53 +190,6 @@ def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> So
         # a high-pass base would be solved again for each
         return replace(options_of(table), mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
     return replace(options_of(table), base=chosen or kept)
-
-
-def signing_key(checked: Checked) -> Path | None:
-    """The stage's own key; None for unsigned bundles, if stage.toml allows them.
-
-    Raises UsageError("no-signing-key", or "signing-key-refused" for one whose bundles the stage would not play).
-    """
-    key = checked.stage.path(KEY_FILE)
-    if key.exists():
-        _check_own_key(key, stage_trust(checked.stage))
-        return key
-    if checked.stage.tables.bundle.allow_unsigned:
-        return None
-    raise UsageError(
-        "no-signing-key",
-        what=f"The stage has no signing key in {KEY_FILE}.",
-        remedy="Make one with `velatura keys STAGE`. It also shows the line to add to stage.toml.",
-    )
-
-
-def _check_own_key(path: Path, trust: Trust) -> None:
-    # Before the work: otherwise the player refuses the bundle when everything is solved.
-    public = bytes(load_signing_key(path).verify_key)
-    if public in trust.revoked:
-        problem, remedy = (
-            "is revoked",
-            f"Move {path} away, make a new key with `velatura keys STAGE`, and add it to trusted_keys.",
-        )
-    elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
-        problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'
-    else:
-        return
-    raise UsageError("signing-key-refused", what=f"The stage's own signing key {problem} by stage.toml.", remedy=remedy)
-
-
-def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
-    """The newest calibration, if its grade is good enough.
-
-    An older one is never used instead: the stage may have changed. ``accept_grade`` accepts any grade with a warning.
-    Raises UsageError("not-calibrated") and CalibrationError("calibration-below-grade").
-    """
-    run, worst = finished_calibration(checked.stage.folder), worst_grade(checked)
-    if accept_grade:
-        accept(run, reporter, worst)
-    if not passes(run, worst):
-        raise below_grade(run, worst)
-    return run
 
 
 def report_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
@@ -247,19 +201,3 @@ def report_grade(checked: Checked, run: Path, last: Path | None, reporter: Repor
     if not passes(run, worst):
         error = below_grade(run, worst)
         reporter.say(f"{error.what} {error.remedy}", Level.WARNING)
-
-
-__all__ = [
-    "KEY_FILE",
-    "calibrate",
-    "calibrating",
-    "finished_calibration",
-    "finished_calibrations",
-    "make_appearances",
-    "output_sizes",
-    "report_grade",
-    "signing_key",
-    "stage_trust",
-    "usable_calibration",
-    "worst_grade",
-]  # fmt: skip

@@ -29,15 +29,14 @@ from controller.run.progress import Level, Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
-from controller.services.calibrate import stage_trust, usable_calibration
 from controller.services.live_frame_file import FileSource, holds_frames
 from controller.solve.exposed import exposure
 from controller.solve.scaling.interactive import Interactive
+from controller.stage.calibrations import stage_trust, usable_calibration
 from controller.stage.check import Checked, check_stage
 from controller.stage.session import StageSession
 from controller.steps.appearance.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
 from controller.steps.appearance.live_parts import live_maps, target_px
-from controller.steps.appearance.publishing import bundle_display
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.values import LiveStatus
@@ -152,7 +151,7 @@ def _show(
     rate_hz: float,
     seconds: float | None,
 ) -> dict[str, Any]:
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     status: LiveStatus | None = None
 
     def report(figures: LiveFigures) -> None:
@@ -205,7 +204,7 @@ def live_mode(rig: Rig, context: Context, ready: Ready) -> Iterator[LiveMode]:
 
     Raises what devices raise.
     """
-    display, folder = bundle_display(rig), runtime_folder(rig.stage)
+    display, folder = rig.bundle_display(), runtime_folder(rig.stage)
     deadline = context.deadline.within(60)
     if ready.shaded:
         size = OutputSize(TARGET, *ready.maps.target_px)
@@ -220,7 +219,7 @@ def live_mode(rig: Rig, context: Context, ready: Ready) -> Iterator[LiveMode]:
 
 
 def _takes_targets(rig: Rig, path: Path, white: float, deadline: Deadline) -> bool:
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     display.load_bundle(rig.stage / "bundles" / CURRENT, deadline=deadline)
     try:
         display.live(path, white=white, deadline=deadline)

@@ -22,11 +22,10 @@ from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
 from controller.services.bundle import check_outputs
-from controller.services.calibrate import stage_trust
+from controller.stage.calibrations import stage_trust
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import LONGEST_RUN_S
 from controller.stage.session import StageSession
-from controller.steps.appearance.publishing import bundle_display
 from hal.deadline import in_seconds
 
 SHOWN_S: Final = 10.0
@@ -192,7 +191,7 @@ def _wrong(path: Path, detail: str) -> UsageError:
 
 
 def _playing(rig: Rig, played_sequence: PlayedSequence, index: Index) -> Sequence[Step]:
-    shown = bundle_display(rig).outputs(deadline=in_seconds(20))
+    shown = rig.bundle_display().outputs(deadline=in_seconds(20))
     check_outputs(index, {(output.name, output.width_px, output.height_px) for output in shown})
     title = " and ".join(dict.fromkeys(name for name, _, _ in played_sequence.items))
     return [
@@ -202,7 +201,7 @@ def _playing(rig: Rig, played_sequence: PlayedSequence, index: Index) -> Sequenc
 
 
 def _show(rig: Rig, played_sequence: PlayedSequence, context: Context) -> Sequence[Path]:
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
     # A fade answers at its end.
     patience_s = 20 + played_sequence.items[0][2]

@@ -29,7 +29,7 @@ from controller.stage.session import StageSession
 from controller.steps.calibrate.dots import dot_steps
 from controller.steps.calibrate.drift import drift_steps
 from controller.steps.calibrate.full import calibration_steps
-from controller.steps.calibrate.grade import accept, below_grade, compare_with_last, grade_figures
+from controller.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
 from controller.steps.calibrate.quick import quick_steps
 from controller.steps.calibrate.single_projector import one_projector_steps
 from controller.steps.modes import MODES, CalibrationMode, DotOptions
@@ -89,11 +89,10 @@ def recalibrate(
         taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
         full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
                 *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
-        repeated = (
-            quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
-            if projector is None
-            else one_projector_steps(rig, run, calibrated, full, projector, longest_exposure_s=longest_s)
-        )
+        if projector is None:
+            repeated = quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
+        else:
+            repeated = one_projector_steps(rig, run, calibrated, full, projector, longest_exposure_s=longest_s)
         return [
             marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
             *repeated,
@@ -107,12 +106,15 @@ def recalibrate(
     compare_with_last(run, last, reporter)
     if not passes(run, worst_grade(checked)):
         raise below_grade(run, worst_grade(checked))
+    advice = "projector" if projector is not None else read_drift_figures(run)["advice"]
+    return {"run": str(run), **grade_figures(run), "advice": advice, **_effort(run)}
+
+
+def _effort(run: Path) -> dict[str, float]:
+    """How many photographs were taken, and the seconds of the check and of the grade."""
     with Journal(run) as journal:
         seconds = sum(value for step, value in journal.steps().items() if step.kind in CHECKS)
-        shots = journal.shot_count()
-    advice = "projector" if projector is not None else read_drift_figures(run)["advice"]
-    return {"run": str(run), **grade_figures(run), "advice": advice, "photographs": shots,
-            "check_and_grade_seconds": seconds}  # fmt: skip
+        return {"photographs": journal.shot_count(), "check_and_grade_seconds": seconds}
 
 
 def check_name(checked: Checked, projector: str | None) -> None:

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.solve.metrics import colour_difference
@@ -49,6 +48,8 @@ def by_pixels(
     ``reachable``: where ``asked`` is in reach; ``valid``: where it says something. Beyond that, a pixel is compared
     with the nearest one where it does. ``white``: radiance of the target's white.
     """
+    from scipy.ndimage import distance_transform_edt
+
     seen = visible_object(lit)
     whole = asked
     if (valid & lit).any() and (seen & ~(valid & lit)).any():
@@ -61,6 +62,8 @@ def by_pixels(
 
 def visible_object(lit: Mask) -> Mask:
     """The object (rows, columns) from its lit pixels: with holes, and gaps of up to two ``GAP`` between them."""
+    from scipy.ndimage import binary_fill_holes
+
     radius = round(GAP * max(lit.shape))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(lit.astype(np.uint8), radius + 1, mode="edge")

@@ -8,7 +8,6 @@ from typing import Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
 
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import mean
@@ -96,6 +95,7 @@ def structural_similarity(one: FloatImage, other: FloatImage) -> FloatImage:
     Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error visibility to structural similarity",
     IEEE Transactions on Image Processing 13(4), 2004: a Gaussian window of 1.5 px, 11 px wide; K1 = 0.01, K2 = 0.03.
     """
+    from scipy.ndimage import gaussian_filter
 
     def local_mean(picture: FloatImage) -> FloatImage:
         return np.asarray(gaussian_filter(picture, SSIM_SIGMA_PX, radius=SSIM_RADIUS_PX, axes=(0, 1)), np.float32)

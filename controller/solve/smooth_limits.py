@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from controller.core.arrays import Float64, FloatImage, Mask
 
@@ -94,6 +93,8 @@ def lowest_above(stiffness: Any, obstacle: Float64) -> Float64:
 
     Where it lies on an obstacle it presses on it; elsewhere A h = 0 (Hintermueller, Ito, Kunisch 2003).
     """
+    from scipy.sparse.linalg import splu
+
     lies = obstacle > 0
     height = np.where(lies, obstacle, 0.0)
     for _ in range(ROUNDS):

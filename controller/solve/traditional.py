@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
@@ -66,5 +65,7 @@ def exposed_for_one(
 def _sampled(
     image: FloatImage, centre: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    from scipy.ndimage import map_coordinates
+
     at = (centre[:, 1], centre[:, 0])
     return np.stack([map_coordinates(image[..., c], at, np.float64, order=1, mode="nearest") for c in range(3)], -1)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from controller.core.extras import extra_missing
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Bench
-from hal.registry import OpenContext, load_drivers
+from hal.registry import BENCH, GROUP, OpenContext, load_drivers
 
 END_S = 10.0
 STARTS = 2
@@ -141,7 +142,7 @@ def bench_of(stage: Path, settings: Mapping[str, Any] | None = None) -> Bench:
 
     Raises UsageError("extra-missing") or PluginError("driver-unknown") where there is none.
     """
-    drivers = load_drivers()
+    drivers = load_drivers(entry for entry in entry_points(group=GROUP) if entry.name.endswith(BENCH))
     missing = extra_missing(drivers.missing_for("emulated"))
     if missing is not None:
         raise missing

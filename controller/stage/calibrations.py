@@ -1,4 +1,4 @@
-"""A stage's finished calibrations, and the keys that may sign its bundles.
+"""A stage's finished calibrations, and the keys that sign its bundles.
 
 It imports little: the kiosk uses it before its first picture, before the calibration code is loaded.
 """
@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from controller.artefacts.grade import passes
 from controller.artefacts.kinds import CALIBRATED
-from controller.bundle.signing import Trust
+from controller.bundle.signing import Trust, load_signing_key
 from controller.config import Stage
 from controller.core.errors import UsageError
 from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
+from controller.run.progress import Reporter
 from controller.stage.check import Checked
+from controller.steps.calibrate.gate import accept, below_grade
 
 KEY_FILE = "keys/stage.key"
 """The stage's signing key, if it exists."""
@@ -73,3 +76,50 @@ def output_sizes(checked: Checked) -> dict[str, tuple[str, tuple[int, int]]]:
     # The player compares a bundle's outputs with its own, in the display's order.
     tables = sorted(checked.stage.tables.projectors, key=lambda table: order.index(table.output))
     return {table.name: (table.output, sizes[table.output]) for table in tables}
+
+
+def signing_key(checked: Checked) -> Path | None:
+    """The stage's own key; None for unsigned bundles, if stage.toml allows them.
+
+    Raises UsageError("no-signing-key", or "signing-key-refused" for one whose bundles the stage would not play).
+    """
+    key = checked.stage.path(KEY_FILE)
+    if key.exists():
+        _check_own_key(key, stage_trust(checked.stage))
+        return key
+    if checked.stage.tables.bundle.allow_unsigned:
+        return None
+    raise UsageError(
+        "no-signing-key",
+        what=f"The stage has no signing key in {KEY_FILE}.",
+        remedy="Make one with `velatura keys STAGE`. It also shows the line to add to stage.toml.",
+    )
+
+
+def _check_own_key(path: Path, trust: Trust) -> None:
+    # Before the work: otherwise the player refuses the bundle when everything is solved.
+    public = bytes(load_signing_key(path).verify_key)
+    if public in trust.revoked:
+        problem, remedy = (
+            "is revoked",
+            f"Move {path} away, make a new key with `velatura keys STAGE`, and add it to trusted_keys.",
+        )
+    elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
+        problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'
+    else:
+        return
+    raise UsageError("signing-key-refused", what=f"The stage's own signing key {problem} by stage.toml.", remedy=remedy)
+
+
+def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bool = False) -> Path:
+    """The newest calibration, if its grade is good enough.
+
+    An older one is never used instead: the stage may have changed. ``accept_grade`` accepts any grade with a warning.
+    Raises UsageError("not-calibrated") and CalibrationError("calibration-below-grade").
+    """
+    run, worst = finished_calibration(checked.stage.folder), worst_grade(checked)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        raise below_grade(run, worst)
+    return run

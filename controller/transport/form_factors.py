@@ -11,7 +11,6 @@ from typing import Final
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt
 
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
@@ -34,6 +33,8 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
     ``points_m``, ``normals`` (rows, columns, 3) in the camera's frame, NaN where unknown; ``grid`` (rows, columns) of
     blocks of ``side`` x ``side`` pixels
     """
+    from scipy.ndimage import distance_transform_edt
+
     count, fine = grid[0] * grid[1], max(1, round(side / ACROSS))
     known: Mask = np.asarray((np.isfinite(points_m) & np.isfinite(normals)).all(axis=2))
     patches = (-(-known.shape[0] // fine), -(-known.shape[1] // fine))

@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
-from scipy.optimize import nnls
 
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.indirect import down, down_up
@@ -79,6 +78,8 @@ def fit_weights(
     of what falls, times theirs. Least squares by blocks of pictures of ``shape``, relative to the light; the part's
     denominator is that of the round before. Neighbours in ``terms`` that differ in their part alone are held together.
     """
+    from scipy.optimize import nnls
+
     pictures = (*whites, *stripes)
     total = whites[0].whole
     light = total + np.sum([one.source("all") for one in whites], axis=0)

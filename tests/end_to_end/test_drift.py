@@ -18,8 +18,9 @@ from controller.artefacts.grade import graded
 from controller.core.errors import CalibrationError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
-from controller.services.calibrate import calibrate, finished_calibration, make_appearances
+from controller.services.calibrate import calibrate, make_appearances
 from controller.services.recalibrate import check_drift, recalibrate
+from controller.stage.calibrations import finished_calibration
 from controller.stage.session import OwnSession
 from plugins.emulated.optics.bumps import Bump, write_bumps
 from tests.end_to_end.kiosk import with_ports_of_its_own

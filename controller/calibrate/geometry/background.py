@@ -6,7 +6,6 @@ from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt, median_filter
 
 from controller.core.arrays import FloatImage, Mask
 
@@ -39,6 +38,8 @@ def room_pixels(points_m: FloatImage) -> Mask:
     A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
     picture's border, or where hardly anything else is seen.
     """
+    from scipy.ndimage import distance_transform_edt, median_filter
+
     known = np.asarray(np.isfinite(points_m).all(axis=2), dtype=np.bool_)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)

@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from controller.core.arrays import Float64, Mask
 
@@ -93,6 +92,8 @@ def candidates(
 
     ``rays`` (points, 2): x, y at depth 1 of the camera pixels that fit ``matrix``; ``projector_px`` (points, 2)
     """
+    from scipy import ndimage
+
     width, height = size_px
     focal = np.geomspace(FOCAL_WIDTHS[0] * width, FOCAL_WIDTHS[1] * width, 48)
     shift = np.linspace(SHIFT_HEIGHTS[0] * height, SHIFT_HEIGHTS[1] * height, 66)

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
 
 from controller.calibrate.values import Geometry, Pinhole
 from controller.core.arrays import Float64, FloatImage
@@ -37,6 +36,8 @@ def bend_picture(rendered: FloatImage, camera: Pinhole) -> FloatImage:
 
     ``rendered`` is larger than the camera's picture by ``margin_px`` on each side.
     """
+    from scipy import ndimage
+
     at = places_in_rendering(camera)
     # splines, since OpenCV's remap rounds places to 1/32 px
     planes = [

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import map_coordinates
 
 from controller.calibrate.values import Radiometry
 from controller.core.arrays import Float64, FloatImage
@@ -69,6 +68,8 @@ def _taken(array: npt.NDArray[Any], at: Float64, *, extend: bool) -> npt.NDArray
 
 def _sampled(image: FloatImage, at: Float64) -> FloatImage:
     # OpenCV would round the places to a 32nd of a pixel, which is too coarse for centres.
+    from scipy.ndimage import map_coordinates
+
     places = [at[:, :, 1], at[:, :, 0]]
     channels = [map_coordinates(image[:, :, c], places, order=1, mode="nearest") for c in range(image.shape[2])]
     return np.stack(channels, axis=2).astype(np.float32)

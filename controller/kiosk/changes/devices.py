@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from PIL import Image, UnidentifiedImageError
-
 from controller.config.models import StageTables
 from controller.core.errors import VelaturaError
 from controller.core.text import printable
@@ -75,6 +73,8 @@ def lens_facts(stage: Path) -> Iterator[Fact]:
 
 
 def _exif(picture: Path) -> dict[int, Any]:
+    from PIL import Image, UnidentifiedImageError
+
     try:
         with warnings.catch_warnings(), Image.open(picture) as opened:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)

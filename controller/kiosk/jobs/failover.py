@@ -26,7 +26,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Runner, Step
 from controller.run.step_id import StepId
-from controller.services.calibrate import output_sizes, signing_key, stage_trust, usable_calibration
+from controller.stage.calibrations import output_sizes, signing_key, stage_trust, usable_calibration
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import LONGEST_RUN_S
 from controller.stage.session import StageSession

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy import ndimage
 
 from controller.core.arrays import FloatImage, Mask
 from controller.solve.targets.values import Target
@@ -19,6 +18,8 @@ def pieces(mask: Mask) -> list[Mask]:
 
     Slivers and islands (shadows cut them off) go to the nearest object. The masks are disjoint and cover ``mask``.
     """
+    from scipy import ndimage
+
     labels, count = ndimage.label(mask, structure=np.ones((3, 3)))
     if count == 0:
         return []

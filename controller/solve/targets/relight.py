@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from controller.calibrate.values import Geometry
 from controller.core.arrays import FloatImage, Mask
@@ -71,6 +70,8 @@ def smooth_normals(
 
     Gaps of at most ``reach_px`` are filled from the nearest known pixel.
     """
+    from scipy import ndimage
+
     known = mask & np.isfinite(geometry.normals).all(axis=2) & np.isfinite(geometry.points_m).all(axis=2)
     distance, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
     filled = mask & (distance <= reach_px) & known.any()

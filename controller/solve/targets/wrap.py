@@ -8,7 +8,6 @@ from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from controller.calibrate.values import Geometry
 from controller.core.arrays import Float64, FloatImage, Mask
@@ -50,6 +49,8 @@ def object_space(
     An object too flat to have an axis is mapped as a plane. ``up``: direction in the camera's frame.
     Raises WorkError("target-no-geometry") when no pixel of ``mask`` has a known position.
     """
+    from scipy import ndimage
+
     known = np.isfinite(geometry.points_m).all(axis=2) & np.isfinite(geometry.normals).all(axis=2)
     wanted = known & mask
     if not wanted.any():

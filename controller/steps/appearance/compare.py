@@ -27,7 +27,6 @@ from controller.solve.judged import as_table, by_pixels
 from controller.solve.metrics import compare, sharpness_windows
 from controller.steps import costs
 from controller.steps.appearance.photographing import PLAYED, photograph_hdr
-from controller.steps.appearance.publishing import bundle_display
 
 WINDOWS: Final = 48
 """Windows of the resolution map along the camera picture's longer side."""
@@ -73,7 +72,7 @@ def _compare(
     bundle, longest_s = settings
     inherit_camera(calibrated.folder, context.folder)
     solved = read_solved(calibrated.folder, name, calibrated.projectors)
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
     shown = display.play(name, deadline=context.deadline.within(20))
     # The day is part of the photograph's settings, so that yesterday's photographs are not reused.

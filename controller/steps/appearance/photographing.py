@@ -18,7 +18,6 @@ from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import ShotId, StepId
 from controller.steps import costs
-from controller.steps.appearance.publishing import bundle_display
 from controller.steps.capture.patterns import bracket
 from controller.steps.capture.photographs import photograph_series, take_photograph
 from hal.deadline import Deadline
@@ -47,7 +46,7 @@ def photographs_s(rig: Rig, names: Sequence[str]) -> float:
 
 
 def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Context) -> Sequence[Path]:
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     bundle = display.load_bundle(rig.stage / "bundles" / "current", deadline=context.deadline.within(20))
     projectors = [projector.name for projector in rig.projectors]
     paths = []
@@ -111,7 +110,7 @@ def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:
 
 
 def _playback(rig: Rig, names: Sequence[str], seconds: float, context: Context) -> Sequence[Path]:
-    display = bundle_display(rig)
+    display = rig.bundle_display()
     deadline: Deadline = context.deadline.within(seconds + 60)
     display.load_bundle(rig.stage / "bundles" / "current", deadline=deadline)
     items = [(name, 1 / PLAYBACK_RATE_HZ) for name in names]

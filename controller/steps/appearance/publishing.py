@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -19,31 +19,16 @@ from controller.bundle.signing import ANY_SIGNER, Trust, load_signing_key, unsig
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config import load_stage
 from controller.config.loader import FILE
-from controller.core.errors import BundleError, UsageError
+from controller.core.errors import BundleError
 from controller.core.storage import sha256_of
-from controller.rig.rig import Rig
 from controller.run.progress import Level, Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.steps.appearance.live_parts import live_arrays
-from controller.steps.appearance.thumbnails import Thumbnails
-from hal.interfaces import BundleDisplay
 
 METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
 """Figures of the solve that a bundle contains; all are the same in a repeated solve."""
 SHOWN_MS = (15_000, 1_000)
 """Show and fade times in the bundle's playlist for appearances without times in stage.toml."""
-
-
-def bundle_display(rig: Rig) -> BundleDisplay:
-    """The rig's display, if it plays bundles. Raises UsageError("display-plays-no-bundles")."""
-    if not isinstance(rig.display, BundleDisplay):
-        raise UsageError(
-            "display-plays-no-bundles",
-            what="The display driver of this stage can't play bundles.",
-            remedy='Write driver = "player" under [display] in stage.toml.',
-        )
-    return rig.display
 
 
 Outputs = Mapping[str, tuple[str, tuple[int, int]]]
@@ -181,14 +166,7 @@ def publish_solved(
     ``check`` is called before each appearance and may raise to stop the work.
     Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then unchanged or intact.
     """
-    thumbnails = Thumbnails(run, tuple(outputs))
-
-    def appearance(name: str) -> NewAppearance:
-        check()
-        solved = read_solved(run, name, tuple(outputs))
-        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
-        metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
-        return NewAppearance(name, frames, thumbnails.of(name), metadata)
+    from controller.steps.appearance.live_parts import live_arrays
 
     arrays = live_arrays(run, outputs) if live else None
 
@@ -199,7 +177,7 @@ def publish_solved(
             calibration=calibration,
             created_unix_s=created_unix_s(run),
             outputs=[(output, *size) for output, size in outputs.values()],
-            appearances=(appearance(name) for name in names),
+            appearances=_appearances(run, outputs, names, check),
             key=None if key is None else load_signing_key(key),
             revision=revision,
             schedule=[PlaylistEntry(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
@@ -212,6 +190,20 @@ def publish_solved(
         if (slots / f"{sha256_of(path)}.vel").exists():
             return index
     return write(floor + 1)
+
+
+def _appearances(
+    run: Path, outputs: Outputs, names: Sequence[str], check: Callable[[], None]
+) -> Iterator[NewAppearance]:
+    from controller.steps.appearance.thumbnails import Thumbnails
+
+    thumbnails = Thumbnails(run, tuple(outputs))
+    for name in names:
+        check()
+        solved = read_solved(run, name, tuple(outputs))
+        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
+        metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
+        yield NewAppearance(name, frames, thumbnails.of(name), metadata)
 
 
 def created_unix_s(run: Path) -> int:

@@ -11,7 +11,6 @@ from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 Surface: TypeAlias = tuple[Floats, npt.NDArray[np.int32]]
@@ -42,6 +41,8 @@ _VASE_HEIGHT: Final = (0.000, 0.012, 0.032, 0.088, 0.145, 0.200, 0.240, 0.264, 0
 
 def vase(rows: int = 420, columns: int = 540) -> Surface:
     """A vase with a fluted, twisted belly, a beaded shoulder and a flared, open mouth."""
+    from scipy.interpolate import CubicSpline
+
     along = np.arange(len(_VASE_RADIUS), dtype=np.float64)
     s = np.linspace(0.0, along[-1], rows)[:, None]
     radius = np.repeat(CubicSpline(along, _VASE_RADIUS)(s), columns, axis=1)

@@ -14,8 +14,9 @@ from controller.core.storage import exclusive
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
-from controller.services.calibrate import KEY_FILE, finished_calibration, make_appearances, output_sizes, signing_key
+from controller.services.calibrate import make_appearances
 from controller.services.play import play
+from controller.stage.calibrations import KEY_FILE, finished_calibration, output_sizes, signing_key
 from controller.stage.check import check_stage
 from controller.stage.run import LOCK
 from controller.stage.session import OwnSession

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from controller.bundle.live_maps import compensate
+from controller.capture.acquire import Acquirer
 from controller.live.sources import LivePicture
 from controller.play.control.launch import PlayerSettings, start_player
 from controller.rig.rig import Rig
 from controller.run.runner import Context
 from controller.services.live import Ready, live_mode
 from hal.deadline import in_seconds
+from hal.interfaces import Camera
 from hal.registry import OpenContext
 from plugins.display.player import DRIVER, PlayerDisplay
 from tests.controller.play.display.test_window import Framebuffer, framebuffer
@@ -49,7 +51,7 @@ def test_targets_go_to_shaders_where_there_are_any_and_finished_frames_otherwise
     target = np.random.default_rng(5).integers(0, 256, (*TARGET[::-1], 3), dtype=np.uint8)
     context = cast("Context", SimpleNamespace(deadline=in_seconds(100)))
     with display_of(tmp_path, windows=windows) as display:
-        rig = cast("Rig", SimpleNamespace(stage=tmp_path, display=display))
+        rig = Rig(tmp_path, (), cast("Camera", None), display, cast("Acquirer", None))
         with live_mode(rig, context, Ready(maps, 1.1, shaded=in_bundle)) as mode:
             made = mode.maker.blank()
             mode.maker.make(LivePicture(target, 0, 0), made)

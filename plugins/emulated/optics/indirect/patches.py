@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
@@ -120,6 +119,8 @@ def _sorted(corners: Floats, group: Integers, albedo: Floats, body: Integers, si
 
 def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integers, Floats, float]:
     """Corners of the (cut) faces, their groups, their albedo, and the size of a group."""
+    import trimesh
+
     size = np.sqrt(_area(scene, faces) / wanted)
     corners, source = _cut(scene, faces, FINEST * size)
     normals, areas = _normals(corners)
@@ -148,6 +149,8 @@ def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integer
 
 def _cut(scene: Scene, faces: Integers, longest: float) -> tuple[Floats, Integers]:
     """Corners (F, 3, 3) of faces without longer edges, and the face of the scene that each is of."""
+    import trimesh
+
     whole = scene.vertices[scene.faces[faces]].astype(np.float64)
     large = np.linalg.norm(whole - np.roll(whole, 1, axis=1), axis=2).max(axis=1) > longest
     if not large.any():

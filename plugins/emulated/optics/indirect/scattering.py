@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.stats import qmc
 
 from plugins.emulated.optics.furnished import Scene
 from plugins.emulated.optics.indirect.patches import CLEAR_M, Patches, patches_of
@@ -41,6 +40,8 @@ def scattering_of(scene: Scene, count: int, seed: int, progress: Progress = lamb
 
 def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress) -> sparse.csr_matrix:
     """Share (2G, 2G) of what a patch sees that is each other patch."""
+    from scipy.stats import qmc
+
     whole = np.concatenate([[0.0], np.cumsum(patches.areas)])
     numbers = qmc.Sobol(5, seed=rng).random(RAYS)
     count = 2 * patches.count

@@ -14,7 +14,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from plugins.emulated.optics.furnished import Scene, furnished
 from plugins.emulated.optics.indirect.mitsuba_scene import MitsubaScene
@@ -118,6 +117,8 @@ class _Cells:
 
     def blend(self) -> sparse.csr_matrix:
         """(pixels, cells): smooth weights of the nearest cells that face as a pixel does, 1 in sum."""
+        from scipy.spatial import cKDTree
+
         count = np.diff(self.starts)[:, None]
         centres, facing = (
             np.add.reduceat(values[self.order], self.starts[:-1]) / count for values in (self.points, self.normals)

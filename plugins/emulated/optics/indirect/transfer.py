@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from plugins.emulated.optics.indirect.patches import Hits, Patches
 from plugins.emulated.optics.indirect.scattering import Scattering
@@ -171,6 +170,8 @@ def _reached(factors: sparse.csr_matrix, lit: npt.NDArray[np.bool_], seen: Integ
 
 def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
     """Weights (cells, P) of the patches near each cell's point that face as it does: smooth, and 1 in sum."""
+    from scipy.spatial import cKDTree
+
     group = kept // 2
     facing = patches.directions[group] * (1.0 - 2.0 * (kept % 2))[:, None]
     body = np.where(seen.patch >= 0, patches.body[seen.patch // 2], -1)

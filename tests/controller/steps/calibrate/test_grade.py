@@ -8,7 +8,7 @@ import pytest
 from controller.artefacts.grade import graded, passes
 from controller.core.errors import CalibrationError
 from controller.run.progress import Level, Silent
-from controller.steps.calibrate.grade import compare_with_last, require
+from controller.steps.calibrate.gate import compare_with_last, require
 
 
 class Heard(Silent):
