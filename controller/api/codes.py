@@ -50,14 +50,8 @@ def decode_folder(folder: Path | str, *, camera: CameraProfile | None = None) ->
     Errors: ``captures-description-wrong``, ``capture-file-missing``, ``capture-shape-wrong``; those of ``develop``.
     """
     folder = Path(folder)
-    said = description_of(folder / DESCRIPTION)
-    gray, phase = said.get("gray"), said.get("phase", {})
-    if not isinstance(gray, dict) or not isinstance(phase, dict) or "projector_px" not in said:
-        raise unfit(
-            folder, "it has no table [gray] or no projector_px", "Write both in captures.toml, as the reference shows."
-        )
-    if set(gray) - {"cell_px", "x", "y"} or set(phase) - {"x", "y"}:
-        raise unfit(folder, "[gray] or [phase] has an unknown key", "Use x, y and cell_px.")
+    said = _description(folder)
+    gray, phase = said["gray"], said["phase"]
     if camera is None and not phase:
         camera = _AS_THEY_ARE
     reader = _Reader(folder, camera)
@@ -70,6 +64,19 @@ def decode_folder(folder: Path | str, *, camera: CameraProfile | None = None) ->
         if wave is not None and wave.period_px < 2 * bits[axis].cell_px:
             raise unfit(folder, "a period is shorter than two cells", "Use a finer Gray code, or a longer period.")
     return decode_any(bits, waves, (width, height))
+
+
+def _description(folder: Path) -> dict[str, Any]:
+    """What ``captures.toml`` says, with both tables. Raises the error ``captures-description-wrong``."""
+    said = {"phase": {}, **description_of(folder / DESCRIPTION)}
+    gray, phase = said.get("gray"), said["phase"]
+    if not isinstance(gray, dict) or not isinstance(phase, dict) or "projector_px" not in said:
+        raise unfit(
+            folder, "it has no table [gray] or no projector_px", "Write both in captures.toml, as the reference shows."
+        )
+    if set(gray) - {"cell_px", "x", "y"} or set(phase) - {"x", "y"}:
+        raise unfit(folder, "[gray] or [phase] has an unknown key", "Use x, y and cell_px.")
+    return said
 
 
 class _Reader:

@@ -94,14 +94,9 @@ def attribute_error(
     moved, dimmed = _explained(light, n, shown, predicted, error, lit & measured)
     label(ErrorCause.DIMMED, dimmed > EXPLAINED, bad)
     if indirect is not None:
-        # a lamp that is darker errs alike everywhere, light by way of other surfaces from place to place
-        use = (lit & measured)[:, :, None]
-        of_lamp = np.sum(np.where(use, light_seen * predicted, 0), axis=(0, 1), dtype=np.float64)
-        of_lamp /= np.maximum(np.sum(np.where(use, predicted * predicted, 0), axis=(0, 1), dtype=np.float64), 1e-30)
-        rest = np.where(use, light_seen - of_lamp.astype(np.float32) * predicted, 0)
         near_indirect = _near(np.where(lit, np.sum(indirect * indirect, axis=2), 0))
         much = near_indirect > INDIRECT_SHARE**2 * near_power
-        own = _near(np.sum(rest * rest, axis=2)) > EXPLAINED * near_error
+        own = _near(_without_lamp(light_seen, predicted, lit & measured)) > EXPLAINED * near_error
         label(ErrorCause.INDIRECT, much & own & (near_error < near_indirect), bad & (labels != ErrorCause.DARK))
     label(ErrorCause.MOVED, (moved > EXPLAINED) & (moved > dimmed), bad)
     label(ErrorCause.EDGE, _edges(x, y, lit), bad)
@@ -109,6 +104,17 @@ def attribute_error(
     label(ErrorCause.UNDECODED, bright & ~lit, calibration.object_mask)
     label(ErrorCause.SATURATED, ~measured, lit)
     return ErrorAttribution(labels, squared, lit)
+
+
+def _without_lamp(seen: FloatImage, predicted: FloatImage, use: Mask) -> FloatImage:
+    """The squared error, without what a lamp of another strength explains: such a lamp errs alike everywhere, light by
+    way of other surfaces from place to place."""
+    within = use[:, :, None]
+    of_lamp = np.sum(np.where(within, seen * predicted, 0), axis=(0, 1), dtype=np.float64)
+    of_lamp /= np.maximum(np.sum(np.where(within, predicted * predicted, 0), axis=(0, 1), dtype=np.float64), 1e-30)
+    rest = np.where(within, seen - of_lamp.astype(np.float32) * predicted, 0)
+    squared: FloatImage = np.sum(rest * rest, axis=2)
+    return squared
 
 
 def _near(image: npt.NDArray[Any]) -> FloatImage:

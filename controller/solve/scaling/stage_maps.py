@@ -65,8 +65,31 @@ def scaling_maps(
     lit = base.inverse > 0
     unit = float(np.median(1 / base.inverse[lit])) if lit.any() else 1.0
     present = np.asarray(np.rint(255 * reduced(lit.mean(axis=0, dtype=np.float32), factor)), np.uint8)
+    outputs = _output_maps(transport, base, radiometries, names, (present.shape[1], present.shape[0]), factor, spread)
+    inverse = plane_image(base.inverse)
+    gain = reduced(inverse, factor, unit).astype(np.float16)
+    dark = reduced(np.maximum(black, 0), factor) * gain.astype(np.float32) / np.float32(unit)
+    offset = np.maximum(dark, reduced(plane_image(base.inverse * image_planes(np.maximum(black, 0))), factor))
+    thrown = None
+    if indirect is not None:
+        reach = transport.reach()
+        thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, lambda image: reduced(image, factor))
+    size_px = present.shape[1], present.shape[0]
+    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), outputs, thrown)
+
+
+def _output_maps(
+    transport: LightTransport,
+    base: Base,
+    radiometries: Sequence[Radiometry],
+    names: Sequence[str] | None,
+    target_px: tuple[int, int],
+    factor: int,
+    spread: float,
+) -> tuple[OutputMaps, ...]:
+    """Of each projector: its base frame, and from where in a target of ``target_px`` (width, height) a pixel takes."""
     centre, sigma, correlation = footprints(transport, factor)
-    sides = np.maximum(np.array(present.shape[::-1], np.float32) - 1, np.float32(1))
+    sides = np.maximum(np.array(target_px, np.float32) - 1, np.float32(1))
     places = np.asarray(np.rint(FULL * np.clip(centre / sides, 0, 1)), np.uint16)
     shapes = packed_shape(np.where(sigma > 0, np.maximum(np.float32(spread) * sigma, LEAST_SIGMA_PX), 0), correlation)
     mixed = plane_frames(base.mixed, transport.sizes)
@@ -84,16 +107,7 @@ def scaling_maps(
                 checked_response(radiometry.response), (17 * n % TILE, 29 * n % TILE),
             )
         )  # fmt: skip
-    inverse = plane_image(base.inverse)
-    gain = reduced(inverse, factor, unit).astype(np.float16)
-    dark = reduced(np.maximum(black, 0), factor) * gain.astype(np.float32) / np.float32(unit)
-    offset = np.maximum(dark, reduced(plane_image(base.inverse * image_planes(np.maximum(black, 0))), factor))
-    thrown = None
-    if indirect is not None:
-        reach = transport.reach()
-        thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, lambda image: reduced(image, factor))
-    size_px = present.shape[1], present.shape[0]
-    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), tuple(outputs), thrown)
+    return tuple(outputs)
 
 
 def _rounded_up(values: FloatImage) -> npt.NDArray[np.float16]:
