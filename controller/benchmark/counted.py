@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
@@ -195,11 +194,3 @@ def calibration_effort(
         projectors=[by[name] for name in projectors],
         dots=[counts.get((dots, name), 0) for name in projectors],
     )
-
-
-def with_all_light(reference: BenchmarkCalibration) -> BenchmarkCalibration:
-    """The same with white images as one photograph of white shows them: direct and indirect light together."""
-    parts = [part if part.indirect is None else dataclasses.replace(part, white=part.white + part.indirect)
-             for part in reference.calibration.projectors]  # fmt: skip
-    calibration = dataclasses.replace(reference.calibration, projectors=tuple(parts))
-    return dataclasses.replace(reference, calibration=calibration)

@@ -209,17 +209,6 @@ class LampGuard:
                 return float("inf")
             return max(0.0, self._record.since_s + self._rules.stable_s - self._now())
 
-    def require_stable(self, *, deadline: Deadline) -> None:
-        """Raise DeviceRefused("lamp-not-stable") unless the lamp is on and has been for ``stable_s``."""
-        power = self.status(deadline=deadline).power
-        if power is Power.ON and self.stable_left_s() <= 0:
-            return
-        raise DeviceRefused(
-            "lamp-not-stable",
-            what=f"The lamp of projector {self.name} is {power.value}. Its light is not stable yet.",
-            remedy=f"Wait until it has been on for {self._rules.stable_s:.0f} s.",
-        )
-
     def may_open_mains(self, *, deadline: Deadline) -> bool:
         """Whether the projector is in standby and has cooled long enough to cut its mains."""
         if self.status(deadline=deadline).power is not Power.OFF:

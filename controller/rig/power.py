@@ -32,12 +32,6 @@ class PowerFailure:
     error: BaseException
 
 
-def power_up(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None) -> None:
-    """Switch every projector on and wait until every lamp is on and steady: ``light``, then ``steady``."""
-    light(guards, deadline=deadline, advance=lambda fraction, note: advance(0.2 * fraction, note), clock=clock)
-    steady(guards, deadline=deadline, advance=lambda fraction, note: advance(0.2 + 0.8 * fraction, note), clock=clock)
-
-
 def light(
     guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None,
     tell: Tell = lambda sentence: None,
@@ -123,31 +117,6 @@ def power_down(
 
     with ThreadPoolExecutor(len(guards), thread_name_prefix="power-down") as pool:
         return tuple(failure for failure in pool.map(attempt, guards) if failure is not None)
-
-
-def cool_all(
-    guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None
-) -> tuple[PowerFailure, ...]:
-    """``power_down``, then wait until every lamp that went off is cool enough for its mains to be cut.
-
-    Raises DeviceTimeout("lamps-not-cool") when the deadline passes and Cancelled when stopped; by then every projector
-    has received the off command.
-    """
-    clock = clock or SystemClock()
-    failures = power_down(guards, clock=clock)
-    failed = {failure.projector for failure in failures}
-    cooling = [guard for guard in guards if guard.name not in failed and not guard.by_hand]
-    while hot := [
-        guard.name for guard in cooling if not guard.may_open_mains(deadline=deadline.within(guard.answer_s))
-    ]:
-        advance(1 - len(hot) / len(cooling), f"cooling {', '.join(hot)}")
-        deadline.check(
-            "lamps-not-cool",
-            what=f"The lamp of {', '.join(hot)} was still cooling at the deadline.",
-            remedy="Leave the mains on until its fans stop.",
-        )
-        clock.sleep(POLL_S, deadline)
-    return failures
 
 
 def _check(guard: LampGuard, deadline: Deadline) -> None:

@@ -15,7 +15,7 @@ from controller.core.errors import WorkError
 from controller.rig.lamp_guard import LampGuard
 from hal.errors import DeviceError
 from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import ROUNDING_S, RULES, Killed, Lamp, Shelf, World, soon
+from tests.controller.rig.lamp_model import ROUNDING_S, RULES, Killed, Lamp, Shelf, World, check_light, soon
 
 
 class Life:
@@ -89,7 +89,7 @@ class Life:
         return self.world.time_s - self.lamp.off_at_s
 
     def measure(self) -> None:
-        self.guard.require_stable(deadline=soon())
+        check_light([self.guard])
         if self.lamp.lit_at_s is None or self.world.time_s - self.lamp.lit_at_s < RULES.stable_s - ROUNDING_S:
             self.lamp.sins.append("measured in unsteady light")
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
 
 import pytest
 
+from controller.capture.acquire import Acquirer
 from controller.core.errors import WorkError
+from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampRecord
+from controller.rig.rig import Rig, RigProjector
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceRefused, DeviceTimeout
+from hal.interfaces import Camera, Display
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 
 ROUNDING_S = 1e-6
@@ -151,6 +157,13 @@ class Shelf:
 
 def soon() -> Deadline:
     return in_seconds(60)
+
+
+def check_light(guards: Sequence[LampGuard]) -> None:
+    """The check of a stage whose other devices are not asked."""
+    projectors = tuple(RigProjector(guard.name, guard.name, (1, 1), guard) for guard in guards)
+    rig = Rig(Path(), projectors, cast("Camera", None), cast("Display", None), cast("Acquirer", None))
+    rig.check_light(deadline=soon())
 
 
 def refusal(act: Callable[[], object]) -> str:

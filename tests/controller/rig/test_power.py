@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import pytest
 
 from controller.rig.lamp_guard import LampGuard
-from controller.rig.power import BY_HAND_S, cool_all, light, power_down, power_up, steady
+from controller.rig.power import BY_HAND_S, light, power_down, steady
 from hal.deadline import Deadline, in_seconds
 from hal.driver_calls import Caller
 from hal.errors import DeviceGone, DeviceRefused, DeviceTimeout
 from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, soon
+from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, check_light, soon
 
 
 @dataclass
@@ -35,22 +35,23 @@ class Room:
         self.notes.append((fraction, note))
 
 
-def test_power_up_strikes_all_and_returns_in_steady_light() -> None:
+def test_all_lamps_are_struck_and_waited_for_until_their_light_is_steady() -> None:
     room = Room()
-    power_up(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
-    for guard in room.guards:
-        guard.require_stable(deadline=soon())
+    for part in (light, steady):
+        room.notes.clear()
+        part(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+        fractions = [fraction for fraction, _ in room.notes]
+        assert fractions == sorted(fractions)
+        assert fractions[-1] <= 1
+    check_light(room.guards)
     assert RULES.stable_s <= room.world.time_s - 1000 <= RULES.stable_s + 2
-    fractions = [fraction for fraction, _ in room.notes]
-    assert fractions == sorted(fractions)
-    assert fractions[-1] <= 1
 
 
-def test_power_up_waits_for_lamps_that_must_rest() -> None:
+def test_lamps_that_must_rest_are_waited_for() -> None:
     room = Room()
     light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
     assert power_down(room.guards, clock=room.world) == ()
-    power_up(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+    light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
     assert [lamp.sins for lamp in room.lamps] == [[], [], []]
     assert any("must stay off for" in note for _, note in room.notes)
 
@@ -198,13 +199,6 @@ def test_a_driver_that_no_longer_tells_what_it_can_do_is_still_told_to_switch_of
     assert [lamp.lit_at_s for lamp in room.lamps] == [None, None, None]
 
 
-def test_cool_all_returns_only_when_every_mains_may_be_cut() -> None:
-    room = Room()
-    light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
-    assert cool_all(room.guards, deadline=soon(), advance=room.advance, clock=room.world) == ()
-    assert all(guard.may_open_mains(deadline=soon()) for guard in room.guards)
-
-
 def test_a_projector_that_is_slow_to_confirm_gets_the_time_that_its_driver_asks_for() -> None:
     room = Room()
     room.lamps[1].switch_s = 150.0
@@ -222,11 +216,9 @@ def test_a_projector_without_power_codes_is_left_to_the_technician_and_the_other
     assert [lamp.strikes for lamp in room.lamps] == [1, 0, 1]
     assert room.world.time_s - 1000 >= BY_HAND_S
     steady(room.guards, deadline=in_seconds(600), advance=room.advance, clock=room.world)
-    for guard in room.guards:
-        guard.require_stable(deadline=soon())
+    check_light(room.guards)
     assert room.guards[1].use().strikes == 1
     assert power_down(room.guards, clock=room.world) == ()
-    assert cool_all(room.guards, deadline=soon(), advance=room.advance, clock=room.world) == ()
 
 
 def test_a_lamp_that_was_switched_off_by_hand_rests_before_the_technician_is_asked_again() -> None:
