@@ -10,6 +10,7 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
+from controller.solve.judged import TITLES
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, StageControl, Subject
 from controller.study.lab.trial import Trial, photograph_frames, run_trial
@@ -18,6 +19,8 @@ from controller.study.values import Cell, Criterion, Experiment, Figure, Result,
 
 DOUBLED: Final = 2.0
 """An appearance counts as broken where its error is so many times the undisturbed one."""
+JUDGED: Final = ("in_reach", "lit")
+"""The pixels that are judged, of ``solve.judged.TITLES``."""
 SHOWN: Final = 4.0
 """Times the undisturbed error, up to which the plots go."""
 Frames = Sequence[FloatImage]
@@ -73,11 +76,11 @@ DISTURBANCES: Final = (
     Disturbance("defocus", "mm before it is calibrated", (100, 300, 1000, 2000), 100, changes=_every("defocus_mm")),
     Disturbance("indirect light", "share that comes back", (0.05, 0.15, 0.4, 1.0), 0.15,
                 changes=_one("ambient", "indirect")),
-    Disturbance("highlights", "strength of the gloss", (0.05, 0.2, 1.0), 0.05, changes=_one("object", "gloss")),
-    Disturbance("white segment", "times the least channel", (0.1, 0.25, 0.75, 2.0), 0.25,
+    Disturbance("highlights", "strength of the gloss", (0.05, 1.0), 0.05, changes=_one("object", "gloss")),
+    Disturbance("white segment", "times the least channel", (0.1, 0.25, 2.0), 0.25,
                 changes=_every("white_segment")),
     Disturbance("misconvergence", "px", (0.25, 0.5, 1.5, 3.0), 0.5, changes=_every("misconverged_px")),
-    Disturbance("lamp flicker", "share of the light, short exposures", (0.02, 0.1, 0.3), 0.02,
+    Disturbance("lamp flicker", "share of the light, short exposures", (0.02, 0.05, 0.1, 0.3), 0.02,
                 changes=_every("flicker")),
     Disturbance("gamma error", "factor of the exponents, after calibration", (1.02, 1.05, 1.1, 1.2), 1.05, 1,
                 after=_every("gamma")),
@@ -99,11 +102,27 @@ class DisturbanceResult:
     why: str = ""
 
     def times(self, base: Trial) -> tuple[float, float]:
-        """How many times as large the error is as undisturbed: of the median, and of 95 % of the pixels."""
+        """How many times as large the error is as undisturbed: of the median, and of 95 % of the pixels.
+
+        In reach or of all lit pixels, whichever is more: fewer pixels in reach must not look like less error.
+        """
         if self.found is None:
             return float("inf"), float("inf")
-        now, before = self.found.quality, base.quality
-        return now.delta_e / before.delta_e, now.delta_e_p95 / before.delta_e_p95
+        median, most = zip(*(_times(self.found, base, pixels) for pixels in JUDGED), strict=True)
+        return max(median), max(most)
+
+
+def _error(trial: Trial, pixels: str) -> tuple[float, float]:
+    """CIEDE2000 of one of ``JUDGED``: the median, and 95 %."""
+    found = trial.quality.pixels[pixels]
+    assert found.delta_e00_median is not None
+    assert found.delta_e00_p95 is not None
+    return found.delta_e00_median, found.delta_e00_p95
+
+
+def _times(now: Trial, base: Trial, pixels: str) -> tuple[float, float]:
+    median, most = (after / before for after, before in zip(_error(now, pixels), _error(base, pixels), strict=True))
+    return median, most
 
 
 def robustness(subject: Subject) -> Result:
@@ -188,17 +207,13 @@ def _criteria(base: Trial, results: Sequence[DisturbanceResult]) -> tuple[Criter
         median, most = asked.times(base)
         reached = "could not be calibrated"
         if asked.found is not None:
-            now, before = asked.found.quality, base.quality
-            reached = (
-                f"median {before.delta_e:.2f} to {now.delta_e:.2f}: {median:.2f} times;"
-                f" 95 % {before.delta_e_p95:.2f} to {now.delta_e_p95:.2f}: {most:.2f} times"
-            )
+            reached = "; ".join(_compared(asked.found, base, pixels) for pixels in JUDGED)
         holds = max(median, most) <= DOUBLED
         worse = "both" if min(median, most) > DOUBLED else "the median" if median > most else "the 95 %"
         criteria.append(
             Criterion(
                 f"{disturbance.name} of {disturbance.limit:g} ({disturbance.unit}): median and 95 % at most"
-                f" {DOUBLED:g} times the undisturbed ones",
+                f" {DOUBLED:g} times the undisturbed ones, in reach and of all lit pixels",
                 reached,
                 holds,
                 "" if holds else asked.why or f"Too large: {worse}.",
@@ -207,17 +222,32 @@ def _criteria(base: Trial, results: Sequence[DisturbanceResult]) -> tuple[Criter
     return tuple(criteria)
 
 
+def _compared(now: Trial, base: Trial, pixels: str) -> str:
+    """Of one of ``JUDGED``, in words."""
+    (before, before_most), (median, most) = _error(base, pixels), _error(now, pixels)
+    return (
+        f"{TITLES[pixels]}: median {before:.2f} to {median:.2f}, {median / before:.2f} times,"
+        f" 95 % {before_most:.1f} to {most:.1f}, {most / before_most:.2f} times"
+    )
+
+
 def _breaking(base: Trial, results: Sequence[DisturbanceResult]) -> ResultTable:
     rows: list[tuple[Cell, ...]] = []
     for disturbance in DISTURBANCES:
         some = _of(results, disturbance)
         doubles: list[Cell] = []
         for measure in (0, 1):
-            level = doubles_at(base, some, measure)
-            doubles.append(f"not at {some[-1].level:g}" if level is None else f"{level:.3g}")
+            doubles.append(_breaking_level(base, some, measure))
         rows.append((disturbance.name, disturbance.unit, disturbance.limit, *doubles))
     columns = ("disturbance", "unit", "users meet", "the median doubles at", "the 95 % doubles at")
     return ResultTable("breaking", "Where the error doubles", columns, tuple(rows))
+
+
+def _breaking_level(base: Trial, some: Sequence[DisturbanceResult], measure: int) -> str:
+    level, last = doubles_at(base, some, measure), some[-1]
+    if level is None:
+        return f"not at {last.level:g}"
+    return f"no calibration at {level:g}" if last.found is None and last.level == level else f"{level:.3g}"
 
 
 def _table(base: Trial, results: Sequence[DisturbanceResult]) -> ResultTable:
@@ -247,7 +277,8 @@ def _figures(base: Trial, results: Sequence[DisturbanceResult]) -> tuple[Figure,
         Figure(
             "levels",
             "CIEDE2000 of an appearance over the undisturbed one, by how strong a disturbance is: the median, and what"
-            f" 95 % of the pixels are within. Cut off at {SHOWN:g} times.",
+            " 95 % of the pixels are within; in reach or of all lit pixels, whichever is more."
+            f" Cut off at {SHOWN:g} times.",
             small_plots([_plot(base, _of(results, one)) for one in DISTURBANCES], y="times the undisturbed error",
                         y_range=(0.5, SHOWN)),
         ),
@@ -269,13 +300,14 @@ def _plot(base: Trial, results: Sequence[DisturbanceResult]) -> SmallPlot:
 
 TEXT = """\
 One disturbance at a time, increased until the error has doubled, in the median and in 95 % of the pixels, or as far as
-makes sense. The limits that are asked for are of the size that users meet. Noise, defocus, indirect light, highlights,
-white segments, misconvergence (red to the right, blue down) and flicker are present during the calibration; gamma and
-focus change afterwards, unnoticed, and a visitor's shadow then covers a part of what one projector lights of the
-object; quantisation is that of the frames. Noise is all of the camera's noise, of the light as of the electronics.
-Light that comes back evenly from the room depends on the whole frame; a highlight is treated as paint. Whether twice
-the error is visible depends on the error. Disturbances are not combined, and highlights are those of a mildly glossy
-object, not of a mirror."""
+makes sense. Both are judged twice, in reach and over all lit pixels, and the worse counts: a disturbance can also make
+fewer pixels reachable. The limits that are asked for are of the size that users meet. Noise, defocus, indirect light,
+highlights, white segments, misconvergence (red to the right, blue down) and flicker are present during the
+calibration; gamma and focus change afterwards, unnoticed, and a visitor's shadow then covers a part of what one
+projector lights of the object; quantisation is that of the frames. Noise is all of the camera's noise, of the light as
+of the electronics. Light that comes back evenly from the room depends on the whole frame; a highlight is treated as
+paint. Whether twice the error is visible depends on the error. Disturbances are not combined, and highlights are those
+of a mildly glossy object, not of a mirror."""
 
 ROBUSTNESS = Experiment(
     name="robustness",

@@ -15,12 +15,21 @@ from controller.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.calibrate.verify.registration import Motion
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError
+from controller.solve.judged import PixelSet
 from controller.steps.modes import DotOptions
 from controller.study.experiments.adaptation import ADAPTED, CUT, adaptation
 from controller.study.experiments.drift import LEVELS_PX, BumpResult, _criteria, drifting
 from controller.study.experiments.effort import effort
-from controller.study.experiments.robustness import DISTURBANCES, quantised, robustness
-from controller.study.lab.subject import BenchChange, Dots, Recalibration, SessionParts, Subject
+from controller.study.experiments.robustness import (
+    DISTURBANCES,
+    DisturbanceResult,
+    doubles_at,
+    quantised,
+    robustness,
+)
+from controller.study.lab.measuring import Quality
+from controller.study.lab.subject import BenchChange, Dots, ReachableTarget, Recalibration, SessionParts, Subject
+from controller.study.lab.trial import Trial
 from controller.study.values import column
 from controller.transport import build_transport
 from tests.controller.study.array_stage import CAMERA, ArrayLight, array_subject
@@ -152,7 +161,7 @@ def test_every_disturbance_grows_until_the_error_has_doubled_and_one_that_cannot
     by = {(row[0], row[1]): dict(zip(table.columns, row, strict=True)) for row in table.rows}
     assert by["highlights", 0.05]["why not"] == "The object mirrors."
     assert by["highlights", 0.05]["95 %"] is None
-    assert ("highlights", 0.2) not in by, "it had broken before"
+    assert ("highlights", 1.0) not in by, "it had broken before"
     base = by["none", None]
     median, most = (float(str(base[name])) for name in ("CIEDE2000 median", "95 %"))
     for one in DISTURBANCES:
@@ -169,6 +178,34 @@ def test_every_disturbance_grows_until_the_error_has_doubled_and_one_that_cannot
     assert holds["lamp flicker"]
     assert holds["highlights"] is False
     assert hand.changes == ()
+
+
+def _trial(in_reach: tuple[float, float], lit: tuple[float, float]) -> Trial:
+    pixels = {"in_reach": PixelSet(*in_reach, 0.3), "lit": PixelSet(*lit, 0.0)}
+    nothing = np.zeros((1, 1, 3), np.float32)
+    wanted = ReachableTarget(nothing, np.ones((1, 1), np.bool_), 1.0)
+    return Trial(wanted, (), nothing, Quality(*in_reach, 0.0, 1.0, 1.0, pixels))
+
+
+def test_pixels_that_a_disturbance_takes_out_of_reach_count_as_error() -> None:
+    base, now = _trial((1.0, 5.0), (1.2, 10.0)), _trial((1.1, 5.5), (3.0, 15.0))
+    result = DisturbanceResult(DISTURBANCES[2], 0.15, now, 1.0)
+    assert result.times(base) == (2.5, 1.5)
+    assert doubles_at(base, [result], 0) == pytest.approx(0.1)
+    assert doubles_at(base, [result], 1) is None
+
+
+def test_a_visitors_shadow_covers_the_asked_share_of_the_object() -> None:
+    subject, _ = stage()
+    (shadow,) = (one for one in DISTURBANCES if one.name == "a visitor's shadow")
+    assert shadow.after is not None
+    first = subject.calibration.projectors[0]
+    rows_columns = np.argwhere(first.metapixels.valid)
+    for level in (0.15, 0.4):
+        (change,) = shadow.after(subject, level)
+        assert change["name"] == first.name
+        covered = rows_columns[:, 1] < float(change["shadow"]) * first.metapixels.valid.shape[1]
+        assert covered.mean() == pytest.approx(level, abs=0.1)
 
 
 @pytest.mark.parametrize("bits", [1.0, 4.0, 8.0])
