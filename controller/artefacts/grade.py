@@ -1,19 +1,20 @@
-"""The grade files of a run; ``steps.calibrate.grade`` computes the grade."""
+"""The grade files of a run, and what else its steps found; ``steps.calibrate.grade`` computes the grade."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from controller.artefacts.names import read_json, write_json
+from controller.artefacts.names import json_path, read_json, write_json
 from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
+from controller.run.step_id import StepId
 
 PICTURE: Final = "verification.png"
 """The map of errors and their reasons, the projectors in rows of ``ACROSS``."""
@@ -24,6 +25,7 @@ BEFORE, RESOLUTION = "before.png", "resolution.png"
 """Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
 _MAPS: Final = "verification.npz"
 _ACCEPTED: Final = "accepted.json"
+_TROUBLES: Final = "troubles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +116,21 @@ def passes(run: Path, worst_grade: float) -> bool:
     """Whether a run's calibration may be used: good enough, accepted by a person, or not graded yet."""
     worst = worst_of(run)
     return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """``sentence``: what it is, and what to do; ``projector``: whose, None for camera, object or several."""
+
+    sentence: str
+    projector: str | None = None
+
+
+def write_troubles(run: Path, step: StepId, found: Iterable[Trouble]) -> Path:
+    """``troubles-STEP.json``; written without any, too, because an earlier try may have found some."""
+    return write_json(json_path(run, _TROUBLES, str(step)), [asdict(trouble) for trouble in found])
+
+
+def read_troubles(run: Path) -> list[Trouble]:
+    """Of all steps of a run, by the names of their files; none of a run of an earlier version."""
+    return [Trouble(**row) for path in sorted(run.glob(f"{_TROUBLES}-*.json")) for row in read_json(path)]

@@ -29,6 +29,8 @@ PILED = 1.15
 HOT_SIGMAS = 12.0
 SMALLEST_CORRECTION = 0.015
 """Spread of the corrections of an exposure series from which the camera's exposure times are corrected."""
+NAMED_SPREAD = 0.003
+"""Standard deviation of the pixels' response, relative, from which it is named; even sensors have 0.001 at most."""
 NAMED_HOT = 5e-5
 """Share of all samples: a sound sensor has fewer hot ones."""
 WORST_BLACK_STEPS = 64.0
@@ -151,19 +153,24 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
     return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
 
 
-def camera_faults(exposures: Float64, hot: int, samples: int) -> str | None:
-    """What a technician should know of ``true_exposures``, and of ``hot`` of all samples; None if there is nothing."""
+def camera_faults(exposures: Float64, hot: int, samples: int, spread: float = 0.0) -> str | None:
+    """What a technician should know of ``true_exposures``, of ``hot`` of all samples, and of ``response_spread``.
+
+    None if there is nothing.
+    """
     parts = []
     if len(exposures):
         off = float(np.ptp(np.log(exposures[:, 1] / exposures[:, 0])))
         parts.append(f"its exposure times differ from what it reports, by {100 * off:.1f} % between two of them")
     if hot > NAMED_HOT * samples:
         parts.append(f"{hot} of its pixels are hot")
+    if spread > NAMED_SPREAD:
+        parts.append(f"the response of its pixels differs by {100 * spread:.1f} % (standard deviation)")
     if not parts:
         return None
     return (
-        f"The camera has faults that are measured and corrected: {', and '.join(parts)}. Nothing has to be done. If "
-        "they grow from one calibration to the next, let the camera cool down, or replace it."
+        f"The camera has faults that calibration takes into account: {', and '.join(parts)}. Nothing has to be done. "
+        "If they grow from one calibration to the next, let the camera cool down, or replace it."
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import tzinfo
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from controller.artefacts.grade import (
     passes,
     read_error_maps,
     read_grade_figures,
+    read_troubles,
 )
 from controller.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
@@ -83,6 +84,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),
+        troubles=tuple(trouble["sentence"] for trouble in figures["troubles"]),
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
              (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
@@ -118,6 +120,7 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "colours_px": {name: None if one is None else one.colours_px for name, one in pixels.items()},
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
         "verification": read_grade_figures(run),
+        "troubles": [asdict(trouble) for trouble in read_troubles(run)],
         "steps": {str(step): seconds for step, seconds in steps.items()},
     }
 

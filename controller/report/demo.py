@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import read_geometry_figures
-from controller.artefacts.grade import read_grade_figures
+from controller.artefacts.grade import read_grade_figures, read_troubles
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.artefacts.published import BundleFigures, has_photograph, read_photograph_of, read_playback
@@ -125,6 +125,7 @@ def _figures(
             "seconds": fitting,
         },
         "verification": read_grade_figures(run),
+        "troubles": [asdict(trouble) for trouble in read_troubles(run)],
         "solve": {key: base[key] for key in ("seconds", "iterations", "objective", "kkt")},
         "appearances": [_appearance_figures(appearance) for appearance in judged],
         "bundle": {"bytes": bundle.bytes, "ratio": bundle.ratio},
@@ -178,6 +179,7 @@ def _page(
             *light_gallery(calibration, crop),
             _frames_gallery(judged, checked),
         ),
+        troubles=tuple(trouble["sentence"] for trouble in figures["troubles"]),
         steps=spent(steps),
         facts=_facts(checked, calibration, figures),
     )

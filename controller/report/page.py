@@ -75,6 +75,7 @@ class Page:
     steps: tuple[tuple[str, float], ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     tables: tuple[PageTable, ...] = ()
+    troubles: tuple[str, ...] = ()
 
 
 def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:

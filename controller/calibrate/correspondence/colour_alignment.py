@@ -3,6 +3,10 @@
 The camera's channels see mixtures of the three, so they are separated first. Distortion and colour fringes of the
 camera move all three alike, or outwards in all directions, and do not change a median. How far medians of parts of the
 picture differ says how sure the whole picture's is.
+
+A colour that lies farther out the farther from the middle has a larger picture (lateral chromatic aberration). The
+lens of the projector does that, and the lens of the camera just so, because it sees red light as red: which of the two
+it is, these photographs do not tell.
 """
 
 from __future__ import annotations
@@ -11,11 +15,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.capture.patterns import PatternPlan
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import smallest
 
 FINE: Final = ("blur-x", "blur-y")
@@ -33,7 +38,11 @@ LEAST_PX: Final = 0.02
 MOST_PX: Final = 1.5
 """Phases repeat after 5 px: a larger shift might as well be one of 3.5 px the other way."""
 SURE: Final = 4.0
-"""Standard errors that a shift needs to be corrected."""
+"""Standard errors that a shift needs to be corrected, and a size to be named."""
+NAMED_SIZE: Final = 1e-4
+"""Relative difference of a colour's size that is named; it is measured to a hundred-thousandth."""
+OUTLIER: Final = 3.0
+ROUNDS: Final = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,26 +75,85 @@ def colour_shifts(captures: Captures, plan: PatternPlan, white: FloatImage, mixi
 
     Raises CalibrationError as ``coloured``.
     """
-    black = coloured(captures, "black", white.shape[:2])
-    bright = np.nanpercentile(smallest(white), 99)
     found, errors = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
+    at = _bright(white)
     for axis, prefix in enumerate(FINE):
-        steps = plan.sinusoids(prefix)
-        at = np.flatnonzero(smallest(white) > FAINTEST * bright)
-        at = at[:: max(1, at.size // SOME_PIXELS)]
-        seen = np.zeros((at.size, 3), np.complex128)
-        for step in steps:
-            image = (coloured(captures, step.name, white.shape[:2]) - black).reshape(-1, 3)[at]
-            seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
-        own = np.linalg.solve(mixing, (2 * seen / white.reshape(-1, 3)[at]).T).T
-        # what is not a number in one of the steps is left out, too
-        own = own[(np.abs(own) > LEAST_CONTRAST).all(axis=1)]
-        if len(own) >= FEWEST_PIXELS:
-            apart = np.angle(own * np.conj(own[:, 1:2])) * FRINGE_PX / (2 * np.pi)
+        apart, _ = _apart_px(captures, plan, prefix, white, mixing, at)
+        if len(apart) >= FEWEST_PIXELS:
             found[:, axis] = np.median(apart, axis=0)
             parts = [np.median(part, axis=0) for part in np.array_split(apart, PARTS)]
             errors[:, axis] = np.std(parts, axis=0, ddof=1) / np.sqrt(PARTS)
     return ColourShifts(found, errors)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourSizes:
+    """``larger`` (3,): by how much the pictures of red, green and blue are larger than green's, relative.
+
+    ``error`` (3,): the standard error of each; both NaN where too little was seen
+    """
+
+    larger: Float64
+    error: Float64
+
+
+def colour_sizes(
+    captures: Captures, plan: PatternPlan, white: FloatImage, mixing: Float64, position_px: FloatImage
+) -> ColourSizes:
+    """Whether the pictures of a projector's colours are of one size.
+
+    ``position_px`` (rows, columns, 2): where camera pixels look in the projector's image, NaN where not known; the rest
+    and the errors: as for ``colour_shifts``
+    """
+    at = _bright(white)
+    at = at[np.isfinite(position_px.reshape(-1, 2)[at]).all(axis=1)]
+    slopes: list[Float64] = []
+    for axis, prefix in enumerate(FINE):
+        apart, seen = _apart_px(captures, plan, prefix, white, mixing, at)
+        if len(apart) < FEWEST_PIXELS:
+            return ColourSizes(np.full(3, np.nan), np.full(3, np.nan))
+        place = position_px.reshape(-1, 2)[at][seen].astype(np.float64)
+        slopes.append(np.stack([_slopes(place, apart[:, colour], axis) for colour in range(3)]))
+    # of each part of the picture, over both axes
+    each = np.mean(slopes, axis=0)
+    return ColourSizes(each.mean(axis=1), np.std(each, axis=1, ddof=1) / np.sqrt(PARTS))
+
+
+def _bright(white: FloatImage) -> npt.NDArray[np.int64]:
+    """Numbers of the camera pixels that see the projector well, at most so many."""
+    at = np.flatnonzero(smallest(white) > FAINTEST * np.nanpercentile(smallest(white), 99))
+    return at[:: max(1, at.size // SOME_PIXELS)]
+
+
+def _apart_px(
+    captures: Captures, plan: PatternPlan, prefix: str, white: FloatImage, mixing: Float64, at: npt.NDArray[np.int64]
+) -> tuple[Float64, Mask]:
+    """(some, 3): by how many projector pixels each colour lies beside green along a sinusoid; and which of ``at``."""
+    black = coloured(captures, "black", white.shape[:2])
+    steps = plan.sinusoids(prefix)
+    seen = np.zeros((at.size, 3), np.complex128)
+    for step in steps:
+        image = (coloured(captures, step.name, white.shape[:2]) - black).reshape(-1, 3)[at]
+        seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
+    own = np.linalg.solve(mixing, (2 * seen / white.reshape(-1, 3)[at]).T).T
+    # what is not a number in one of the steps is left out, too
+    use = (np.abs(own) > LEAST_CONTRAST).all(axis=1)
+    own = own[use]
+    return np.angle(own * np.conj(own[:, 1:2])) * FRINGE_PX / (2 * np.pi), use
+
+
+def _slopes(place_px: Float64, apart_px: Float64, axis: int) -> Float64:
+    """(PARTS,): change of ``apart_px`` (some,) along an axis of the projector's image, of every so many-th pixel."""
+    from_middle = place_px - place_px.mean(axis=0)
+    equations = np.column_stack([np.ones(len(from_middle)), from_middle])
+    used = np.ones(len(equations), np.bool_)
+    for _ in range(ROUNDS):
+        plane = np.linalg.lstsq(equations[used], apart_px[used], rcond=None)[0]
+        off = np.abs(apart_px - equations @ plane)
+        used = off <= OUTLIER * 1.4826 * np.median(off) + 1e-9
+    kept, seen = equations[used], apart_px[used]
+    parts = [np.linalg.lstsq(kept[n::PARTS], seen[n::PARTS], rcond=None)[0][1 + axis] for n in range(PARTS)]
+    return np.array(parts)
 
 
 def misaligned(name: str, shifts: ColourShifts) -> str | None:
@@ -101,4 +169,23 @@ def misaligned(name: str, shifts: ColourShifts) -> str | None:
         f"The colours of projector {name} do not lie on each other: {' and '.join(parts)} from green. What is solved "
         "takes that into account, but detail of single pixels keeps coloured edges. To avoid them, align its panels in "
         "its menu (often called panel alignment, convergence or registration), and calibrate again."
+    )
+
+
+def fringed(name: str, sizes: ColourSizes, size_px: tuple[int, int]) -> str | None:
+    """What a technician should know of ``colour_sizes`` of a projector of ``size_px``; None where they are alike."""
+    sure = np.abs(sizes.larger) > np.maximum(SURE * sizes.error, NAMED_SIZE)
+    if not sure.any():
+        return None
+    parts = [
+        f"{colour}'s picture is {100 * abs(by):.2f} % {'larger' if by > 0 else 'smaller'} than green's"
+        for colour, by, named in zip(COLOURS, sizes.larger, sure, strict=True)
+        if named
+    ]
+    edge_px = float(np.max(np.abs(sizes.larger[sure]))) * max(size_px) / 2
+    return (
+        f"Colours of projector {name} lie apart towards the edges of its picture, by up to {edge_px:.2f} pixels: "
+        f"{' and '.join(parts)} (lateral chromatic aberration of its lens or of the camera's). Nothing has to be done "
+        "unless fine detail has coloured edges there. Then keep the object in the middle of both pictures, with less "
+        "lens shift, and calibrate again."
     )

@@ -55,7 +55,7 @@ def veiling_glare(calibration: Calibration, geometry: Geometry | None) -> float:
     )
     shape = subset_of(geometry, thin)
     paint, indirect = own_reflectance(few, shape), np.sum(thrown, axis=0)
-    veil = _spread(np.asarray(indirect + np.sum([part.white for part in few.projectors], axis=0), np.float32))
+    veil = spread_by_lens(np.asarray(indirect + np.sum([part.white for part in few.projectors], axis=0), np.float32))
     known: Mask = np.asarray(few.object_mask & np.isfinite(paint).all(axis=2))
     shares = _shares(indirect, paint, veil, known)
     if shares.size < FEWEST:
@@ -76,8 +76,8 @@ def veiled(share: float) -> str | None:
     )
 
 
-def _spread(light: FloatImage) -> FloatImage:
-    """Light (rows, columns, 3) as a lens that veils would spread all of it."""
+def spread_by_lens(light: FloatImage) -> FloatImage:
+    """Light (rows, columns) or (rows, columns, 3) as a lens that veils would spread all of it."""
     rows, columns = light.shape[:2]
     coarse = cv2.resize(light, (COARSE_PX, max(1, round(COARSE_PX * rows / columns))), interpolation=cv2.INTER_AREA)
     wide = cv2.GaussianBlur(coarse, (0, 0), WIDE * COARSE_PX, borderType=cv2.BORDER_CONSTANT)
@@ -109,4 +109,4 @@ def _shares(indirect: FloatImage, paint: FloatImage, veil: FloatImage, known: Ma
     return np.concatenate(found) if found else np.zeros(0)
 
 
-__all__ = ["veiled", "veiling_glare"]
+__all__ = ["spread_by_lens", "veiled", "veiling_glare"]

@@ -65,12 +65,14 @@ class SinusoidContrast:
 
     ``fine_around`` (rows, columns): the fine contrast of the light of all pixels around, of all channels together
     ``white`` (rows, columns, 3): the white image with less noise, from all steps, which add up to it
+    ``strengths`` (sinusoids, steps): how strong the lamp was at each step, 1 at white; None where steps are computed
     """
 
     coarse: Sinusoids
     fine: Sinusoids
     fine_around: FloatImage
     white: FloatImage
+    strengths: Float64 | None = None
 
 
 def sinusoid_contrast(
@@ -89,14 +91,15 @@ def sinusoid_contrast(
     black = coloured(captures, "black", white.shape[:2])
     noise = noise or CameraNoise()
     sums = WhiteSums()
-    coarse, _ = _measured(captures, plan, COARSE, black, white, noise, sums)
-    fine, powers = _measured(captures, plan, FINE, black, white, noise, sums)
+    coarse, _, gains = _measured(captures, plan, COARSE, black, white, noise, sums)
+    fine, powers, more = _measured(captures, plan, FINE, black, white, noise, sums)
+    strengths = 1 / np.array([*gains, *more]) if gains else None
     averaged = sums.averaged(white)
     with np.errstate(invalid="ignore", divide="ignore"):
         noise_of_white = white / averaged
         for one in (coarse, fine):
             np.multiply(one.contrast, noise_of_white, out=one.contrast)
-    return SinusoidContrast(coarse, fine, _contrast_around(powers, averaged), averaged)
+    return SinusoidContrast(coarse, fine, _contrast_around(powers, averaged), averaged, strengths)
 
 
 def indirect_share(
@@ -169,14 +172,15 @@ def _measured(
     white: FloatImage,
     camera: CameraNoise,
     white_sums: WhiteSums,
-) -> tuple[Sinusoids, list[FloatImage]]:
+) -> tuple[Sinusoids, list[FloatImage], list[Float64]]:
     """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise.
 
-    And (rows, columns, 3) of each axis: their squared amplitude, without noise. What the steps of each axis add up to
-    goes into ``white_sums``.
+    And (rows, columns, 3) of each axis: their squared amplitude, without noise; and ``_gains`` of each axis, if any.
+    What the steps of each axis add up to goes into ``white_sums``.
     """
     powers: list[FloatImage] = []
     sums: list[FloatImage] = []
+    gains: list[Float64] = []
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
         images = (coloured(captures, step.name, black.shape[:2]) - black for step in steps)
@@ -184,7 +188,8 @@ def _measured(
             along, across = _amplitude(images, steps)
         else:
             kept = list(images)
-            kept = [image * np.float32(gain) for image, gain in zip(kept, _gains(kept, white), strict=True)]
+            gains.append(_gains(kept, white))
+            kept = [image * np.float32(gain) for image, gain in zip(kept, gains[-1], strict=True)]
             along, across = _amplitude(kept, steps)
             sums.append(np.asarray(sum(kept), np.float32))
             white_sums.add(sums[-1] * np.float32(2 / len(steps)))
@@ -200,7 +205,7 @@ def _measured(
     with np.errstate(invalid="ignore", divide="ignore"):
         contrast = 2 * product**0.25 / white
         sigma = 2 * np.sqrt(np.float32(2 / PHASE_STEPS / len(prefixes)) * variance) / white
-    return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32)), powers
+    return Sinusoids(np.asarray(contrast, np.float32), np.asarray(sigma, np.float32)), powers, gains
 
 
 def _contrast_around(powers: Sequence[FloatImage], white: FloatImage) -> FloatImage:

@@ -14,7 +14,7 @@ from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.artefacts.photographs import Developed, light_of, noise_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
-from controller.calibrate.correspondence.colour_alignment import colour_shifts, misaligned
+from controller.calibrate.correspondence.colour_alignment import colour_shifts, colour_sizes, fringed, misaligned
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.correspondence.opposites import completed
@@ -25,13 +25,14 @@ from controller.calibrate.photometry.radiometry import measure_radiometry, white
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.calibrate.indirect import indirect_step
+from controller.steps.calibrate.projector_glare import lens_troubles
 from controller.steps.capture.camera import camera_step
 from controller.steps.capture.patterns import capture_steps, code_step
+from controller.steps.troubles import tell, tell_all
 
 
 def calibration_steps(
@@ -93,8 +94,7 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         known_px=used.known_px(context.folder, projector.name),
         noise=noise_of(bracket[0]),
     )
-    if radiometry.segment:
-        context.reporter.say(white_segment(projector.name, radiometry.segment), Level.WARNING)
+    segment = white_segment(projector.name, radiometry.segment) if radiometry.segment else None
     matrix = bracket[0].read().camera_to_xyz
     light = Light(
         response=radiometry.response,
@@ -105,7 +105,8 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         segment=np.array([radiometry.segment]) if radiometry.segment else None,
     )
     figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
-    return [light.write(context.folder, projector.name), figures]
+    said = tell(context, StepId(StepKind.RADIOMETRY, projector.name), [segment])
+    return [light.write(context.folder, projector.name), figures, said]
 
 
 _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -120,8 +121,6 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     ready = {"black": light.black, "white": light.white + light.black}
     captures = completed(Developed(taken, ready), plan)
     shifts = colour_shifts(captures, plan, light.white, light.mixing)
-    if (said := misaligned(projector.name, shifts)) is not None:
-        context.reporter.say(said, Level.WARNING)
     apart_px = shifts.sure_px
     colours = None if apart_px is None else ColourPlaces.of(apart_px, light.white, light.mixing)
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
@@ -141,6 +140,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
             remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
+    sizes = colour_sizes(captures, plan, light.white, light.mixing, correspondence.projector_px)
+    apart_said = [misaligned(projector.name, shifts), fringed(projector.name, sizes, projector.size_px)]
     fitted = fit_pixels(captures, plan, correspondence, colours)
     metapixels = fitted.metapixels
     pixels = Pixels(
@@ -158,7 +159,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
     apart = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
     figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen), apart)
-    return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name)]
+    said = tell(context, StepId(StepKind.PIXELS, projector.name), apart_said)
+    return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name), said]
 
 
 def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Path]:
@@ -171,4 +173,6 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
         prior,
         progress=lambda fraction: context.advance(fraction, "geometry"),
     )
-    return write_geometry(context.folder, [projector.name for projector in rig.projectors], found)
+    names = [projector.name for projector in rig.projectors]
+    said = tell_all(context, StepId(StepKind.GEOMETRY), lens_troubles(context, rig.projectors, found.geometry))
+    return [*write_geometry(context.folder, names, found), said]

@@ -27,7 +27,6 @@ from controller.capture.pattern_frames import device_frame, frame
 from controller.capture.patterns import Pattern
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.solve.scaling.dither import to_light
@@ -35,6 +34,7 @@ from controller.steps import costs
 from controller.steps.appearance.solving import random_pattern
 from controller.steps.calibrate.drift import shown_frames
 from controller.steps.capture.photographs import Planned, take_all
+from controller.steps.troubles import tell
 
 
 def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -> Step:
@@ -101,10 +101,9 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
     geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
-    for said in glossy(gloss_strength(calibration, geometry)), veiled(veiling_glare(calibration, geometry)):
-        if said is not None:
-            context.reporter.say(said, Level.WARNING)
-    return write_grade(context.folder, figures, maps, png(in_rows(pictures)))
+    sentences = glossy(gloss_strength(calibration, geometry)), veiled(veiling_glare(calibration, geometry))
+    said = tell(context, StepId(StepKind.VERIFY), sentences)
+    return [*write_grade(context.folder, figures, maps, png(in_rows(pictures))), said]
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:

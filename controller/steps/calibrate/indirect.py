@@ -15,6 +15,7 @@ from controller.artefacts.photographs import Developed, noise_of
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
 from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
+from controller.calibrate.photometry.lamp_light import lamp_flicker, unsteady
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import (
     indirect_figures,
@@ -27,6 +28,7 @@ from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
+from controller.steps.troubles import tell
 from controller.transport.indirect_stripes import dark_light
 
 PASSES: Final = 2
@@ -78,7 +80,9 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     known = pixels.phase_map
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, _gain(white, light.white))
-    return [found.write(folder, name), figures.write(folder, name)]
+    unsteadiness = unsteady(name, lamp_flicker(seen.strengths))
+    said = tell(context, StepId(StepKind.INDIRECT, name), [unsteadiness])
+    return [found.write(folder, name), figures.write(folder, name), said]
 
 
 def _gain(white: FloatImage, photographed: FloatImage) -> FloatImage | None:

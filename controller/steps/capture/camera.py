@@ -28,15 +28,16 @@ from controller.capture.linearity import (
     true_exposures,
 )
 from controller.capture.noise import measure_noise
+from controller.capture.pixel_response import response_spread
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.capture.photographs import Planned, take_all
+from controller.steps.troubles import tell
 
 RESPONSE_STOPS = (-6, -5, -4, -3, -2, -1, 0, 1, 2)
 """Exposures of a JPEG camera's bracket series, relative to the one at which white is well exposed."""
@@ -154,19 +155,20 @@ def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
 def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Path]:
     black = BLACK.read(context.folder)
     series = [white_bracket(light_of(name).read(context.folder)) for name in projectors]
+    faults = None
     if is_jpeg(black[0].path):
         profile, figures = _of_colours("jpeg", black, series)
     elif is_linear(black[0].path):
         profile, figures = _of_colours("linear", black, series)
     else:
-        profile, figures = _of_raw(black, series, context)
+        profile, figures, faults = _of_raw(black, series, context)
     path = write_camera_figures(context.folder, figures)
-    return [profile.save(context.folder), path]
+    return [profile.save(context.folder), path, tell(context, StepId(StepKind.CAMERA), [faults])]
 
 
 def _of_raw(
     black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
-) -> tuple[CameraProfile, dict[str, object]]:
+) -> tuple[CameraProfile, dict[str, object], str | None]:
     dark = [_exposed(one) for one in black]
     levels = dark[0][0].levels
     offset = black_offset([one for _, one in dark], levels)
@@ -189,18 +191,20 @@ def _of_raw(
     profile = replace(profile, clip=clip, exposures=true_exposures(ratios))
     if noise is not None:
         profile = replace(profile, noise=noise.noise)
-    if (said := camera_faults(profile.exposures, len(hot), dark[0][1].samples.size)) is not None:
-        context.reporter.say(said, Level.WARNING)
+    lit = [[_samples(one, profile) for one in series] for series in whites]
+    spread = response_spread(lit, levels.colours)
+    faults = camera_faults(profile.exposures, len(hot), dark[0][1].samples.size, spread)
     figures = {
         "kind": "raw",
         "black_offset_steps": offset.tolist(),
         "hot_pixels": len(hot),
+        "response_spread": spread,
         "clip": [[None if np.isinf(value) else float(value) for value in row] for row in clip],
         "exposure_ratios": [[one.nominal, one.ratios] for one in found],
         "worst_nonlinearity": max((one.worst for one in found), default=0.0),
         "noise": {"shot": profile.noise.shot, "read": profile.noise.read, "measured": noise is not None},
     }
-    return profile, figures
+    return profile, figures, faults
 
 
 def _exposed(taken: Taken) -> tuple[RawMosaic, RawExposure]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from controller.artefacts.calibration import read_calibration
-from controller.artefacts.grade import ErrorMaps, write_grade
+from controller.artefacts.grade import ErrorMaps, Trouble, write_grade, write_troubles
 from controller.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
 from controller.bundle.export import png
 from controller.core.arrays import save_arrays
@@ -90,6 +90,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(runs, "20260102-100000-quick", (2.5, 3.5))
     made = write_run(runs, "20260103-100000-calibrate", (9.0, 4.0))
     write_run(runs, "20260104-100000-calibrate", (1.0, 1.0))
+    write_troubles(made, StepId("pixels", "left"), [Trouble("Blue is <i>off</i>. Run `velatura drift`.", "left")])
     write_calibration_report(made, ASKED)
     return made
 
@@ -114,6 +115,7 @@ def test_it_is_compared_with_those_before_it_and_not_with_those_after(run: Path)
     assert "4 Jan 2026" not in text
     assert not re.search("[0-9]{8}-[0-9]{6}", text), "names of runs are for programs"
     assert "at most 8 %, not reached" in text
+    assert "What the calibration found Blue is <i>off</i>. Run velatura drift" in text
     assert "Colours beside green, corrected, in pixels: left red 0.50, blue 0.25." in text
 
 
@@ -123,6 +125,7 @@ def test_the_figures_are_for_machines_and_the_pictures_for_the_panel(run: Path) 
     assert figures["metapixels"] == {"left": 192, "<b>right</b>": 192}
     assert figures["colours_px"] == {"left": [list(place) for place in APART], "<b>right</b>": None}
     assert figures["geometry"]["reprojection_rms_px"] == 0.025
+    assert figures["troubles"] == [{"sentence": "Blue is <i>off</i>. Run `velatura drift`.", "projector": "left"}]
     for name in ("before.png", "resolution.png"):
         picture = cv2.imread(str(run / name))
         assert picture is not None

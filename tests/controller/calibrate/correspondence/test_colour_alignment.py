@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.calibrate.correspondence.colour_alignment import ColourShifts, colour_shifts, misaligned
+from controller.calibrate.correspondence.colour_alignment import (
+    ColourShifts,
+    ColourSizes,
+    colour_shifts,
+    colour_sizes,
+    fringed,
+    misaligned,
+)
 from controller.capture.pattern_frames import frame
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage
@@ -14,9 +21,16 @@ MIXING = np.array([[0.86, 0.10, 0.04], [0.07, 0.88, 0.05], [0.02, 0.09, 0.89]])
 PLAN = plan_patterns((96, 72))
 
 
-def pictures(shifts: Float64, noise: float = 0.01) -> dict[str, FloatImage]:
-    """A camera that sees 2.3 pixels for each of the projector's, whose colours are shifted by (3, 2) pixels."""
+def places() -> FloatImage:
+    """Where the camera's pixels look: it sees 2.3 pixels for each of the projector's."""
     y, x = np.mgrid[0:150, 0:200] / 2.3 + 3.0
+    return np.stack([x, y], axis=2).astype(np.float32)
+
+
+def pictures(shifts: Float64, noise: float = 0.01, larger: Float64 | None = None) -> dict[str, FloatImage]:
+    """Seen at ``places``; colours are shifted by (3, 2) pixels, and ``larger`` (3,), seen from pixel (40, 30)."""
+    x, y = np.moveaxis(places().astype(np.float64), 2, 0)
+    sizes = np.zeros(3) if larger is None else larger
     rng = np.random.default_rng(3)
     paint = 0.2 + 0.6 * rng.random((1, 200, 3))
     whole = np.broadcast_to(paint, (150, 200, 3)).astype(np.float32)
@@ -26,7 +40,10 @@ def pictures(shifts: Float64, noise: float = 0.01) -> dict[str, FloatImage]:
             fx, fy = step.frequency
             # 0.6 of the contrast is left by blur
             own = [
-                0.5 + 0.3 * np.cos(2 * np.pi * (fx * (x - dx) + fy * (y - dy)) - step.phase_rad) for dx, dy in shifts
+                0.5 + 0.3 * np.cos(
+                    2 * np.pi * (fx * (x - dx - by * (x - 40)) + fy * (y - dy - by * (y - 30))) - step.phase_rad
+                )
+                for (dx, dy), by in zip(shifts, sizes, strict=True)
             ]  # fmt: skip
             light = np.stack(own, axis=-1) @ MIXING.T * whole
             found[step.name] = (light * (1 + noise * rng.standard_normal(light.shape))).astype(np.float32)
@@ -81,3 +98,27 @@ def test_only_what_is_beyond_doubt_is_corrected(px: float, error_px: float, sure
 def test_without_light_nothing_is_said() -> None:
     made = {name: np.zeros_like(image) for name, image in pictures(np.zeros((3, 2))).items()}
     assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None
+    assert fringed("left", colour_sizes(made, PLAN, made["white"], MIXING, places()), (96, 72)) is None
+
+
+@pytest.mark.parametrize("larger", [(-4e-4, 0.0, 4e-4), (2e-3, 0.0, 0.0), (1e-3, 1e-3, 0.0)])
+def test_colours_of_another_size_are_found_beside_shifts_and_named(larger: tuple[float, float, float]) -> None:
+    made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), larger=np.array(larger))
+    found = colour_sizes(made, PLAN, made["white"], MIXING, places())
+    np.testing.assert_allclose(found.larger, np.array(larger) - larger[1], atol=6e-5)
+    said = fringed("left", found, (96, 72))
+    assert said is not None
+    assert ("red's picture" in said) == (larger[0] != larger[1])
+    assert ("blue's picture" in said) == (larger[2] != larger[1])
+    assert "camera's" in said
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])
+def test_shifted_colours_of_one_size_are_not_named_as_fringes(noise: float) -> None:
+    made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), noise)
+    assert fringed("left", colour_sizes(made, PLAN, made["white"], MIXING, places()), (96, 72)) is None
+
+
+def test_a_size_that_is_not_sure_is_not_named() -> None:
+    assert fringed("left", ColourSizes(np.array([3e-4, 0, 0]), np.full(3, 1e-4)), (96, 72)) is None
+    assert fringed("left", ColourSizes(np.full(3, np.nan), np.full(3, np.nan)), (96, 72)) is None

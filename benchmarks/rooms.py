@@ -1,0 +1,116 @@
+"""The demo in rooms with real light: its four appearances without and with one photograph, and the troubles it names.
+
+Each demo is a whole job through emulated devices, and its figures are those of its report: photographed, against the
+adapted target over what is in reach of it; then against the target as asked. What it names is compared with what
+bench.toml says there is. ``BENCH_ROOMS`` and ``BENCH_SEEDS`` choose some; ``BENCH_FOLDER`` keeps the demos, and
+measures kept ones again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks import Row, at_least, at_most
+from controller.artefacts.grade import Trouble
+from controller.demo.job import demo
+from controller.demo.stage import APPEARANCES, prepare
+from controller.run.progress import Silent
+from plugins.emulated.optics.truth import BenchTruth, read_truth
+
+ROOMS: Final = "room hard"
+SEEDS: Final = "1 7 23"
+GOALS: Final = {"room": ((1.2, 6.0), (0.9, 5.0)), "hard": (None, (2.0, 8.0))}
+"""CIEDE2000, median and 95 %, without and with one photograph."""
+Named = tuple[str, str | None]
+"""A part of the sentence that names a trouble, and the projector that has it."""
+
+
+def measure(size: str) -> list[Row]:
+    """Run every chosen demo that is not there yet, and judge all of them."""
+    rooms = os.environ.get("BENCH_ROOMS", ROOMS).split()
+    seeds = os.environ.get("BENCH_SEEDS", SEEDS).split()
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="velatura-bench-") as temporary:
+        folder = Path(os.environ.get("BENCH_FOLDER", temporary))
+        for room in rooms:
+            found = [_figures(folder / f"{room}-{size}-{seed}", room, size, int(seed)) for seed in seeds]
+            rows += _appearances(room, found)
+            rows += _troubles(room, [(read_truth(out / "stage"), figures) for out, figures in found])
+    return rows
+
+
+def _figures(out: Path, room: str, size: str, seed: int) -> tuple[Path, dict[str, Any]]:
+    """The folder of a demo, run now or before, and its report.json."""
+    if not (out / "report.json").exists():
+        stage = prepare(out, size=size, object_file=None, seed=seed, room=room)
+        demo(stage, reporter=Silent(), cancel=threading.Event())
+    return out, json.loads((out / "report.json").read_bytes())
+
+
+def _appearances(room: str, found: Sequence[tuple[Path, dict[str, Any]]]) -> list[Row]:
+    before, after = GOALS.get(room, (None, None))
+    rows = []
+    for table in APPEARANCES:
+        each = [next(one for one in figures["appearances"] if one["name"] == table["name"]) for _, figures in found]
+        ways = (
+            ("no photograph", [one["refined"]["photographs"][0] for one in each], before),
+            ("one photograph", [one["adapted"] for one in each], after),
+            ("one photograph, as asked", [one["pixels"]["in_reach"] for one in each], None),
+            ("all lit pixels, as asked", [one["pixels"]["lit"] for one in each], None),
+        )
+        for way, values, goals in ways:
+            for n, key in enumerate(("delta_e00_median", "delta_e00_p95")):
+                seen = [one[key] for one in values]
+                name = f"{room}, {table['name']}, {way}, {('median', '95 %')[n]}"
+                how = "by seed " + ", ".join(f"{value:.2f}" for value in seen)
+                rows.append(at_most(name, max(seen), None if goals is None else goals[n], unit="CIEDE2000", how=how))
+    return rows
+
+
+def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> list[Row]:
+    """Every trouble counts once for each projector that has it; the worst demo counts."""
+    named, false = [], []
+    for truth, figures in found:
+        told = [Trouble(**one) for one in figures["troubles"]]
+        said = {one for one in _possible(truth) if any(one[0] in t.sentence and one[1] == t.projector for t in told)}
+        there = {one for one, level in _possible(truth).items() if level}
+        named.append((len(said & there), len(there), sorted(f"{text} ({whose})" for text, whose in there - said)))
+        false.append((len(said - there), sorted(f"{text} ({whose})" for text, whose in said - there)))
+    worst = min(named, key=lambda one: one[0] - one[1])
+    wrong = max(false)
+    missing = "; ".join(worst[2]) or "nothing missing"
+    return [
+        at_least(f"{room}, troubles named", worst[0], worst[1], unit="troubles", how=missing),
+        at_most(f"{room}, named though not there", wrong[0], 0, unit="troubles", how="; ".join(wrong[1])),
+    ]
+
+
+def _possible(truth: BenchTruth) -> dict[Named, float]:
+    """All troubles that may be told, with their levels; 0 where there is none."""
+    sensor = truth.camera.sensor
+    found: dict[Named, float] = {
+        ("glare in the camera's lens", None): truth.camera.glare,
+        ("exposure times differ", None): sensor.shutter_spread,
+        ("pixels are hot", None): sensor.hot_pixels,
+        ("the response of its pixels differs", None): sensor.response_spread,
+        ("The object is glossy", None): truth.object.gloss,
+    }
+    for one in truth.projectors:
+        shifts = [abs(px) for shift in one.panels.shift_px for px in shift]
+        found |= {
+            ("is not steady", one.name): one.lamp.flicker,
+            ("do not lie on each other", one.name): max(shifts),
+            ("lie apart towards the edges", one.name): max(abs(size) for size in one.panels.magnified),
+            ("adds white light of its own", one.name): one.light.white_segment,
+            ("as a veil over its whole picture", one.name): one.light.glare,
+        }
+    return found
+
+
+__all__: Sequence[str] = ("measure",)

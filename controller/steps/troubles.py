@@ -1,0 +1,29 @@
+"""Tells a technician what a step found, and keeps it for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from controller.artefacts.grade import Trouble, write_troubles
+from controller.run.progress import Level
+from controller.run.runner import Context
+from controller.run.step_id import StepId
+
+
+def tell(context: Context, step: StepId, sentences: Sequence[str | None]) -> Path:
+    """Say what was found of the step's projector, if it has one, as warnings; None is nothing.
+
+    Returns the file that keeps it, an artefact of the step.
+    """
+    return tell_all(context, step, [Trouble(one, step.projector) for one in sentences if one is not None])
+
+
+def tell_all(context: Context, step: StepId, found: Sequence[Trouble]) -> Path:
+    """As ``tell``."""
+    for trouble in found:
+        context.reporter.say(trouble.sentence, Level.WARNING)
+    return write_troubles(context.folder, step, found)
+
+
+__all__ = ["tell", "tell_all"]

@@ -1,0 +1,60 @@
+"""What steps found is said once, kept by step, and forgotten when the step finds nothing any more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
+
+from controller.artefacts.grade import Trouble, read_troubles, write_troubles
+from controller.artefacts.kinds import StepKind
+from controller.run.progress import Level
+from controller.run.step_id import StepId
+from controller.steps.troubles import tell
+
+if TYPE_CHECKING:
+    from controller.run.runner import Context
+
+
+class Said:
+    def __init__(self) -> None:
+        self.all: list[tuple[str, Level]] = []
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.all.append((text, level))
+
+
+def context(folder: Path) -> tuple[Context, Said]:
+    said = Said()
+    return cast("Context", SimpleNamespace(folder=folder, reporter=said)), said
+
+
+def test_troubles_of_all_steps_are_read_back(tmp_path: Path) -> None:
+    camera, left = StepId(StepKind.CAMERA), StepId(StepKind.PIXELS, "left")
+    now, said = context(tmp_path)
+    paths = {tell(now, camera, ["Hot."]), tell(now, left, [None, "Bent.", "Blue."])}
+    assert all(path.parent == tmp_path for path in paths)
+    assert len(paths) == 2
+    assert said.all == [("Hot.", Level.WARNING), ("Bent.", Level.WARNING), ("Blue.", Level.WARNING)]
+    wanted = [Trouble("Hot."), Trouble("Bent.", "left"), Trouble("Blue.", "left")]
+    assert read_troubles(tmp_path) == wanted
+
+
+def test_a_step_that_finds_nothing_forgets_what_it_found_before(tmp_path: Path) -> None:
+    now, said = context(tmp_path)
+    path = tell(now, StepId(StepKind.CAMERA), ["Hot."])
+    assert tell(now, StepId(StepKind.CAMERA), [None]) == path
+    assert json.loads(path.read_text()) == []
+    assert read_troubles(tmp_path) == []
+    assert len(said.all) == 1
+
+
+def test_runs_of_earlier_versions_have_none(tmp_path: Path) -> None:
+    assert read_troubles(tmp_path) == []
+
+
+def test_projectors_whose_names_differ_keep_their_own(tmp_path: Path) -> None:
+    for name in ("a", "A", "a b", "a%20b", "ä"):
+        write_troubles(tmp_path, StepId(StepKind.PIXELS, name), [Trouble(f"of {name}", name)])
+    assert {one.projector for one in read_troubles(tmp_path)} == {"a", "A", "a b", "a%20b", "ä"}

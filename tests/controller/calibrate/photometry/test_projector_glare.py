@@ -1,0 +1,121 @@
+"""A veil of a projector's lens is told from other light in dark parts: judged by veils of other shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from scipy.signal import fftconvolve
+
+from controller.calibrate.photometry.glare import spread_by_lens
+from controller.calibrate.photometry.projector_glare import DarkPart, Glare, lens_veils, projector_glare
+from controller.core.arrays import Float64, FloatImage
+
+SHAPE = (320, 420)
+SIZE = (150, 200)
+"""Of the projector's picture; it lies on the whole wall."""
+Veil = Callable[[Float64], Float64]
+
+
+def even(picture: Float64) -> Float64:
+    return np.full_like(picture, picture.mean())
+
+
+def scattered(picture: Float64) -> Float64:
+    """Falls with the third power of the angle, as stray light in lenses does."""
+    y, x = np.mgrid[-SIZE[0] : SIZE[0] + 1, -SIZE[1] : SIZE[1] + 1]
+    spread = (1 + (x**2 + y**2) / 30.0**2) ** -1.5
+    return fftconvolve(picture, spread / spread.sum(), mode="same")
+
+
+def stripes() -> list[Float64]:
+    found = []
+    for axis, bits in ((1, 3), (0, 3)):
+        for bit in range(bits):
+            lit = (np.arange(SIZE[axis]) * 2 ** (bit + 1) // SIZE[axis]) % 2 == 1
+            found.append(np.broadcast_to(lit if axis else lit[:, None], SIZE).astype(np.float64))
+    return found
+
+
+def on_wall(picture: Float64) -> Float64:
+    return np.asarray(cv2.resize(picture, SHAPE[::-1], interpolation=cv2.INTER_LINEAR), np.float64)
+
+
+def stage(
+    glare: float, veil: Veil = even, *, bounced: float = 0.1, lens: float = 0.02, seed: int = 0, shadows: int = 30
+) -> tuple[list[FloatImage], list[DarkPart], FloatImage]:
+    """A painted wall behind things that throw shadows on it; light of other surfaces comes from where stripes are."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
+    paint = rng.choice((0.2, 0.5, 0.8), (20, 26, 3)).repeat(17, axis=0)[: SHAPE[0]].repeat(17, axis=1)[:, : SHAPE[1]]
+    paint = cv2.GaussianBlur(paint, (0, 0), 0.7)
+    falling = []
+    for slope, number in ((0.3, shadows), (-0.3, 4), (0.1, 4)):
+        lit = np.ones(SHAPE)
+        for _ in range(number):
+            row, column, radius = rng.uniform(20, 300), rng.uniform(20, 400), rng.uniform(10, 18)
+            lit[np.hypot(y - row, x - column) < radius] = 0
+        falling.append(cv2.GaussianBlur(lit, (0, 0), 1.2) * (1 + slope * (x / SHAPE[1] - 0.5)))
+    around = paint * bounced * (1 + 0.5 * np.sin(x / 40) * np.cos(y / 30))[..., None]
+    whites = [_noisy(paint * light[..., None] + around, rng) for light in falling]
+    parts = []
+    for picture in stripes():
+        stray = np.clip(veil(picture), 0, None)
+        wide = on_wall(np.asarray(cv2.GaussianBlur(picture, (0, 0), 35.0), np.float64))
+        seen = paint * (falling[0] * on_wall((1 - glare) * picture + glare * stray))[..., None]
+        seen = seen + around * wide[..., None]
+        seen = seen + lens * cv2.GaussianBlur(seen, (0, 0), 60.0)
+        dark = on_wall(np.asarray(cv2.dilate(picture, np.ones((13, 13))), np.float64)) < 0.01
+        spread = on_wall(spread_by_lens(picture.astype(np.float32)).astype(np.float64))
+        parts.append(DarkPart(_noisy(seen, rng), dark & (falling[0] > 0.3), spread.astype(np.float32)))
+    return whites, parts, np.full(SHAPE, 1.2, np.float32)
+
+
+def _noisy(light: Float64, rng: np.random.Generator) -> FloatImage:
+    return (light + rng.standard_normal(light.shape) * np.sqrt(light / 36_000 + 1e-7)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("veil", "least", "most"), [(even, 1.0, 3.0), (scattered, 0.6, 1.4)], ids=["even", "by angle"])
+@pytest.mark.parametrize("glare", [0.02, 0.04])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_veil_is_measured(veil: Veil, least: float, most: float, glare: float, seed: int) -> None:
+    whites, parts, depth_m = stage(glare, veil, seed=seed)
+    found = projector_glare(whites, 0, parts, depth_m)
+    # dark parts get more of a veil that is as strong everywhere than of one that falls with the angle
+    assert least * glare < found.share < most * glare
+
+
+def test_a_veil_is_named() -> None:
+    whites, parts, depth_m = stage(0.03, scattered)
+    found = projector_glare(whites, 0, parts, depth_m)
+    said = lens_veils("left", found.sure)
+    assert said is not None
+    assert f"{100 * found.share:.1f} %" in said
+    assert "projector left" in said
+
+
+@pytest.mark.parametrize("bounced", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("lens", [0.0, 0.04])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_light_of_other_surfaces_and_the_cameras_veil_are_none(bounced: float, lens: float, seed: int) -> None:
+    whites, parts, depth_m = stage(0.0, bounced=bounced, lens=lens, seed=seed)
+    assert lens_veils("left", projector_glare(whites, 0, parts, depth_m).sure) is None
+
+
+def test_nothing_is_said_where_nothing_tells() -> None:
+    whites, parts, depth_m = stage(0.04)
+    assert projector_glare(whites, 0, [], depth_m).sure == 0
+    assert projector_glare(whites[:1], 0, parts, depth_m).sure == 0
+    assert projector_glare(whites, 0, parts, np.full_like(depth_m, np.nan)).sure == 0
+    whites, parts, depth_m = stage(0.04, shadows=0)
+    assert projector_glare(whites, 0, parts, depth_m).sure == 0
+
+
+@pytest.mark.parametrize(
+    ("share", "error", "blocks", "sure"),
+    [(0.02, 0.004, 40, True), (0.02, 0.006, 40, False), (0.02, 0.0, 5, False), (-0.02, 0.001, 40, False)],
+)
+def test_only_what_is_beyond_doubt_is_believed(share: float, error: float, blocks: int, sure: bool) -> None:
+    assert Glare(share, error, blocks).sure == (share if sure else 0)
