@@ -20,6 +20,10 @@ import numpy.typing as npt
 from controller.core.arrays import Float64, FloatImage, Mask
 
 GREEN: Final = 1
+ENOUGH_SAMPLES: Final = 1_000_000
+"""So many stand for a larger picture."""
+BAND_PX, GAP_PX = 96, 2
+"""Rows that are kept together, and how many of them, the last, are not used, so that no detail spans two bands."""
 BLOCK_PX: Final = 24
 WHOLE: Final = 0.9
 """Of a block's green samples that must be known in both photographs."""
@@ -65,6 +69,16 @@ def response_spread(whites: Sequence[Sequence[FloatImage]], colours: npt.NDArray
     coarser = np.concatenate([_block_means(one.coarser * other.coarser) for one, other in pairs])
     known = np.isfinite(finest) & np.isfinite(coarser)
     return _of_even_paint(finest[known], np.abs(coarser[known]))
+
+
+def some_rows(samples: FloatImage) -> FloatImage:
+    """Bands of rows from all over a picture (rows, columns), about ``ENOUGH_SAMPLES``; all of a small one."""
+    step = int(np.ceil(samples.size / ENOUGH_SAMPLES))
+    if step < 2:
+        return samples
+    bands = samples[: len(samples) // BAND_PX * BAND_PX].reshape(-1, BAND_PX, samples.shape[1])[::step].copy()
+    bands[:, -GAP_PX:] = np.nan
+    return bands.reshape(-1, samples.shape[1])
 
 
 def _of_even_paint(finest: Float64, coarser: Float64) -> float:
@@ -134,4 +148,4 @@ def _block_means(products: Float64) -> Float64:
     return np.asarray(np.divide(total, count, out=np.full(len(blocks), np.nan), where=enough), np.float64)
 
 
-__all__ = ["response_spread"]
+__all__ = ["response_spread", "some_rows"]

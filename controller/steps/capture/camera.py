@@ -28,7 +28,7 @@ from controller.capture.linearity import (
     true_exposures,
 )
 from controller.capture.noise import measure_noise
-from controller.capture.pixel_response import response_spread
+from controller.capture.pixel_response import response_spread, some_rows
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
 from controller.core.arrays import ByteImage, FloatImage
@@ -191,7 +191,7 @@ def _of_raw(
     profile = replace(profile, clip=clip, exposures=true_exposures(ratios))
     if noise is not None:
         profile = replace(profile, noise=noise.noise)
-    lit = [[_samples(one, profile) for one in series] for series in whites]
+    lit = [[some_rows(_samples(one, profile)) for one in series] for series in whites]
     spread = response_spread(lit, levels.colours)
     faults = camera_faults(profile.exposures, len(hot), dark[0][1].samples.size, spread)
     figures = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from controller.capture.linearity import NAMED_SPREAD, camera_faults
-from controller.capture.pixel_response import response_spread
+from controller.capture.pixel_response import ENOUGH_SAMPLES, response_spread, some_rows
 from controller.core.arrays import Float64, FloatImage
 
 SHAPE = (360, 480)
@@ -74,6 +74,16 @@ def test_an_even_sensor_has_none_whatever_the_paint(seed: int, only_rough: bool)
     found = response_spread(whites(0.0, seed=seed, only_rough=only_rough), RGGB)
     assert found < NAMED_SPREAD
     assert camera_faults(np.empty((0, 2)), 0, 1000, found) is None
+
+
+def test_some_rows_stand_for_a_large_picture() -> None:
+    large = [[np.tile(one, (6, 3)) for one in exposures] for exposures in whites(0.01)]
+    few = [[some_rows(one) for one in exposures] for exposures in large]
+    assert few[0][0].size < 1.2 * ENOUGH_SAMPLES < large[0][0].size
+    assert few[0][0].shape[0] % 2 == 0
+    assert response_spread(few, RGGB) == pytest.approx(0.01, rel=0.15)
+    small = large[0][0][:300, :400]
+    assert some_rows(small) is small
 
 
 def test_one_projector_does_not_tell() -> None:
