@@ -89,7 +89,8 @@ class CameraTruth:
 
     ``glare``: share of the light that its lens spreads over the whole picture (``effects.flaws.veiled``);
     ``focus_m``: where along its axis it is focused, 0: all is sharp (``effects.depth_of_field``);
-    ``bands_nm``: its filters, without which its colours are those of sRGB (``effects.spectra``).
+    ``bands_nm``: its filters, without which its colours are those of sRGB (``effects.spectra``);
+    ``picture_s``: a picture takes at least so long from the release to its file, in seconds of the clock.
     """
 
     pose: Pose
@@ -104,6 +105,7 @@ class CameraTruth:
     glare: Annotated[float, Between(0.0, 0.5)] = 0.0
     focus_m: Annotated[float, Between(0.0, 100.0)] = 0.0
     bands_nm: Annotated[Bands, Between(0.0, 2000.0)] = NO_BANDS
+    picture_s: Annotated[float, Between(0.0, 60.0)] = 0.0
 
     @property
     def spectral(self) -> bool:

@@ -101,7 +101,7 @@ class World:
         return len(bumps.bump)
 
     def expose(self, settings: ShotSettings) -> ShotFiles:
-        """Take one picture: lasts the (scaled) exposure time, and shows what was visible during it."""
+        """Take one picture of what is visible during the (scaled) exposure time; lasts ``picture_s`` at least."""
         taken = time.strftime("%Y:%m:%d %H:%M:%S")
         before = [lamp.light_level() for lamp in self._lamps]
         start_s = time.monotonic()
@@ -113,7 +113,9 @@ class World:
         # Panels and shutter keep no time with each other.
         shutter = Shutter(float(self._moment.random()), settings.exposure_s, settings.aperture_f)
         light = self._mixed(self._visible.during(start_s, end_s), levels, shutter)
-        return self._files(light, settings, taken)
+        files = self._files(light, settings, taken)
+        time.sleep(max(0.0, start_s + self._truth.camera.picture_s - time.monotonic()))
+        return files
 
     def _mixed(
         self, visible: list[tuple[float, VisibleFrameSet | None]], levels: Sequence[float], shutter: Shutter

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -248,3 +249,10 @@ def test_exposures_differ_from_what_the_camera_says_the_same_way_each_time(
     assert np.log(error).std() == pytest.approx(0.05, rel=0.3)
     again = shots(wrong, *said).mean(axis=(1, 2))
     np.testing.assert_allclose(again / shots(truth, *said).mean(axis=(1, 2)), error, rtol=5e-3)
+
+
+def test_a_picture_lasts_as_long_as_the_camera_needs(truth: BenchTruth, shots: Callable[..., Image]) -> None:
+    slow = dataclasses.replace(truth, camera=dataclasses.replace(truth.camera, picture_s=0.4))
+    began_s = time.monotonic()
+    shots(slow, 0.02, 0.02, 0.02)
+    assert time.monotonic() - began_s >= 1.2
