@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -111,31 +112,11 @@ def pattern_errors(stage: CalibratedStage, truth: Truth) -> list[dict[str, float
     All of them with what other surfaces throw back, as the solves predict it.
     """
     calibrated = Calibrated(stage.run, stage.names)
-    calibration = calibrated.calibration
     found = []
-    for n, part in enumerate(calibration.projectors):
+    for n, part in enumerate(calibrated.calibration.projectors):
         rows, columns = part.metapixels.valid.shape
-        lit = calibrated.transport.lit[n]
-        white = truth.white(n)
-        full = 1.02 * float(white.max())
-        clean_white = developed(white, full)
-        known = part.white if part.indirect is None else part.white + part.indirect
-        unit = float(known[lit].sum(dtype=np.float64) / clean_white[lit].sum(dtype=np.float64))
-
-        def clean(shown: ByteImage, n: int = n, full: float = full, unit: float = unit) -> FloatImage:
-            return developed(truth.light(n, shown), full) * np.float32(unit)
-
-        pattern = random_pattern((columns, rows))
-        photograph = codes_of(part.name).by_name(stage.run)[pattern.name].per_second()
-        predicted = predicted_light(calibrated, n, frame(pattern, (columns, rows)))
-        real = clean(device_frame(pattern, (columns, rows), part.radiometry.response))
-        figures = {
-            "random photographed": verify(
-                predicted + calibration.black, photograph, calibration.black, lit
-            ).relative_rms,
-            "random": relative(predicted, real, lit),
-            "random noise": relative(photograph - calibration.black, real, lit),
-        }
+        lit, clean = calibrated.transport.lit[n], noise_free(calibrated, truth, n)
+        figures = random_errors(calibrated, n, clean)
         y, x = np.mgrid[0:rows, 0:columns]
         for name, on in (("chequers", (x + y) % 2), ("columns", (x // 2) % 2)):
             light = np.repeat(on.astype(np.float32)[..., None], 3, axis=2)
@@ -148,6 +129,32 @@ def pattern_errors(stage: CalibratedStage, truth: Truth) -> list[dict[str, float
         figures["column of T, one surface"] = relative(predicted, real, lit & truth.one_surface(n, EDGE_PX))
         found.append(figures)
     return found
+
+
+def noise_free(calibrated: Calibrated, truth: Truth, n: int) -> Callable[[ByteImage], FloatImage]:
+    """What the camera would make of a device frame of projector ``n`` without noise, in the calibration's unit."""
+    part, lit = calibrated.calibration.projectors[n], calibrated.transport.lit[n]
+    white = truth.white(n)
+    full = 1.02 * float(white.max())
+    clean_white = developed(white, full)
+    known = part.white if part.indirect is None else part.white + part.indirect
+    unit = np.float32(known[lit].sum(dtype=np.float64) / clean_white[lit].sum(dtype=np.float64))
+    return lambda shown: developed(truth.light(n, shown), full) * unit
+
+
+def random_errors(calibrated: Calibrated, n: int, clean: Callable[[ByteImage], FloatImage]) -> dict[str, float]:
+    """Of the grade's random pattern: its error, and the parts that prediction and photograph have in it."""
+    part, black = calibrated.calibration.projectors[n], calibrated.calibration.black
+    rows, columns = part.metapixels.valid.shape
+    lit, pattern = calibrated.transport.lit[n], random_pattern((columns, rows))
+    photograph = codes_of(part.name).by_name(calibrated.folder)[pattern.name].per_second()
+    predicted = predicted_light(calibrated, n, frame(pattern, (columns, rows)))
+    real = clean(device_frame(pattern, (columns, rows), part.radiometry.response))
+    return {
+        "random photographed": verify(predicted + black, photograph, black, lit).relative_rms,
+        "random": relative(predicted, real, lit),
+        "random noise": relative(photograph - black, real, lit),
+    }
 
 
 def predicted_light(calibrated: Calibrated, n: int, light: FloatImage) -> FloatImage:

@@ -15,6 +15,8 @@ from embreex.mesh_construction import TriangleMesh
 from controller.capture.raw import develop
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from plugins.emulated.kept_light import kept_folder
+from plugins.emulated.optics.bumps import FILE as BUMPS
+from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.indirect.kept import Indirect
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, directions, samples_of
@@ -29,15 +31,19 @@ STEEPEST = 3.0
 
 
 class Truth:
-    """The truth of a stage folder, and pictures of it without noise."""
+    """The truth of a stage folder, and pictures of it without noise.
 
-    def __init__(self, stage: Path) -> None:
-        self.bench: BenchTruth = read_truth(stage)
+    ``bumps``: with what was done to it after it was set up. Only bumps that leave all rays where they are will do.
+    """
+
+    def __init__(self, stage: Path, *, bumps: bool = False) -> None:
+        set_up = read_truth(stage)
+        self.bench: BenchTruth = bumped(set_up, read_bumps(stage / BUMPS, set_up)) if bumps else set_up
         self.stage_object: StageObject = object_of(stage, self.bench.object)
         kept = kept_folder(stage / FOLDER)
-        self.samples = samples_of(self.bench, self.stage_object, kept, lambda share: None)
+        self.samples = samples_of(set_up, self.stage_object, kept, lambda share: None)
         indirect = Indirect(self.stage_object, kept)
-        transfer = indirect.transfer(self.bench, self.samples.pixels, lambda share: None, keep=True)
+        transfer = indirect.transfer(set_up, self.samples.pixels, lambda share: None, keep=True)
         self._renderer = Renderer(self.bench, self.samples, transfer)
         self._direct = Renderer(*_direct_alone(self.bench, self.samples))
         width, height = self.bench.camera.lens.size_px
