@@ -22,6 +22,8 @@ from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
 from controller.services.calibrate import calibrating
+from controller.solve.engines.choice import choose_engine
+from controller.solve.engines.processor import Engine
 from controller.solve.feasibility import target_radiance
 from controller.solve.traditional import exposed_for_one, traditional_compensation
 from controller.stage.bench import BenchProcess
@@ -49,16 +51,18 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
     checked, out = check_stage(stage), stage.parent
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     session = OwnSession(stage, around=bench)
-    run = session.run(checked, partial(demo_steps, checked=checked), name="demo", reporter=reporter, cancel=cancel)
+    engine = choose_engine(checked.stage.tables.solve.device, reporter.say)
+    steps = partial(demo_steps, checked=checked, engine=engine)
+    run = session.run(checked, steps, name="demo", reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")
     html, machine = write_demo_report(out, run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
 
 
-def demo_steps(rig: Rig, run: Path, *, checked: Checked) -> Sequence[Step]:
+def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequence[Step]:
     """Calibrate, solve, refine, publish, photograph, compare with one projector, swap."""
     stage = checked.stage
-    calibrated = Calibrated(run, checked.names)
+    calibrated = Calibrated(run, checked.names, engine)
     requests = requests_of(stage, calibrated)
     names = [request.name for request in requests]
     table = stage.tables.solve

@@ -11,6 +11,7 @@ from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
+from controller.demo.job import demo
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
@@ -125,6 +126,9 @@ def test_what_solves_is_as_typed_or_as_the_stage_says(stage: Path, monkeypatch: 
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert refused(None) == "extra-missing"
     assert refused("auto") == "not-calibrated"
+    with pytest.raises(UsageError) as error:
+        demo(stage, reporter=Silent(), cancel=threading.Event())
+    assert error.value.code == "extra-missing", "the demo, too, and before its devices are started"
 
 
 def test_playing_without_a_bundle_is_refused_before_any_device_is_opened(stage: Path) -> None:
