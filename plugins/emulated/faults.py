@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 
@@ -75,6 +75,3 @@ class Faults:
 def noise(answer: bytes) -> bytes:
     """Bytes of the same length that mean nothing, with the line end kept so that they look like an answer."""
     return bytes((byte * 7 + 0x81) & 0xFF | 0x80 for byte in answer[:-1]) + answer[-1:]
-
-
-KNOBS = tuple(field.name for field in fields(WireFaults))

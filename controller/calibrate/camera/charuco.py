@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from controller.calibrate.camera.intrinsics import CameraIntrinsics
 from controller.core.arrays import Float64
-from controller.core.errors import CalibrationError, UsageError
+from controller.core.errors import CalibrationError
 
 SQUARES: Final = (11, 8)
 MARKER_SHARE: Final = 0.75
@@ -61,40 +61,14 @@ def find_corners(photograph: Grey) -> BoardView | None:
     return BoardView(known, np.asarray(corners, dtype=np.float32).reshape(-1, 2))
 
 
-def calibrate_camera(photographs: Sequence[Grey]) -> CameraIntrinsics:
-    """Focal length, principal point and k1 with their covariance, from photographs of the board.
-
-    Parameters
-    ----------
-    photographs : grey (rows, columns) uint8, all of one size, taken with the zoom and focus of the stage; those that do
-        not show the board are left out
-
-    Raises
-    ------
-    UsageError  "camera-photographs-differ" (in size)
-    CalibrationError  "camera-board-not-found" (in any), "camera-too-few-views", "camera-views-parallel",
-        "camera-fit-poor" (no lens explains the corners)
-    """
-    sizes = {photograph.shape for photograph in photographs}
-    if len(sizes) > 1:
-        raise UsageError(
-            "camera-photographs-differ",
-            what=f"The photographs are of different sizes: {', '.join(f'{s[1]} x {s[0]}' for s in sorted(sizes))}.",
-            remedy="Take all photographs with the same camera in the same orientation and format.",
-        )
-    views = [view for view in map(find_corners, photographs) if view is not None]
-    if not views:
-        raise CalibrationError(
-            "camera-board-not-found",
-            what=f"None of the {len(photographs)} photographs shows {FEWEST_CORNERS} corners of the board.",
-            remedy="Print the board of `velatura camera board`. Let it fill half of the picture, and light it evenly.",
-        )
-    rows, columns = next(iter(sizes))
-    return calibrate_views(views, (columns, rows))
-
-
 def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> CameraIntrinsics:
-    """As ``calibrate_camera``, from corners that are found already; ``size_px`` (width, height)."""
+    """Focal length, principal point and k1 with their covariance, from the board's corners in several photographs.
+
+    ``size_px``: (width, height) of the photographs, which were taken with the zoom and focus of the stage
+
+    Raises CalibrationError("camera-too-few-views", "camera-views-parallel", or "camera-fit-poor": no lens explains the
+    corners).
+    """
     _require_enough(views)
     fit = _fit(views, size_px)
     scatter = float(np.sqrt(np.mean([np.mean(off**2) for off in fit.off_px])))

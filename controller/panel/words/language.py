@@ -13,7 +13,6 @@ from typing import Final
 LANGUAGES: Final = {"en": "English", "de": "Deutsch", "es": "Español", "fr": "Français", "ja": "日本語"}
 """Each by its own name. English is what the code says."""
 COOKIE: Final = "velatura-language"
-DOMAIN: Final = "panel"
 _spoken: ContextVar[str] = ContextVar("language", default="en")
 
 

@@ -20,8 +20,6 @@ VERSION: Final = 0x0001_0000
 UNKNOWN_TOTAL: Final = frozenset({0xFFFF_FFFF, 0xFFFF_FFFF_FFFF_FFFF})
 """Totals of StartData that mean "I do not know yet"."""
 DATA_TYPES: Final = frozenset({10, 12})
-PAYLOAD_AT: Final = 12
-"""Where the payload of Data and EndData begins: after the header and the transaction id."""
 _LONGEST_NAME: Final = 256
 
 

@@ -15,7 +15,6 @@ from controller.calibrate.camera.charuco import (
     SQUARES,
     BoardView,
     board_picture,
-    calibrate_camera,
     calibrate_views,
     find_corners,
 )
@@ -68,7 +67,8 @@ def photograph(tilt_x: float, tilt_y: float, *, noise: float = 2.0, seed: int = 
 
 @pytest.fixture(scope="module")
 def found() -> CameraIntrinsics:
-    return calibrate_camera([photograph(*tilt) for tilt in TILTS])
+    views = [find_corners(photograph(*tilt)) for tilt in TILTS]
+    return calibrate_views([view for view in views if view is not None], SIZE)
 
 
 def test_the_lens_of_the_photographs_is_found_within_its_sigmas(found: CameraIntrinsics) -> None:
@@ -126,14 +126,11 @@ def test_a_wrong_corner_does_no_harm() -> None:
     assert calibrate_views(views, SIZE).focal_px == pytest.approx(FOCAL, rel=0.003)
 
 
-def test_photographs_without_a_board_are_left_out_and_named_when_nothing_is_left() -> None:
+def test_a_photograph_without_a_board_has_no_corners_and_two_views_are_too_few() -> None:
     blank = np.full(SIZE[::-1], 90, dtype=np.uint8)
     assert find_corners(blank) is None
     with pytest.raises(CalibrationError) as refused:
-        calibrate_camera([blank] * 6)
-    assert refused.value.code == "camera-board-not-found"
-    with pytest.raises(CalibrationError) as refused:
-        calibrate_camera([photograph(*TILTS[0]), photograph(*TILTS[1]), blank])
+        calibrate_views(corners(list(TILTS[:2])), SIZE)
     assert refused.value.code == "camera-too-few-views"
 
 
@@ -151,12 +148,6 @@ def test_corners_that_no_lens_explains_are_refused() -> None:
     with pytest.raises(CalibrationError) as refused:
         calibrate_views(views, SIZE)
     assert refused.value.code in ("camera-fit-poor", "camera-too-few-views")
-
-
-def test_photographs_of_two_sizes_are_refused() -> None:
-    with pytest.raises(UsageError) as refused:
-        calibrate_camera([np.zeros((520, 776), np.uint8), np.zeros((776, 520), np.uint8)])
-    assert refused.value.code == "camera-photographs-differ"
 
 
 def jpeg(path: Path, tags: Mapping[int, object]) -> Path:

@@ -43,6 +43,14 @@ def test_photographs_without_a_board_are_named(tmp_path: Path, capsys: pytest.Ca
     assert not (tmp_path / "lens.toml").exists()
 
 
+def test_photographs_of_two_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(tmp_path / "wide.png"), str(tmp_path / "high.png")]
+    for file, shape in zip(files, ((520, 776), (776, 520)), strict=True):
+        cv2.imwrite(file, np.zeros(shape, np.uint8))
+    assert run(["camera", "calibrate", *files, "--out", str(tmp_path / "lens.toml"), "--json"]) != 0
+    assert answer(capsys)["error"]["code"] == "camera-photographs-differ"
+
+
 def test_a_missing_photograph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["camera", "calibrate", str(tmp_path / "no.jpg"), "--json"]) == 1
     assert answer(capsys)["error"]["code"] == "photograph-unreadable"
