@@ -108,6 +108,12 @@ the object's rim, as the maps show.""",
         ("appearances", f"{title}: CIEDE2000 at most"): TOO_FINE
         for title in ("recoloured", "pattern replaced", "translucent marble", "inter-reflections", "head lowered")
     },
+    ("robustness", "indirect light"): """\
+Light that comes back from the room also falls where the target is dark, and no frame can take it away: many more pixels
+are out of reach, as the table says, and too bright. A target with less contrast was not tried.""",
+    ("robustness", "a visitor's shadow"): """\
+The covered pixels lack one projector's light, and nothing measures that while a picture is shown. The median hardly
+changes, because most pixels are not covered.""",
     ("frequency", "F_3 / F_1 at least 1.4, at 50% contrast"): """\
 To make a wave finer than one projector's pixels, three have to sharpen it against their blur, up to full light and
 down to none, and a bold wave leaves less room for that than a faint one.""",
