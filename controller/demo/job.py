@@ -21,19 +21,18 @@ from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
-from controller.services.calibrate import calibrating
+from controller.services.calibrate import calibrating, publishing
 from controller.solve.engines.choice import choose_engine
 from controller.solve.engines.processor import Engine
 from controller.solve.feasibility import target_radiance
 from controller.solve.traditional import exposed_for_one, traditional_compensation
 from controller.stage.bench import BenchProcess
-from controller.stage.calibrations import output_sizes, signing_key, worst_grade
+from controller.stage.calibrations import worst_grade
 from controller.stage.check import Checked, check_stage
 from controller.stage.run import marker
 from controller.stage.session import OwnSession
 from controller.steps import costs
 from controller.steps.appearance.photographing import photograph_hdr, photograph_step, photographs_s, playback_step
-from controller.steps.appearance.publishing import publish_step
 from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.requests import requests_of
 from controller.steps.appearance.solving import device_frames, options_of, solve_steps
@@ -83,14 +82,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
         *refine_steps(rig, calibrated, {request.name: request.title for request in requests}, refining, after=solvings),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
-        publish_step(
-            stage.folder,
-            output_sizes(checked),
-            names,
-            stage=stage.tables.stage.name,
-            calibration=run.name,
-            key=signing_key(checked),
-        ),
+        publishing(checked, run, names),
         marker("published", "Published", leave=Event.PUBLISHED),
         marker("playing", "Playing", enter=Event.PLAY),
         photograph_step(rig, names, longest_exposure_s=longest_s),

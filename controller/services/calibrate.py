@@ -159,7 +159,7 @@ def make_appearances(
                 *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
-            publish = _publishing(checked, run, names)
+            publish = publishing(checked, run, names)
             whole = [*steps, publish] if refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}
@@ -171,7 +171,8 @@ def make_appearances(
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
 
 
-def _publishing(checked: Checked, run: Path, names: Sequence[str]) -> Step:
+def publishing(checked: Checked, run: Path, names: Sequence[str]) -> Step:
+    """The step that makes these appearances of ``run`` the stage's signed bundle."""
     stage = checked.stage
     return publish_step(
         stage.folder,
