@@ -70,7 +70,8 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         phase_map, mosaic = read_phase_map(folder, name)
         # in place: of a mapped file, only the pages with saturated pixels become memory of this process
         white, radiometry = np.nan_to_num(light.white, copy=False), light.radiometry
-        if (gain := read_white_gain(folder, name)) is not None:
+        gain = read_white_gain(folder, name) if found is None else found[number].white_gain
+        if gain is not None:
             white = _times(white, gain, folder)
         indirect = stripes = None
         if found is not None:
