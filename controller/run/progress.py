@@ -112,6 +112,12 @@ class Tracker:
         self._worked_s += self._clock() - self._step_began_s
         self._close(Phase.DONE)
 
+    def done_beside(self, index: int) -> None:
+        """Step ``index`` was done beside others, which took the time."""
+        self._index = index
+        self._worked += self._weights[index]
+        self._close(Phase.DONE)
+
     def skip(self, index: int) -> None:
         """Step ``index`` was done by an earlier run; it does not count for the rate."""
         self._index = index

@@ -1,13 +1,18 @@
-"""Runs steps in order: each once, with a deadline, stoppable at any time, resumed from the journal."""
+"""Runs steps in order: each once, with a deadline, stoppable at any time, resumed from the journal.
+
+Steps that only calculate run beside later ones that use devices, so that a camera need not wait for them.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from controller.core.errors import VelaturaError, WorkError
+from controller.run.background import Advance, BackgroundSteps
 from controller.run.durations import measured
 from controller.run.journal import Artefact, Journal
 from controller.run.progress import Level, Reporter, Silent, Tracker
@@ -61,6 +66,8 @@ class Step:
     enter, leave : machine events at the start and end of the work; none for a skipped step
     always : run it even if an earlier run did it. For steps that set the state of hardware, which can't be
         restored from the journal
+    calculates : it uses no device, so it may run beside later steps that do not read from it. It has no ``enter`` or
+        ``leave``
     """
 
     id: StepId
@@ -72,11 +79,15 @@ class Step:
     enter: Event | None = None
     leave: Event | None = None
     always: bool = False
+    calculates: bool = False
 
     @property
     def heading(self) -> str:
         """Its title for the technician."""
         return self.title or str(self.id)
+
+
+_Results = dict[StepId, tuple[Artefact, ...]]
 
 
 class Runner:
@@ -114,40 +125,81 @@ class Runner:
         took_before = measured(self._journal.folder, [step.id for step in self._steps])
         weights = [step.weight for step in self._steps]
         tracker = Tracker(titles, weights, self._reporter, self._clock, took_before)
-        results: dict[StepId, tuple[Artefact, ...]] = {}
+        results: _Results = {}
+
+        def calculate(index: int, advance: Advance, until: Deadline) -> bool:
+            return self._one(self._steps[index], results, lambda: None, advance, until)
+
+        beside = BackgroundSteps(calculate, deadline)
         with self._journal.run(name):
             try:
-                for index, step in enumerate(self._steps):
-                    check(deadline)
-                    results[step.id] = self._one(index, step, results, tracker, deadline)
+                with beside.ending():
+                    self._all(results, tracker, beside, deadline)
             except BaseException as error:
                 self._failed(error)
                 raise
         return results
 
+    def _all(self, results: _Results, tracker: Tracker, beside: BackgroundSteps, deadline: Deadline) -> None:
+        """All steps; one that calculates in the thread beside, as long as a step that uses devices follows."""
+
+        def advance(fraction: float, note: str = "") -> None:
+            beside.check()
+            tracker.advance(fraction, note)
+
+        last = max((index for index, step in enumerate(self._steps) if not step.calculates), default=-1)
+        for index, step in enumerate(self._steps):
+            check(deadline)
+            if step.calculates and index < last:
+                beside.begin(index, step.id)
+                continue
+            self._await(beside, step.after, tracker, deadline)
+            if self._one(step, results, partial(tracker.begin, index), advance, deadline):
+                tracker.end()
+            else:
+                tracker.skip(index)
+        self._await(beside, None, tracker, deadline)
+
+    def _await(
+        self, beside: BackgroundSteps, steps: Sequence[StepId] | None, tracker: Tracker, deadline: Deadline
+    ) -> None:
+        """Until ``steps`` (None: all) that run beside are done; count what is done by now."""
+        shown: int | None = None
+        while True:
+            for number, done_now in beside.finished():
+                if not done_now:
+                    tracker.skip(number)
+                elif number == shown:
+                    tracker.end()
+                else:
+                    tracker.done_beside(number)
+            if (running := beside.awaited(steps)) is None:
+                return
+            check(deadline)
+            if running[0] != shown:
+                shown = running[0]
+                tracker.begin(shown)
+            tracker.advance(running[1])
+            beside.wait()
+
     def _one(
-        self,
-        index: int,
-        step: Step,
-        results: Mapping[StepId, tuple[Artefact, ...]],
-        tracker: Tracker,
-        deadline: Deadline,
-    ) -> tuple[Artefact, ...]:
+        self, step: Step, results: _Results, begin: Callable[[], None], advance: Advance, deadline: Deadline
+    ) -> bool:
+        """Do a step, or take what an earlier run did; whether it was done now."""
         inputs = self._inputs(step, results)
         if not step.always and (done := self._journal.done(step.id, inputs)) is not None:
-            tracker.skip(index)
-            return done
-        tracker.begin(index)
+            results[step.id] = done
+            return False
+        begin()
         self._report(step.enter, step.heading)
         began_at_s = time.time()
-        context = Context(self._journal.folder, self._journal, deadline, self._reporter, dict(results), tracker.advance)
+        context = Context(self._journal.folder, self._journal, deadline, self._reporter, results.copy(), advance)
         paths = step.run(context)
-        artefacts = self._journal.complete(step.id, inputs, paths, began_at_s=began_at_s)
+        results[step.id] = self._journal.complete(step.id, inputs, paths, began_at_s=began_at_s)
         self._report(step.leave, step.heading)
-        tracker.end()
-        return artefacts
+        return True
 
-    def _inputs(self, step: Step, results: Mapping[StepId, tuple[Artefact, ...]]) -> dict[str, str]:
+    def _inputs(self, step: Step, results: _Results) -> dict[str, str]:
         made = {
             input_name(earlier, number): artefact.sha256
             for earlier in step.after

@@ -23,6 +23,8 @@ DECODED: Final = 62
 FITTED: Final = 75
 """The same while its metapixels and its phase map are made, the projector's own arrays included: it has about a sixth
 as many pixels as the camera."""
+PHOTOGRAPHED: Final = 17
+"""The same of the photograph of the next projector that is read meanwhile."""
 SPARE: Final = 1.1
 """Small arrays, stacks and tables of threads."""
 PROGRAM: Final = 300 * 1024 * 1024
@@ -86,8 +88,8 @@ def base_peak_bytes(size: StageSize) -> int:
 
 
 def calibration_peak_bytes(size: StageSize) -> int:
-    """Bytes at the peak of decoding photographs and fitting metapixels, one projector after the other."""
-    return int(SPARE * max(DECODED, FITTED) * size.camera) + PROGRAM
+    """Bytes at the peak of decoding photographs and fitting metapixels, while the next projector is photographed."""
+    return int(SPARE * (max(DECODED, FITTED) + PHOTOGRAPHED) * size.camera) + PROGRAM
 
 
 def check_memory(need: int, free: int | None, work: str = "The solve") -> str:

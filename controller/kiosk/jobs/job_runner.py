@@ -55,8 +55,9 @@ class JobReporter:
             self._steps = [JobStep("", 0.0)] * now.count
         done = 1.0 if now.phase is not Phase.RUNNING else now.step_fraction
         self._steps[now.index] = JobStep(now.step, done)
-        self.job = replace(self.job, steps=tuple(self._steps[: now.index + 1]), left_s=now.left_s, count=now.count,
-                           why=now.why)  # fmt: skip
+        # one that runs beside others may begin before earlier ones are shown
+        begun = tuple(step for step in self._steps if step.title)
+        self.job = replace(self.job, steps=begun, left_s=now.left_s, count=now.count, why=now.why)
         self._changed()
 
     def say(self, text: str, level: Level = Level.INFO) -> None:

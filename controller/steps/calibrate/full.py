@@ -42,8 +42,9 @@ def calibration_steps(
     steps = capture_steps(rig, longest_exposure_s=longest_exposure_s, options=options)
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
+    # All responses first: while one projector's code is photographed, only the places of another are calculated.
+    steps += [_radiometry_step(projector) for projector in rig.projectors]
     for projector in rig.projectors:
-        steps.append(_radiometry_step(projector))
         steps.append(code_step(rig, projector, options))
         steps.append(_pixels_step(projector))
         steps.append(indirect_step(projector))
@@ -77,6 +78,7 @@ def _pixels_step(projector: RigProjector) -> Step:
         after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.CODES)),
         title=f"Decoding {projector.name} and fitting its metapixels",
         weight=costs.PIXELS_S * costs.scale([projector.size_px]),
+        calculates=True,
     )
 
 

@@ -47,6 +47,7 @@ def indirect_step(projector: RigProjector) -> Step:
         after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.PIXELS)),
         title=f"Telling direct from indirect light of {projector.name}",
         weight=costs.INDIRECT_S * costs.scale([projector.size_px]),
+        calculates=True,
     )
 
 

@@ -152,7 +152,7 @@ def test_only_the_last_jobs_are_remembered(log: EventLog) -> None:
     assert [number for number in range(25) if runner.known(number) is not None] == list(range(5, 21))
 
 
-def test_the_steps_of_a_job_are_those_up_to_the_present_one(log: EventLog) -> None:
+def test_the_steps_of_a_job_are_those_that_began(log: EventLog) -> None:
     changes: list[int] = []
     reporter = JobReporter(Job(1, "work"), log, lambda: changes.append(1))
 
@@ -163,10 +163,13 @@ def test_the_steps_of_a_job_are_those_up_to_the_present_one(log: EventLog) -> No
     assert at(0, 3, Phase.RUNNING, 0.25) == [("step 0", 0.25)]
     assert at(0, 3, Phase.DONE, 0.25) == [("step 0", 1.0)]
     assert at(1, 3, Phase.RUNNING, 0.5) == [("step 0", 1.0), ("step 1", 0.5)]
+    # One that runs beside others ends after a later one has begun.
+    assert at(3, 4, Phase.RUNNING, 0.5) == [("step 3", 0.5)]
+    assert at(2, 4, Phase.DONE, 0.0) == [("step 2", 1.0), ("step 3", 0.5)]
     # Resumed, or another runner: as many steps as that one has.
-    assert at(1, 2, Phase.RUNNING, 0.75) == [("", 0.0), ("step 1", 0.75)]
+    assert at(1, 2, Phase.RUNNING, 0.75) == [("step 1", 0.75)]
     reporter.say("Look at this.", Level.WARNING)
-    assert (reporter.job.count, reporter.job.left_s, len(changes)) == (2, 2.0, 5)
+    assert (reporter.job.count, reporter.job.left_s, len(changes)) == (2, 2.0, 7)
     assert [(row.level, row.text) for row in log.after(0)] == [("warning", "Look at this.")]
 
 
