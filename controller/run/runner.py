@@ -20,6 +20,7 @@ from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId, input_name
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError
+from hal.runtime.compute import threads_may_compute
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,16 +142,20 @@ class Runner:
         return results
 
     def _all(self, results: _Results, tracker: Tracker, beside: BackgroundSteps, deadline: Deadline) -> None:
-        """All steps; one that calculates in the thread beside, as long as a step that uses devices follows."""
+        """All steps; one that calculates in the thread beside, as long as a step that uses devices follows.
+
+        All in order where two threads may not run kernels: the step that photographs may run one, too.
+        """
 
         def advance(fraction: float, note: str = "") -> None:
             beside.check()
             tracker.advance(fraction, note)
 
         last = max((index for index, step in enumerate(self._steps) if not step.calculates), default=-1)
+        in_thread = any(step.calculates for step in self._steps[: last + 1]) and threads_may_compute()
         for index, step in enumerate(self._steps):
             check(deadline)
-            if step.calculates and index < last:
+            if step.calculates and index < last and in_thread:
                 beside.begin(index, step.id)
                 continue
             self._await(beside, step.after, tracker, deadline)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import hashlib
+import importlib
 import math
 import os
 import re
@@ -56,6 +57,25 @@ def prepare_threads() -> None:
     if usable_cpus() < affinity():  # numba uses the affinity, but no control groups
         os.environ.setdefault("NUMBA_NUM_THREADS", str(usable_cpus()))
     os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
+
+
+def threads_may_compute() -> bool:
+    """Whether several threads of this process may run kernels at the same time.
+
+    numba can do it with OpenMP or TBB. Where a computer has neither library, it ends the process instead.
+    """
+    prepare_threads()
+    wanted = os.environ.get("NUMBA_THREADING_LAYER", "default")
+    return wanted != "workqueue" and _has_threads()
+
+
+@cache
+def _has_threads() -> bool:
+    for pool in ("omppool", "tbbpool"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(f"numba.np.ufunc.{pool}")
+            return True
+    return False
 
 
 def kernel_folder() -> Path:

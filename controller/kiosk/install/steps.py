@@ -20,7 +20,7 @@ from controller.play.control.launch import PlayerSettings
 
 PACKAGES: Final = (
     "xserver-xorg-core", "xauth", "x11-xserver-utils", "libgl1-mesa-dri", "libgl1", "libxrandr2", "libxext6",
-    "libusb-1.0-0", "libhidapi-libusb0", "openssl", "openssh-client",
+    "libusb-1.0-0", "libhidapi-libusb0", "libgomp1", "openssl", "openssh-client",
 )  # fmt: skip
 AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")

@@ -70,6 +70,23 @@ def test_it_runs_while_the_next_step_photographs(journal: Journal) -> None:
     assert results[StepId("map")][0].path.read_bytes() == b"mapfirst"
 
 
+def test_all_run_in_order_where_two_threads_may_not_calculate(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_THREADING_LAYER", "workqueue")
+    ended = threading.Event()
+
+    def calculate(context: Context) -> None:
+        time.sleep(0.05)
+        ended.set()
+
+    def photograph(context: Context) -> None:
+        assert ended.is_set()
+
+    steps = [step("map", calculate, calculates=True), step("codes", photograph)]
+    assert len(Runner(steps, journal).run("test", deadline=in_seconds(LONG_S))) == 2
+
+
 def test_a_step_that_reads_from_it_waits(journal: Journal) -> None:
     photographed, ended = threading.Event(), threading.Event()
 

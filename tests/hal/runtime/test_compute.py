@@ -103,12 +103,29 @@ print(numba.threading_layer())
 """
 
 
+TOGETHER = """
+from hal.runtime.compute import threads_may_compute
+
+print(threads_may_compute())
+"""
+
+
 def test_kernels_run_on_openmp_also_where_the_system_has_tbb(tree: Path, tmp_path: Path) -> None:
     # ``.ci/system-packages`` brings libtbb; by itself numba would take it, whose threads spin
     with (tree / "benchmarks" / "kernel.py").open("a") as file:
         file.write(PARALLEL)
     assert _run(tree, tmp_path)[-1] == "omp"
     assert _run(tree, tmp_path, {"NUMBA_THREADING_LAYER": "workqueue"})[-1] == "workqueue"
+
+
+def test_threads_compute_together_only_where_numba_would_not_end_the_process(tree: Path, tmp_path: Path) -> None:
+    with (tree / "benchmarks" / "kernel.py").open("a") as file:
+        file.write(TOGETHER)
+    assert _run(tree, tmp_path)[-1] == "True"
+    assert _run(tree, tmp_path, {"NUMBA_THREADING_LAYER": "workqueue"})[-1] == "False"
+    # as on a computer without the libraries
+    missing = "import sys; sys.modules.update({f'numba.np.ufunc.{name}pool': None for name in ('omp', 'tbb')})"
+    assert _run(tree, tmp_path, before=missing)[-1] == "False"
 
 
 def test_numba_that_was_loaded_before_gets_the_same_settings(tree: Path, tmp_path: Path) -> None:
