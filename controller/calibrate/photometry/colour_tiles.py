@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.correspondence.codes import read_code
+from controller.calibrate.correspondence.gray_code import Cells
 from controller.calibrate.values import Radiometry
 from controller.capture.pattern_frames import tile_levels
 from controller.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame
@@ -75,6 +76,7 @@ def measure_tiles(
     indirect: KnownIndirect | None = None,
     known_px: FloatImage | None = None,
     noise: CameraNoise | None = None,
+    code: tuple[Cells, Cells] | None = None,
 ) -> TileMeasurements:
     """Find the tiles by the code and measure each.
 
@@ -84,13 +86,13 @@ def measure_tiles(
     black, white : (rows, columns, 3) linear light of black, and of white above black; NaN where not known
     indirect : is taken away from tiles and white
     known_px, noise : as for ``decode``
+    code : the cells of both axes, from ``tile_code``; read from the photographs if omitted
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
     tiles_patterns = plan.of_kind(PatternKind.COLOUR_TILES)
     side = tiles_patterns[0].tile_cells
-    half = np.asarray(white.sum(axis=2) / 2, np.float32)
-    axes = read_code(captures, plan, black.sum(axis=2) + half, half, known_px, noise or CameraNoise())
+    axes = code or tile_code(captures, plan, black, white, known_px=known_px, noise=noise)
     across, down = cells_of_frame(plan.size_px)
     tile = (axes[1].cell // side) * -(-across // side) + axes[0].cell // side
     framed = (axes[0].cell < across) & (axes[1].cell < down)
@@ -130,6 +132,20 @@ def measure_tiles(
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
     shown_in, away, place = (np.concatenate(parts) for parts in (photographs, thrown, places))
     return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away, place)
+
+
+def tile_code(
+    captures: Captures,
+    plan: PatternPlan,
+    black: FloatImage,
+    white: FloatImage,
+    *,
+    known_px: FloatImage | None = None,
+    noise: CameraNoise | None = None,
+) -> tuple[Cells, Cells]:
+    """The cells by which tiles are found, for several measurements. Parameters and errors as for ``measure_tiles``."""
+    half = np.asarray(white.sum(axis=2) / 2, np.float32)
+    return read_code(captures, plan, black.sum(axis=2) + half, half, known_px, noise or CameraNoise())
 
 
 def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:

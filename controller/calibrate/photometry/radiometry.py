@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.calibrate.correspondence.captures import Captures, coloured
+from controller.calibrate.correspondence.gray_code import Cells
 from controller.calibrate.photometry.colour_tiles import KnownIndirect, TileMeasurements, measure_tiles
 from controller.calibrate.photometry.uneven_light import own_weight, uneven_light
 from controller.calibrate.values import Radiometry
@@ -82,6 +83,7 @@ def measure_radiometry(
     indirect: KnownIndirect | None = None,
     known_px: FloatImage | None = None,
     noise: CameraNoise | None = None,
+    code: tuple[Cells, Cells] | None = None,
 ) -> tuple[Radiometry, RadiometryReport]:
     """Response and mixing of one projector.
 
@@ -90,6 +92,7 @@ def measure_radiometry(
     captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
     indirect : what is known of it by an earlier measurement; the response is then fitted to direct light alone
     known_px, noise : as for ``decode``
+    code : as for ``measure_tiles``
 
     Returns
     -------
@@ -104,7 +107,7 @@ def measure_radiometry(
     """
     black = coloured(captures, "black")
     white = coloured(captures, "white", black.shape[:2]) - black
-    tiles = measure_tiles(captures, plan, black, white, indirect=indirect, known_px=known_px, noise=noise)
+    tiles = measure_tiles(captures, plan, black, white, indirect=indirect, known_px=known_px, noise=noise, code=code)
     if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",

@@ -14,7 +14,7 @@ from controller.artefacts.pattern_plans import PlanUsed
 from controller.artefacts.photographs import Developed, noise_of
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
 from controller.calibrate.correspondence.opposites import completed
-from controller.calibrate.photometry.colour_tiles import KnownIndirect
+from controller.calibrate.photometry.colour_tiles import KnownIndirect, tile_code
 from controller.calibrate.photometry.lamp_light import lamp_flicker, unsteady
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import (
@@ -63,6 +63,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     radiometry = light.radiometry
     seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
     white = seen.white
+    code = tile_code(captures, plan, light.black, light.white, known_px=known_px, noise=noise)
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
@@ -71,8 +72,8 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
             captures,
             plan,
             indirect=KnownIndirect(share * white, radiometry),
-            known_px=known_px,
             noise=noise,
+            code=code,
         )
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
