@@ -13,19 +13,18 @@ from controller.artefacts.photographs import Taken
 from controller.artefacts.published import write_photograph, write_playback
 from controller.artefacts.solved import read_solved
 from controller.capture.brackets import merge_brackets
+from controller.capture.profile import load_profile
 from controller.core.arrays import FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import ShotId, StepId
 from controller.steps import costs
-from controller.steps.capture.patterns import bracket
+from controller.steps.appearance.exposure_times import speeds, timed
 from controller.steps.capture.photographs import photograph_series, take_photograph
 from hal.deadline import Deadline
 
 PLAYED = "played"
 """The kind of the photographs of appearances."""
-PHOTO_BRACKET = (0.7, 5.0)
-"""Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""
 PLAYBACK_RATE_HZ = 60.0
 
 
@@ -89,13 +88,16 @@ def take_bracket(
     rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
     of: Mapping[str, str], first_again: bool = False,
 ) -> list[Taken]:  # fmt: skip
-    """The photographs of ``photograph_hdr``; ``first_again``: the first exposure is taken at the end once more."""
-    exposures_s = bracket(1 / white, PHOTO_BRACKET, rig.acquirer.exposures_s(), longest_s)
+    """The photographs of ``photograph_hdr``, with their true exposures.
+
+    ``first_again``: the first exposure is taken at the end once more
+    """
+    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder))
     with photograph_series(rig, context) as series:
         for number, exposure_s in enumerate([*exposures_s, *exposures_s[: int(first_again)]]):
             identity = ShotId(kind, f"{name}-{number}")
             series.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
-    return series.taken
+    return timed(series.taken)
 
 
 def playback_step(rig: Rig, names: Sequence[str], *, seconds: float) -> Step:

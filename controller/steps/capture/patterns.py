@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,8 @@ FIRST_EXPOSURE_S = 1 / 30
 EXPOSURE_TRIES = 8
 WHITE_EXPOSURES = 3
 """Maximum number of photographs for one HDR white image."""
+MOST_CHANGED = 1.6
+"""Factor by which an exposure of a bracket may change to be another projector's, too: brackets overlap widely."""
 BLACK_BRACKET = (8.0, 32.0)
 """Exposures of the HDR black image, relative to the one at which white is well exposed."""
 
@@ -111,7 +113,36 @@ def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Pa
     for number, projector in enumerate(rig.projectors):
         context.advance(number / len(rig.projectors), projector.name)
         found[projector.name] = _find_exposure(rig, projector, context, longest_s)
-    return [Exposures.write(context.folder, found)]
+    return [Exposures.write(context.folder, linked(found))]
+
+
+def linked(found: Mapping[str, Exposures]) -> dict[str, Exposures]:
+    """The exposures by projector, with one at least that an earlier projector's white has, too, if one is near.
+
+    A camera's times may differ from what it says, and a bracket shows the ratios of its own alone. A projector whose
+    bracket has none in common with the others would seem brighter or darker than these.
+    """
+    kept: dict[str, Exposures] = {}
+    for name, one in found.items():
+        used = {value for other in kept.values() for value in other.white_s}
+        kept[name] = one if not used or used & set(one.white_s) else _with_one_of(used, one)
+    return kept
+
+
+def _with_one_of(used: set[float], one: Exposures) -> Exposures:
+    """The bracket with the exposure that has to change least, not its first, replaced by one of ``used``."""
+    own = one.white_s
+    changes = [
+        (abs(math.log(value / own[at])), at, value)
+        for at in range(1, len(own))
+        for value in sorted(used)
+        if own[at - 1] < value and (at + 1 == len(own) or value < own[at + 1])
+    ]
+    nearest = min(changes, default=None)
+    if nearest is None or nearest[0] > math.log(MOST_CHANGED):
+        return one
+    _, at, value = nearest
+    return Exposures(one.base_s, (*own[:at], value, *own[at + 1 :]))
 
 
 def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
@@ -165,4 +196,4 @@ def _sizes(rig: Rig) -> str:
     return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
 
 
-__all__ = ["bracket", "capture_steps", "code_step"]
+__all__ = ["bracket", "capture_steps", "code_step", "linked"]

@@ -29,7 +29,7 @@ from controller.capture.latency import (
     fingerprint,
     same_picture,
 )
-from controller.capture.profile import load_profile
+from controller.capture.profile import CameraProfile, load_profile
 from controller.core.arrays import ByteImage
 from controller.rig.camera_watch import CameraWatch
 from controller.rig.rig import Rig
@@ -196,7 +196,7 @@ def take_photograph(
     settings = {"exposure_s": repr(exposure_s), **of}
     known = context.journal.shot(identity, settings)
     if known is not None:
-        return replace(_taken(identity, known.path, read_exposure(known.path)), profile=profile)
+        return _as_measured(_taken(identity, known.path, read_exposure(known.path)), profile)
     file, confirmed_s = rig.acquirer.photograph(
         capture_name(identity),
         exposure_s,
@@ -204,7 +204,13 @@ def take_photograph(
         shown_at_s=shown_at_s,
         deadline=context.deadline,
     )
-    return replace(_journalled(context, identity, settings, file.path, confirmed_s), profile=profile)
+    return _as_measured(_journalled(context, identity, settings, file.path, confirmed_s), profile)
+
+
+def _as_measured(taken: Taken, profile: CameraProfile | None) -> Taken:
+    """With what is known of the camera: its true exposure, if that differs from what it says."""
+    exposure_s = taken.exposure_s if profile is None else profile.true_exposure(taken.exposure_s)
+    return replace(taken, profile=profile, exposure_s=exposure_s)
 
 
 def _taken(identity: ShotId, path: Path, exposure_s: float) -> Taken:

@@ -1,0 +1,83 @@
+"""Exposure times of an appearance's photographs, where the camera opens for other times than it says.
+
+A calibration finds how long the exposures of its whites really are. An appearance is brighter or darker than white and
+needs others: the longest of its photographs has a known one, and those it overlaps with are measured against it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import fmean
+from typing import Final
+
+from controller.artefacts.photographs import Taken
+from controller.capture.demosaic import SensorLevels
+from controller.capture.linearity import RawExposure, exposure_ratio
+from controller.capture.profile import CameraProfile
+from controller.capture.raw import is_jpeg, read_mosaic
+from controller.steps.capture.patterns import bracket
+
+WANTED: Final = (0.7, 5.0)
+"""Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""
+LONG: Final = 2.2, 9.0
+"""In the same unit: a known exposure is taken for the longer photograph. With less, white's half is missing in it, and
+with more hardly anything is well exposed in both."""
+
+
+def speeds(white: float, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None) -> list[float]:
+    """Exposures for what has ``white`` in full scales per second, rising: those ``WANTED``, the longer one known.
+
+    ``profile``: of the camera; without corrections in it, its exposures are what it says
+    """
+    found = bracket(1 / white, WANTED, available_s, longest_s)
+    if profile is None or not len(profile.exposures) or len(found) < 2:
+        return found
+    known = {float(value) for value in profile.exposures[:, 0]}
+    low, high = (factor / white for factor in LONG)
+    usable = [value for value in available_s if low <= value <= min(high, longest_s) and _listed(value, known)]
+    if not usable:
+        return found
+    return [found[0], min(usable, key=lambda value: abs(math.log(value * white / WANTED[1])))]
+
+
+def timed(taken: Sequence[Taken]) -> list[Taken]:
+    """Photographs of one picture with their true exposures: those that are not known, by those that are.
+
+    ``taken`` have the exposures of their ``profile`` where it knows them. Where no two overlap, nothing is changed.
+    """
+    profile = taken[0].profile if taken else None
+    if profile is None or not len(profile.exposures) or is_jpeg(taken[0].path):
+        return list(taken)
+    true = {float(value) for value in profile.exposures[:, 1]}
+    known = [one for one in taken if _listed(one.exposure_s, true)]
+    if not known or len(known) == len(taken):
+        return list(taken)
+    sure = max(known, key=lambda one: one.exposure_s)
+    times: dict[float, list[float]] = {}
+    for one in taken:
+        if not _listed(one.exposure_s, true):
+            times.setdefault(one.exposure_s, []).append(_measured_s(one, sure, profile))
+    return [replace(one, exposure_s=fmean(times[one.exposure_s])) if one.exposure_s in times else one for one in taken]
+
+
+def _measured_s(one: Taken, sure: Taken, profile: CameraProfile) -> float:
+    """Its exposure in seconds as the light says, compared with ``sure``."""
+    (shorter, levels), (longer, _) = (
+        _exposed(each, profile) for each in sorted((one, sure), key=lambda each: each.exposure_s)
+    )
+    ratio = exposure_ratio(shorter, longer, levels)
+    return sure.exposure_s / ratio if one.exposure_s < sure.exposure_s else sure.exposure_s * ratio
+
+
+def _exposed(one: Taken, profile: CameraProfile) -> tuple[RawExposure, SensorLevels]:
+    raw = read_mosaic(one.path, profile=profile)
+    return RawExposure(raw.samples, one.exposure_s), raw.levels
+
+
+def _listed(value: float, known: set[float]) -> bool:
+    return any(math.isclose(value, one, rel_tol=1e-6) for one in known)
+
+
+__all__ = ["speeds", "timed"]

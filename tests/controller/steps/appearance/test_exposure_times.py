@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.artefacts.photographs import Taken
+from controller.capture.profile import CameraProfile
+from controller.steps.appearance.exposure_times import speeds, timed
+from tests.controller.capture.test_raw import BLACK, WHITE, write_dng
+
+AVAILABLE_S = [round(2.0 ** (number / 3), 4) for number in range(-30, 10)]
+LIGHT = np.geomspace(0.05, 30.0, 320)[None, :] * (1 + 0.4 * np.sin(np.arange(240) / 9))[:, None]
+
+
+def profile_of(*known: tuple[float, float]) -> CameraProfile:
+    return CameraProfile(exposures=np.array(known) if known else np.empty((0, 2)))
+
+
+def photographed(path: Path, told_s: float, opened_s: float, profile: CameraProfile, seed: int) -> Taken:
+    light = np.random.default_rng(seed).poisson(LIGHT * opened_s * 30_000) / 30_000
+    write_dng(path, np.clip(np.rint(BLACK + light * (WHITE - BLACK)), 0, WHITE).astype(np.uint16))
+    return Taken(path.stem, path, profile.true_exposure(told_s), profile=profile)
+
+
+def test_a_camera_that_is_right_is_asked_for_the_exposures_that_are_wanted() -> None:
+    wanted = [0.0787, 0.5]
+    assert speeds(9.0, AVAILABLE_S, 1.0, None) == pytest.approx(wanted)
+    assert speeds(9.0, AVAILABLE_S, 1.0, profile_of()) == pytest.approx(wanted)
+
+
+def test_the_longer_exposure_is_one_that_is_known() -> None:
+    profile = profile_of((0.0625, 0.065), (0.315, 0.31), (0.63, 0.64))
+    assert speeds(9.0, AVAILABLE_S, 1.0, profile) == pytest.approx([0.0787, 0.63])
+    assert speeds(9.0, AVAILABLE_S, 0.5, profile) == pytest.approx([0.0787, 0.315])
+    assert speeds(200.0, AVAILABLE_S, 1.0, profile) == pytest.approx([0.0039, 0.0248]), "none of them is near"
+
+
+def test_an_unknown_exposure_is_measured_by_one_that_is_known(tmp_path: Path) -> None:
+    """6 % wrong, as 1/30 s that are 1/32 s; both photographs of this exposure get the same time."""
+    profile = profile_of((0.16, 0.155), (0.5, 0.51))
+    first, long, last = (
+        photographed(tmp_path / f"{name}.dng", told_s, opened_s, profile, seed)
+        for seed, (name, told_s, opened_s) in enumerate(
+            (("first", 1 / 30, 1 / 32), ("long", 0.16, 0.155), ("last", 1 / 30, 1 / 32))
+        )
+    )
+    found = timed([first, long, last])
+    assert [one.path for one in found] == [first.path, long.path, last.path]
+    assert found[1].exposure_s == 0.155
+    assert found[0].exposure_s == found[2].exposure_s == pytest.approx(1 / 32, rel=0.003)
+
+
+def test_what_cannot_be_measured_stays_as_the_camera_says(tmp_path: Path) -> None:
+    profile = profile_of((0.16, 0.155), (0.5, 0.51))
+    dark = photographed(tmp_path / "dark.dng", 1e-5, 1e-5, profile, 1)
+    short = photographed(tmp_path / "short.dng", 1 / 30, 1 / 32, profile, 2)
+    known = photographed(tmp_path / "known.dng", 0.16, 0.155, profile, 3)
+    assert timed([short, dark]) == [short, dark], "none is known"
+    assert timed([dark, known])[0].exposure_s == pytest.approx(1e-5), "nothing is well exposed in both"
+    assert timed([known]) == [known]
+    sound = Taken("short", short.path, short.exposure_s, profile=profile_of())
+    assert timed([sound, known]) == [sound, known]
