@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import heapq
+import itertools
 import os
 import tempfile
 import threading
@@ -49,6 +50,8 @@ CALMER: Final = 3.0
 END_S: Final = 150.0
 SERVES_S: Final = 60.0
 KEEPS_S: Final = 30.0
+LOOKS_S: Final = 60.0
+WAITS_S: Final = DAY_S
 GOOD: Final = "kiosk/stage.toml.good"
 
 
@@ -104,6 +107,11 @@ class Life:
         """What people will write again into files that are damaged."""
         self.repaired_s = 0.0
         self._keep_by_s: float | None = None
+        self._looked_s = 0.0
+        self._order = itertools.count()
+        self._waiting: list[Item] = []
+        """What waits for a moment."""
+        self.witness.log.moment = self._moment
         self._repairs: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
 
@@ -113,7 +121,7 @@ class Life:
         began_s = time.process_time()
         with _folder() as here, watched(self.world.disk):
             # It has another name each time, and the kiosk names files of which its disk takes no more.
-            self.witness.here = f"{here}/"
+            self.witness.log.here = f"{here}/"
             rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.place.rows)
             make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check))
             self.world.scheduler.on_kill = self.news.set
@@ -127,14 +135,14 @@ class Life:
         if self.broken is not None and not isinstance(self.broken, Broken):
             raise self.broken
         witness = self.witness
-        text = "\n".join(witness.digested)
+        text = "\n".join(witness.log.digested)
         lamps = " ".join(f"{name} {lamp.strikes} {lamp.off_at_s!r}" for name, lamp in self.world.lamps.items())
         broken = self.broken
         return Outcome(
             self.seed, self.days, self.place, self.items, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
             "" if broken is None else broken.promise, "" if broken is None else str(broken),
-            self.world.scheduler.now_s, len(witness.digested), time.process_time() - began_s, witness.minutes,
-            tuple(witness.digested[-30:]),
+            self.world.scheduler.now_s, len(witness.log.digested), time.process_time() - began_s, witness.minutes,
+            tuple(witness.log.digested[-30:]),
         )  # fmt: skip
 
     def _pass(self) -> None:
@@ -159,12 +167,28 @@ class Life:
             while self._repairs and self._repairs[0][0] <= scheduler.now_s:
                 heapq.heappop(self._repairs)[2]()
             while left and left[0].at_s <= scheduler.now_s and self.broken is None:
-                happenings.happen(self, left.pop(0))
-                scheduler.rush()
+                item = left.pop(0)
+                if item.moment:
+                    self._waiting.append(item)
+                else:
+                    self._happen(item)
+
+    def _happen(self, item: Item) -> None:
+        happenings.happen(self, item)
+        self.world.scheduler.rush()
+
+    def _moment(self, name: str) -> None:
+        """The kiosk's log says this: what waits for it happens soon. In a thread of the kiosk."""
+        now_s = self.world.scheduler.now_s
+        self._waiting = [item for item in self._waiting if now_s - item.at_s < WAITS_S]
+        for item in [item for item in self._waiting if item.moment == name]:
+            self._waiting.remove(item)
+            self.later(item.after_s, partial(self._happen, item))
+            self.news.set()
 
     def later(self, seconds: float, repair: Callable[[], None]) -> None:
         """Do this after so many seconds."""
-        heapq.heappush(self._repairs, (self.world.scheduler.now_s + seconds, len(self._repairs), repair))
+        heapq.heappush(self._repairs, (self.world.scheduler.now_s + seconds, next(self._order), repair))
 
     # -- the service
 
@@ -239,9 +263,9 @@ class Life:
 
         def stepped() -> None:
             refresh()
-            self._keeps_good()
             if self.broken is None and self.service is service:
                 try:
+                    self._keeps_good()
                     self._calm(service, news=self.witness.judge(kiosk, service))
                     self.witness.paused_long = self.world.scheduler.stretch > 1
                 except Exception as error:  # noqa: BLE001 - a mistake of the witness must not be taken for one of the kiosk
@@ -257,14 +281,20 @@ class Life:
         service.changed = stepped
 
     def _keeps_good(self) -> None:
-        """A service that runs with a sound stage.toml has a copy of it, soon after the disk takes one."""
+        """A service that runs with a sound stage.toml has a copy of it, soon after the disk has room. Raises Broken."""
         now_s = self.world.scheduler.now_s
+        if now_s < self._looked_s + LOOKS_S and self._keep_by_s is not None:
+            return
+        self._looked_s = now_s
         if self.world.disk.full or "stage.toml" in self.unreadable:
             self._keep_by_s = None
+        elif _content(STAGE / GOOD) == _content(STAGE / "stage.toml"):
+            self.unreadable.clear()
+            self._keep_by_s = now_s + KEEPS_S
         elif self._keep_by_s is None:
             self._keep_by_s = now_s + KEEPS_S
         elif now_s > self._keep_by_s:
-            self.unreadable.clear()
+            raise Broken("settings kept", f"{GOOD} is no copy of stage.toml")
 
     def _calm(self, service: Service, *, news: bool) -> None:
         """Stretch pauses while nothing happens."""
@@ -303,6 +333,10 @@ class Life:
                 believe(self, item, values)
 
         self.world.scheduler.task(asked, "command", program).start()
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
 
 
 @contextlib.contextmanager

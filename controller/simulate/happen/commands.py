@@ -46,6 +46,12 @@ def _changed(text: str, what: str) -> str:
     )
 
 
+def cancelled(life: Living) -> None:
+    """What runs is to end soon."""
+    if life.service is not None:
+        life.witness.work_cancelled(life.service)
+
+
 def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
     """A command was accepted: what it asks for is wanted from now on."""
     witness, now_s = life.witness, life.world.scheduler.now_s
@@ -57,6 +63,7 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
     elif item.who == "stop":
         witness.wanted.say(False)
         witness.disturb(0.0, SETTLING_S)
+        cancelled(life)
     elif item.who == "set-schedule":
         witness.wanted.use(Calendar(values["time_zone"], values["rows"]))
         life.news.set()
@@ -65,6 +72,8 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
         witness.light_until_s = now_s + 900.0 + SETTLING_S
     elif item.who in ("save-settings", "recalibrate", "compare", "cancel"):
         witness.disturb(0.0)
+        if item.who == "cancel":
+            cancelled(life)
     else:
         witness.disturb(0.0, 60.0)
     if life.world.disk.full:

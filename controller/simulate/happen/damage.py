@@ -13,7 +13,7 @@ from controller.core.errors import VelaturaError
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
-from controller.simulate.judge.witness import REPAIR_S
+from controller.simulate.judge.witness import GOES_BACK_S, PLAYER_S, REPAIR_S
 from controller.simulate.stage import TRUST, publish
 
 SECTOR_BYTES: Final = 512
@@ -35,7 +35,7 @@ def file_damaged(life: Living, item: Item) -> None:
         else:
             path.write_bytes(_damaged(before, item))
         if item.who.startswith("kiosk/events"):
-            life.witness.begun_checks.clear()
+            life.witness.log.begun_checks.clear()
             life.witness.wanted.unsure_until_hours()
         if item.who.endswith("lamps.json"):
             life.witness.lamps.ledger_lost()
@@ -88,12 +88,13 @@ def bundle_damaged(life: Living, item: Item) -> None:
     if world.screen.process is not None:
         world.screen.process.kill()
     repaired_s = item.for_s or MEND_FILE_S
-    witness.disturb(0.0 if _goes_back(bundles, earlier) else repaired_s)
+    witness.bundle_bad_until_s = max(witness.bundle_bad_until_s, world.scheduler.now_s + repaired_s)
+    witness.disturb(GOES_BACK_S if _goes_back(bundles, earlier) else repaired_s, PLAYER_S)
     witness.disturb_player(repaired_s)
 
     def repair() -> None:
         publish(STAGE, int(world.truth_s))
-        witness.disturb(0.0)
+        witness.disturb(0.0, PLAYER_S)
 
     life.later(repaired_s, repair)
 
@@ -102,7 +103,7 @@ def bundles_unreadable(life: Living, item: Item) -> None:
     """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left."""
     disk, witness = life.world.disk, life.witness
     disk.blind = True
-    witness.disturb(item.for_s)
+    witness.disturb(item.for_s, PLAYER_S)
     witness.disturb_player(item.for_s)
 
     def repair() -> None:

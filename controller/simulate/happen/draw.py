@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -29,15 +29,18 @@ DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 WORK: Final = ("recalibrate", "compare", "test-shots")
 CANCELLED: Final = 0.5
 
-LEFT_OUT: Final = (0.25, 0.5, 0.75)
+LEFT_OUT: Final = (0.3, 0.6, 0.8)
 """Share of the kinds of things, and of the ways in which each happens, that a life does not have."""
 LEANINGS: Final = (1.0, 1.0, 4.0)
-PACES_H: Final = (2.0, 5.0, 12.0, 30.0)
+PACES_H: Final = (2.0, 4.0, 8.0, 16.0)
 """Most promises are judged some half an hour after the last trouble: in a life without a pause they never are."""
-NEAR: Final = (0.0, 0.2, 0.5)
+NEAR: Final = (0.0, 0.1, 0.2)
 """Share of what happens that happens around an opening or a closing, and how long before and after it."""
 AROUND_S: Final = (-300.0, 120.0)
-SEVERAL: Final = (0.2, 0.5, 0.8)
+AT_MOMENTS: Final = (0.3, 0.5, 0.7)
+"""Share of what happens that waits for a moment at which the kiosk does something, and how long it comes after it."""
+SOON_S: Final[Mapping[str, tuple[float, float]]] = {"at once": (0.0, 1.0), "soon": (1.0, 15.0), "later": (15.0, 150.0)}
+SEVERAL: Final = (0.3, 0.6, 0.9)
 """Share of what happens that does not come alone."""
 ALIKE: Final = (0.0, 0.1, 0.4)
 """Share of what happens to one projector that has a cause that all of them share, such as their air or their mains."""
@@ -50,9 +53,14 @@ _Weights = Mapping[str, float]
 KINDS: Final[_Weights] = {
     "line": 2, "lamp fails": 1, "lamp reports": 1, "lamp switched by hand": 1, "player": 2, "camera gone": 1,
     "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 1, "killed": 1, "bundles unreadable": 1,
-    "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 0.5, "network gone": 0.5, "drift": 0.5,
-    "command": 4, "x server": 1, "cable out": 1,
+    "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 1, "network gone": 0.5, "drift": 0.5,
+    "command": 6, "x server": 1, "cable out": 1, "published": 0.5,
 }  # fmt: skip
+MOMENTS: Final[_Weights] = {
+    "work-begins": 2, "task-due": 1, "asked": 1, "service-started": 2, "player-started": 1, "disk-full": 1,
+    "lamp-struck": 1, "powering": 1, "playing": 1, "degraded": 1, "fault": 1, "cooling": 1, "off": 1,
+}  # fmt: skip
+"""Codes of the kiosk's events, and the states that a stage comes to."""
 COMMANDS: Final[_Weights] = {
     "start": 6, "stop": 6, "play": 4, "rotate": 2, "next": 3, "black": 3, "pause": 3, "brightness": 3, "identify": 2,
     "recalibrate": 4, "cancel": 3, "compare": 2, "set-schedule": 3, "seen": 1, "save-settings": 3, "test-shots": 1,
@@ -70,14 +78,19 @@ HOW: Final[Mapping[str, Sequence[str]]] = {
     "file damaged": ("cut", "flipped", "empty", "removed"),
     "bundle damaged": ("", "all"),
     "restarted": ("lamps stay lit", "lamps off"),
+    "clock set": ("hours", "days", "lost"),
 }
 LASTS_S: Final[Mapping[str, tuple[float, float]]] = {
     "seconds": (0.5, 30.0), "minutes": (30.0, 900.0), "hours": (900.0, LONGEST_S),
 }  # fmt: skip
 AFTER: Final = ("at once", "at once", "while it lasts", "while it lasts", "as it ends")
 """When another thing happens after the first of several."""
-MOST_TOGETHER: Final = 4
-ENDLESS: Final = ("killed", "drift", "restarted", "killed while writing", "command", "lamp switched by hand")
+MOST_TOGETHER: Final = 5
+ENDLESS: Final = (
+    "killed", "drift", "restarted", "killed while writing", "command", "lamp switched by hand", "published",
+)  # fmt: skip
+MIND: Final = 0.7
+"""Share of the commands "start" and "stop" that ask for what the hours do not."""
 
 
 def setting(seed: str) -> Setting:
@@ -128,6 +141,7 @@ class Leaning:
         self._left_out = chance.choice(LEFT_OUT)
         self.pace_s = chance.choice(PACES_H) * HOUR_S
         self.near, self.several, self.alike = chance.choice(NEAR), chance.choice(SEVERAL), chance.choice(ALIKE)
+        self.at_moments = chance.choice(AT_MOMENTS)
         self._weights: dict[str, dict[str, float]] = {}
 
     def drawn(self, chance: random.Random, what: str, usual: _Weights | Sequence[str]) -> str:
@@ -147,24 +161,36 @@ class Leaning:
 def draw(seed: str, days: float) -> list[Item]:
     """The script of a life. Each has a pace and a leaning of its own.
 
-    Of several things that come together, some come at once, some while the first lasts, and some as it ends. In some
-    lives much happens when the stage opens or closes, which is when a kiosk does most.
+    Of several things that come together, some come at once, some while the first lasts, and some as it ends. Much of
+    it happens when the stage opens or closes, or at a moment when the kiosk does something.
     """
     chance, leaning, place = random.Random(f"{seed} script"), Leaning(seed), setting(seed)
     calendar = Calendar(place.zone, place.rows)
+    drawing = _Drawing(chance, leaning, lambda at_s: calendar.open(place.begins_unix_s + at_s))
     items: list[Item] = []
     at_s = chance.expovariate(1 / min(leaning.pace_s, 5 * HOUR_S)) + 600.0
     while at_s < days * DAY_S:
-        if chance.random() < leaning.near:
+        near = chance.random()
+        if near < leaning.near:
             edge_s = calendar.changes_s(place.begins_unix_s + at_s) - place.begins_unix_s
             at_s = min(max(at_s, edge_s + chance.uniform(*AROUND_S)), days * DAY_S)
-        first = _one(chance, at_s, leaning)
-        items += _with_others(chance, first, leaning)
-        if chance.random() < leaning.several:
-            for _ in range(chance.randint(1, MOST_TOGETHER)):
-                items += _with_others(chance, _one(chance, _after_s(chance, first), leaning), leaning)
+        together = drawing.together(at_s)
+        if leaning.near < near < leaning.near + leaning.at_moments:
+            together = _waiting(chance, leaning, together)
+        items += together
         at_s += chance.expovariate(1 / leaning.pace_s) + 30.0
     return sorted((item for item in items if item.at_s < days * DAY_S), key=lambda item: item.at_s)
+
+
+def _waiting(chance: random.Random, leaning: Leaning, together: Sequence[Item]) -> list[Item]:
+    """The same at a moment at which the kiosk does something, with the same times between them."""
+    begins_s = min(item.at_s for item in together)
+    moment = leaning.drawn(chance, "moment", MOMENTS)
+    soon_s = chance.uniform(*SOON_S[leaning.drawn(chance, "soon", list(SOON_S))])
+    return [
+        replace(item, at_s=begins_s, moment=moment, after_s=round(item.at_s - begins_s + soon_s, 3))
+        for item in together
+    ]
 
 
 def _after_s(chance: random.Random, first: Item) -> float:
@@ -177,63 +203,78 @@ def _after_s(chance: random.Random, first: Item) -> float:
             return first.at_s + chance.expovariate(1 / 60.0)
 
 
-def _with_others(chance: random.Random, item: Item, leaning: Leaning) -> list[Item]:
-    """It, and what comes of the same cause: the other projectors', or that people think better of it."""
-    if item.who in NAMES and chance.random() < leaning.alike:
-        others = [replace(item, who=name, at_s=round(item.at_s + chance.expovariate(1 / 20.0), 3)) for name in NAMES]
-        return [item if other.who == item.who else other for other in others]
-    if item.who in WORK and chance.random() < CANCELLED:
-        return [item, Item(round(item.at_s + chance.uniform(1.0, 120.0), 3), "command", "cancel")]
-    return [item]
+class _Drawing:
+    """Draws things. ``is_open``: whether the stage is to be open by its hours, so many seconds after the beginning."""
 
+    def __init__(self, chance: random.Random, leaning: Leaning, is_open: Callable[[float], bool]) -> None:
+        self._chance, self._leaning, self._is_open = chance, leaning, is_open
 
-def _one(chance: random.Random, at_s: float, leaning: Leaning) -> Item:  # noqa: PLR0911 - one for each kind
-    at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
-    how = leaning.drawn(chance, what, HOW[what]) if what in HOW else ""
-    lasts_s = round(chance.uniform(*LASTS_S[leaning.drawn(chance, "lasts", list(LASTS_S))]), 1)
-    lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s
-    name = chance.choice(NAMES)
-    match what:
-        case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand" | "cable out":
-            return Item(at_s, what, name, how, lasts_s)
-        case "player":
-            return Item(
-                at_s,
-                what,
-                "",
-                how,
-                lasts_s if how in TROUBLES else 0.0,
-                chance.randint(1, 4) * how.startswith("crashes"),
-            )
-        case "file damaged":
-            return Item(at_s, what, leaning.drawn(chance, "file", FILES), how, number=round(chance.random(), 3))
-        case "bundle damaged":
-            return Item(at_s, what, "", how, max(600.0, lasts_s))
-        case "killed while writing":
-            return Item(at_s, what, number=chance.randint(1, 12))
-        case "clock set":
-            number = chance.choice([chance.uniform(-7000, 7000), chance.uniform(-200_000, 200_000), -1.5e9])
-            return Item(at_s, what, "", "", lasts_s, round(number, 1))
-        case "command":
-            return _command(at_s, chance, leaning.drawn(chance, "command", COMMANDS))
-        case _:
-            return Item(at_s, what, "", how, lasts_s)
+    def together(self, at_s: float) -> list[Item]:
+        """One thing, and what comes together with it."""
+        chance, first = self._chance, self._one(at_s)
+        items = self._with_others(first)
+        if chance.random() < self._leaning.several:
+            for _ in range(chance.randint(1, MOST_TOGETHER)):
+                items += self._with_others(self._one(_after_s(chance, first)))
+        return items
 
+    def _with_others(self, item: Item) -> list[Item]:
+        """It, and what comes of the same cause: the other projectors', or that people think better of it."""
+        chance = self._chance
+        if item.who in NAMES and chance.random() < self._leaning.alike:
+            others = [
+                replace(item, who=name, at_s=round(item.at_s + chance.expovariate(1 / 20.0), 3)) for name in NAMES
+            ]
+            return [item if other.who == item.who else other for other in others]
+        if item.who in WORK and chance.random() < CANCELLED:
+            return [item, Item(round(item.at_s + chance.uniform(1.0, 120.0), 3), "command", "cancel")]
+        return [item]
 
-def _command(at_s: float, chance: random.Random, who: str) -> Item:
-    values: dict[str, Any] = {}
-    match who:
-        case "play":
-            values = {"name": chance.choice(APPEARANCES), **({"fade_s": 2.0} if chance.random() < 0.5 else {})}
-        case "black" | "pause" | "identify":
-            values = {"on": chance.random() < 0.5}
-        case "brightness":
-            values = {"percent": chance.choice([0, 10, 50, 100])}
-        case "recalibrate":
-            values = {"kind": chance.choice(["quick", "full"])}
-        case "set-schedule":
-            values = {"time_zone": chance.choice(ZONES), "drift_check": chance.choice(["03:30", "02:30", ""]),
-                      "rows": hours(chance, chance.choice((0.0, 0.1, 0.9)))}  # fmt: skip
-        case "save-settings":
-            values = {"text": chance.choice(["comment", "projector", "display"])}
-    return Item(at_s, "command", who, arguments=json.dumps(values, sort_keys=True) if values else "")
+    def _one(self, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
+        chance, leaning = self._chance, self._leaning
+        at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
+        how = leaning.drawn(chance, what, HOW[what]) if what in HOW else ""
+        lasts_s = round(chance.uniform(*LASTS_S[leaning.drawn(chance, "lasts", list(LASTS_S))]), 1)
+        lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s
+        name = chance.choice(NAMES)
+        match what:
+            case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand" | "cable out":
+                return Item(at_s, what, name, how, lasts_s)
+            case "player":
+                times = chance.randint(1, 4) * how.startswith("crashes")
+                return Item(at_s, what, "", how, lasts_s if how in TROUBLES else 0.0, times)
+            case "file damaged":
+                return Item(at_s, what, leaning.drawn(chance, "file", FILES), how, number=round(chance.random(), 3))
+            case "bundle damaged":
+                return Item(at_s, what, "", how, max(600.0, lasts_s))
+            case "killed while writing":
+                return Item(at_s, what, number=round(chance.uniform(1.0, 8.0) ** 2))
+            case "clock set":
+                reach_s = {"hours": 7000.0, "days": 200_000.0, "lost": 0.0}[how]
+                return Item(at_s, what, "", how, lasts_s, round(chance.uniform(-reach_s, reach_s), 1))
+            case "command":
+                return self._command(at_s, leaning.drawn(chance, "command", COMMANDS))
+            case _:
+                return Item(at_s, what, "", how, lasts_s)
+
+    def _command(self, at_s: float, who: str) -> Item:
+        chance = self._chance
+        values: dict[str, Any] = {}
+        match who:
+            case "start" | "stop":
+                if chance.random() < MIND:
+                    who = "stop" if self._is_open(at_s) else "start"
+            case "play":
+                values = {"name": chance.choice(APPEARANCES), **({"fade_s": 2.0} if chance.random() < 0.5 else {})}
+            case "black" | "pause" | "identify":
+                values = {"on": chance.random() < 0.5}
+            case "brightness":
+                values = {"percent": chance.choice([0, 10, 50, 100])}
+            case "recalibrate":
+                values = {"kind": chance.choice(["quick", "full"])}
+            case "set-schedule":
+                values = {"time_zone": chance.choice(ZONES), "drift_check": chance.choice(["03:30", "02:30", ""]),
+                          "rows": hours(chance, chance.choice((0.0, 0.1, 0.9)))}  # fmt: skip
+            case "save-settings":
+                values = {"text": chance.choice(["comment", "projector", "display"])}
+        return Item(at_s, "command", who, arguments=json.dumps(values, sort_keys=True) if values else "")

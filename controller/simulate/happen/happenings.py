@@ -7,13 +7,13 @@ from functools import partial
 from typing import Final
 
 from controller.kiosk.decide.planner import EARLIEST_S
-from controller.simulate.disk import TOTAL_BYTES
+from controller.simulate.disk import STAGE, TOTAL_BYTES
 from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.lamps import RULES, Lamp
-from controller.simulate.stage import OUTPUTS
+from controller.simulate.stage import OUTPUTS, publish
 
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
@@ -30,7 +30,7 @@ def _line(life: Living, item: Item) -> None:
     line = life.world.lines[item.who]
     line.trouble = item.how
     line.connection += item.how == "gone"
-    life.witness.disturb(item.for_s + 120.0)
+    life.witness.disturb_lamps(item.for_s + 120.0)
 
     def repair() -> None:
         line.trouble = ""
@@ -57,14 +57,14 @@ def _lamp_fails(life: Living, item: Item) -> None:
     else:
         lamp.dud = True
         lamp.go_dark()
-    life.witness.disturb(item.for_s)
+    life.witness.disturb_lamps(item.for_s)
     life.later(item.for_s, partial(_new_lamp, life, lamp))
 
 
 def _new_lamp(life: Living, lamp: Lamp) -> None:
     """A technician puts in a new one, and opens the stage if it is to be open."""
     lamp.dud, lamp.fault, lamp.lasts_s = False, "", float("inf")
-    life.witness.disturb(0.0)
+    life.witness.disturb_lamps(0.0)
     if life.service is not None:
         for supervisor in life.service.devices.projectors:
             supervisor.forgive()
@@ -76,7 +76,7 @@ def _lamp_reports(life: Living, item: Item) -> None:
     lamp.fault = item.how
     if item.how in ("temperature", "cover"):
         lamp.go_dark()
-    life.witness.disturb(item.for_s)
+    life.witness.disturb_lamps(item.for_s)
     life.later(item.for_s, partial(_new_lamp, life, lamp))
 
 
@@ -87,12 +87,12 @@ def _by_hand(life: Living, item: Item) -> None:
         lamp.go_dark()
     elif not lamp.lit and not lamp.bad and now_s - lamp.off_at_s >= RULES.minimum_off_s:
         lamp.lit_at_s, lamp.by_hand = now_s, True
-    life.witness.disturb(0.0)
+    life.witness.disturb_lamps(0.0)
 
 
 def _player(life: Living, item: Item) -> None:
     screen, witness = life.world.screen, life.witness
-    fell = item.how in ("killed", "hung") and witness.calm and bool(screen.appearance)
+    fell = item.how in ("killed", "hung") and witness.player_well
     # One that died again and again already is started after longer and longer pauses.
     again_s = PLAYER_S if life.world.scheduler.now_s < witness.player_disturbed_until_s else 0.0
     if item.how in ("killed", "crashes"):
@@ -125,6 +125,7 @@ def _x_server(life: Living, item: Item) -> None:
 
     def repair() -> None:
         screen.no_server = False
+        life.witness.disturb_picture(0.0)
 
     life.later(item.for_s, repair)
 
@@ -137,6 +138,7 @@ def _cable(life: Living, item: Item) -> None:
 
     def repair() -> None:
         screen.unplugged.discard(output)
+        life.witness.disturb_picture(0.0)
 
     life.later(item.for_s, repair)
 
@@ -207,8 +209,10 @@ def _restarted(life: Living, item: Item) -> None:
 
 
 def _clock(life: Living, item: Item) -> None:
+    """Set wrongly, or ``lost``: at 1970, as after a battery that is empty."""
     world, wanted = life.world, life.witness.wanted
-    world.clock_off_s, world.is_synchronised = item.number, False
+    world.clock_off_s = -world.truth_s if item.how == "lost" else item.number
+    world.is_synchronised = False
     if world.wall() < EARLIEST_S and wanted.sure:
         wanted.lose_time()
     else:
@@ -240,6 +244,12 @@ def _drift(life: Living, item: Item) -> None:
     life.world.drifted = True
 
 
+def _published(life: Living, item: Item) -> None:
+    """Appearances that were made on another computer."""
+    publish(STAGE, int(life.world.truth_s))
+    life.witness.disturb_picture(0.0)
+
+
 def _command(life: Living, item: Item) -> None:
     life.command(item)
 
@@ -250,5 +260,6 @@ _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "disk full": _disk_full, "disk low": _disk_low,
     "file damaged": file_damaged, "bundle damaged": bundle_damaged, "bundles unreadable": bundles_unreadable,
     "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
-    "clock set": _clock, "network gone": _no_network, "drift": _drift, "command": _command,
+    "clock set": _clock, "network gone": _no_network, "drift": _drift, "published": _published,
+    "command": _command,
 }  # fmt: skip

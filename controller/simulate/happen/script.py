@@ -9,12 +9,18 @@ from dataclasses import asdict, dataclass
 from controller.simulate.scheduler import DAY_S
 
 
+def moment_of(code: str, text: str) -> str:
+    """What an item may wait for: the code of an event, or the state that the stage comes to."""
+    return text.removeprefix("The stage is ").partition(":")[0].rstrip(".") if code == "state" else code
+
+
 @dataclass(frozen=True, slots=True)
 class Item:
     """One thing that happens ``at_s``; ``for_s``: how long it lasts, 0: it has no end of its own.
 
     ``who``: a projector, a file, an operation; ``how``: which trouble; ``number``: its size; ``arguments``: of an
-    operation.
+    operation. With a ``moment`` it waits from ``at_s`` on, for a day at most, until the kiosk's
+    log says that, and happens ``after_s`` later.
     """
 
     at_s: float
@@ -24,6 +30,8 @@ class Item:
     for_s: float = 0.0
     number: float = 0.0
     arguments: str = ""
+    moment: str = ""
+    after_s: float = 0.0
 
     @property
     def line(self) -> str:
@@ -31,7 +39,8 @@ class Item:
         said = " ".join(word for word in (self.what, self.who, self.how, self.arguments) if word)
         lasts = f" for {self.for_s:.0f} s" if self.for_s else ""
         size = f" ({self.number:g})" if self.number else ""
-        return f"{self.at_s / DAY_S:7.3f} d  {said}{size}{lasts}"
+        waits = f", {self.after_s:.1f} s after the next {self.moment}" if self.moment else ""
+        return f"{self.at_s / DAY_S:7.3f} d  {said}{size}{lasts}{waits}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,16 +13,18 @@ def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]
     """A service has started again: what the one before logged is there. ``damaged``: files that were. Raises Broken."""
     rows = list(service.log.after(0))
     # What could not be written before the end is gone, and its numbers are given again.
-    witness.read = next((row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.read)
-    witness.numbers_again()
+    witness.log.read = next(
+        (row.number - 1 for row in reversed(rows) if row.code == "service-started"), witness.log.read
+    )
+    witness.log.numbers_again()
     there = {row.number: row for row in rows}
     if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
-        witness.rows.clear()
+        witness.log.rows.clear()
     # A full log forgets its oldest; one that is not full has all of them.
     least = min(there) if len(rows) >= SHOWN else 0
-    for number, row in list(witness.rows.items()):
+    for number, row in list(witness.log.rows.items()):
         if number < least:
-            del witness.rows[number]
+            del witness.log.rows[number]
         elif there.get(number) != row:
             raise Broken("nothing lost", f"event {number} is gone from the log: {row.text}")
     if not (STAGE / "stage.toml").exists() and "stage.toml" not in damaged:

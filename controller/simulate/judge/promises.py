@@ -16,6 +16,7 @@ PROMISES: Final = {
     "rests while closed": "A closed stage without work is off, cools, or says what is wrong.",
     "lit through a restart": "A service that is killed or restarted leaves the lamps of an open stage lit.",
     "serves": "A started service runs, also on a full disk or with a damaged stage.toml if the last good one is there.",
+    "settings kept": "A kiosk that runs has a copy of its stage.toml, soon after the disk has room for one.",
     "off is off": "When a stage says that every lamp is off, none burns that it struck.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.decide.interfaces import Request
 from controller.kiosk.decide.live_changes import LiveChanges
-from controller.kiosk.interface import EventRow
-from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.lamps import BACK_S, LampWitness
+from controller.simulate.judge.log import LogWitness
 from controller.simulate.judge.promises import Broken
 from controller.simulate.judge.wanted import SETTLING_S, Wanted
 from controller.simulate.stage import OUTPUTS
@@ -25,18 +23,17 @@ REPAIR_S: Final = 2000.0
 """After a fault: the longest retry out of the state fault, and the lamps' times."""
 PLAYER_S: Final = 120.0
 """After trouble with the player: its longest pause before a start, and a start that fails."""
+GOES_BACK_S: Final = 900.0
+"""Until a player whose bundle is damaged goes back to the one before: starts in vain, of which each waits longer."""
 BLACK_S: Final = 30.0
 DARK_S: Final = 240.0
 HANGS_S: Final = 45.0
 """A start, two questions without an answer, and the pauses between them."""
 OPENED_S: Final = 200.0
 DECIDES_S: Final = 0.3
-CHECK_BEGINS: Final = "Started: Drift check."
-MOST_WORDS: Final = 240
-MOST_AGAIN: Final = 20
-"""Of the same words; the longest pause between two starts of the player is 30 s."""
-WORDS_S: Final = 300.0
 WORK_S: Final = 3600.0
+CANCELLED_S: Final = 120.0
+"""Of one step of work: an exposure, and three questions on lines that are silent."""
 _RESTING: Final = (State.OFF, State.COOLING, State.FAULT)
 
 
@@ -44,68 +41,62 @@ class Witness:
     """Sees what really is, and judges.
 
     ``disturbed_until_s``: until when a fault, or what follows of it, excuses; ``paused_long``: whether the reconciler's
-    pause that begins now is stretched; ``here``: the folder of this life, which is left out of what is logged.
+    pause that begins now is stretched.
     """
 
     def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
         self._world, self.wanted = world, Wanted(calendar, lambda: world.truth_s)
         self.lamps = LampWitness(world)
+        self.log = LogWitness(world)
         self.paused_long = False
         self.disturbed_until_s = SETTLING_S
-        self.player_disturbed_until_s = 0.0
+        self.player_disturbed_until_s = self.bundle_bad_until_s = 0.0
         self.changed_s = 0.0
         self._was_open: bool | None = None
         self._began_s, self._stepped_s = 0.0, 0.0
-        self.read = 0
-        self.rows: dict[int, EventRow] = {}
-        self._held: deque[EventRow] = deque(maxlen=SHOWN)
-        self.digested: list[str] = []
-        self.here = "\0"
-        self._logged_state = self._logged_fault = ""
         self._black_since_s: float | None = None
         self._back_by_s: float | None = None
         self._missing_since_s: float | None = None
         self._found_since_s: dict[str, float] = {}
-        self._alerted, self._alerted_number, self._kills = 0, 0, 0
-        self.begun_checks: set[str] = set()
-        self._due_check = ""
-        self._recent: deque[tuple[float, str]] = deque()
-        self._often: Counter[str] = Counter()
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
         self._work: Request | None = None
         self._work_since_s = 0.0
+        self._cancelled: tuple[Request | None, float] = (None, 0.0)
 
     # -- the service
 
     def begins(self) -> None:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
-        self._held.clear()
         self._found_since_s.pop("hangs", None)
-        self._logged_state = State.OFF.value
+        self.log.begins()
 
     def player_fell(self) -> None:
-        """The player died or hangs, and nothing else is wrong."""
+        """The player died or hangs, and nothing else is wrong with it."""
         self._back_by_s = self._world.scheduler.now_s + BACK_S
+
+    @property
+    def player_well(self) -> bool:
+        """Whether the player has long shown what it should, whatever is wrong with lamps."""
+        since_s = max(self.player_disturbed_until_s, self._began_s + SETTLING_S, self.changed_s + SETTLING_S)
+        well = self._world.scheduler.now_s > since_s and not self._world.disk.full and not self._world.disk.blind
+        return well and self.wanted.sure and self.wanted.open() and bool(self._world.screen.appearance)
 
     def killed(self) -> None:
         """The service was, perhaps between an alert and the note that it was sent."""
-        # Sent before it was killed, and not yet looked at.
-        self._alerted_number = max([self._alerted_number, *(row.number for row in self._world.alerted)])
-        self._alerted = len(self._world.alerted)
-        self._kills += 1
+        self.log.killed()
         self._missing_since_s = None
-
-    def numbers_again(self) -> None:
-        """What was logged from ``read`` on has numbers that others had, which were never written."""
-        self._alerted_number = min(self._alerted_number, self.read)
 
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
-        now_s = self._world.scheduler.now_s
-        self._back_by_s, self.lamps.stays_lit = None, {}
-        self.disturbed_until_s = max(self.disturbed_until_s, now_s + for_s + after_s)
+        self._back_by_s = None
+        self.disturb_lamps(for_s, after_s)
+
+    def disturb_lamps(self, for_s: float, after_s: float = REPAIR_S) -> None:
+        """A fault of lamps or their lines: a player that dies meanwhile has no excuse."""
+        self.lamps.stays_lit = {}
+        self.disturbed_until_s = max(self.disturbed_until_s, self._world.scheduler.now_s + for_s + after_s)
 
     def disturb_player(self, for_s: float) -> None:
         """Trouble with the player, so long, and what it takes until it shows what it should."""
@@ -115,8 +106,9 @@ class Witness:
 
     def disturb_picture(self, for_s: float) -> None:
         """Something between player and projectors fails for so long: both excuses end when the player shows again."""
-        self.disturb(for_s, PLAYER_S)
-        self.disturb_player(for_s)
+        again_s = GOES_BACK_S if self._world.scheduler.now_s + for_s < self.bundle_bad_until_s else 0.0
+        self.disturb(for_s + again_s, PLAYER_S)
+        self.disturb_player(for_s + again_s)
 
     def next_edge_s(self) -> float:
         """When hours change next, in the world's time."""
@@ -144,95 +136,46 @@ class Witness:
         if now_s - self._stepped_s > DECIDES_S and not self.paused_long:
             raise Broken("decides always", f"it did not for {now_s - self._stepped_s:.1f} s")
         self._stepped_s = now_s
-        news = self._listen(service)
+        news = self.log.listen(service, self._check_may_begin)
+        for row in news:
+            self.lamps.off(row)
         wanted = self.wanted.open()
         if wanted is not self._was_open:
             self._was_open, self.changed_s = wanted, now_s
             if wanted:
                 self.lamps.forgive()
         state = service.reconciler.machine.state
-        if self._logged_state != state.value:
-            raise Broken("state", f"it says {self._logged_state}, but it is {state.value}")
+        if self.log.state != state.value:
+            raise Broken("state", f"it says {self.log.state}, but it is {state.value}")
         surely = wanted and self.wanted.sure
         self.lamps.judge(service, serving_s=now_s - self._began_s, open_surely=surely)
         self._works(service)
-        self._alerts()
+        self.log.alerts()
         self._player(service)
         self._devices(service)
         self._closed(service, state, wanted)
         self._opened(kiosk, service, state, wanted)
         elapsed_s, self._judged_s = now_s - self._judged_s, now_s
         self.minutes["open" if wanted else "closed"] += elapsed_s / 60
-        return news
+        return bool(news)
 
-    def _listen(self, service: Service) -> bool:
-        number, now_s = service.log.number, self._world.scheduler.now_s
-        if service.log.problem is None:
-            # What was logged while nothing could be written has been written now.
-            self.rows.update((row.number, row) for row in self._held)
-            self._held.clear()
-        if number == self.read:
-            return False
-        for row in service.log.after(self.read):
-            self.read = row.number
-            text = row.text.replace(self.here, "")
-            self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {text}")
-            if service.log.problem is None:
-                self.rows[row.number] = row
-            else:
-                self._held.append(row)
-            self._said(row)
-            if row.code == "crash":
-                raise Broken("no crash", row.text)
-            if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
-                raise Broken("remedy", f"{row.code}: {row.text}")
-            if row.code == "state":
-                self.lamps.off(row)
-                if row.text.startswith("The stage is fault"):
-                    self._logged_fault = row.text
-                self._logged_state = row.text.removeprefix("The stage is ").partition(":")[0].partition(".")[0]
-            elif row.code == "task-due":
-                open_s = now_s - self.changed_s
-                if self._was_open and self.wanted.open() and open_s > BLACK_S and self.wanted.sure:
-                    raise Broken("at night", row.text)
-                self._due_check = row.text.partition("(")[2].partition(")")[0]
-            elif row.text == CHECK_BEGINS:
-                self._check_begins(service)
-        return True
+    def _check_may_begin(self) -> bool:
+        open_s = self._world.scheduler.now_s - self.changed_s
+        return not (self._was_open and self.wanted.open() and open_s > BLACK_S and self.wanted.sure)
 
-    def _check_begins(self, service: Service) -> None:
-        if self._due_check in self.begun_checks:
-            raise Broken("once a night", f"{self._due_check} begins again")
-        if service.log.problem is None:
-            # What can't be written may be done again after a kill.
-            self.begun_checks.add(self._due_check)
-
-    def _said(self, row: EventRow) -> None:
-        now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
-        recent.append((now_s, row.text))
-        often[row.text] += 1
-        while now_s - recent[0][0] >= WORDS_S:
-            often[recent.popleft()[1]] -= 1
-        if len(recent) >= MOST_WORDS:
-            raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
-        if often[row.text] >= MOST_AGAIN:
-            raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
+    def work_cancelled(self, service: Service) -> None:
+        """A person cancelled what runs."""
+        self._cancelled = (service.jobs.running, self._world.scheduler.now_s)
 
     def _works(self, service: Service) -> None:
         now_s, running = self._world.scheduler.now_s, service.jobs.running
+        cancelled, since_s = self._cancelled
         if running is not self._work:
             self._work, self._work_since_s = running, now_s
         elif running is not None and now_s - self._work_since_s > WORK_S:
             raise Broken("work ends", f"{running.kind} runs for {now_s - self._work_since_s:.0f} s")
-
-    def _alerts(self) -> None:
-        world = self._world
-        for row in world.alerted[self._alerted :]:
-            if row.number <= self._alerted_number and not self._kills:
-                raise Broken("alerts", f"event {row.number} was sent after {self._alerted_number}")
-            if row.number > self._alerted_number:
-                self._alerted_number, self._kills = row.number, 0
-        self._alerted = len(world.alerted)
+        elif running is not None and running is cancelled and now_s - since_s > CANCELLED_S:
+            raise Broken("work ends", f"{running.kind} runs for {now_s - since_s:.0f} s after it was cancelled")
 
     def _player(self, service: Service) -> None:
         """A picture that stands still is no sign of a player that lives."""
@@ -351,10 +294,10 @@ class Witness:
         if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
             return True
         before = snapshot.reason.partition("Before: ")[2].rstrip(".")
-        if state in (State.POWERING, State.WARMING) and before and before in self._logged_fault:
+        if state in (State.POWERING, State.WARMING) and before and before in self.log.fault:
             return True
         return (
             bool(snapshot.warnings)
             or any(row.problem for row in snapshot.devices)
-            or any(row.code == "nothing-installed" for row in self.rows.values())
+            or any(row.code == "nothing-installed" for row in self.log.rows.values())
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from controller.simulate.happen.draw import draw, setting
-from controller.simulate.happen.script import from_json, to_json
+from controller.simulate.happen.script import Item, Setting, from_json, to_json
 from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import Life
 
@@ -67,6 +67,17 @@ def test_a_short_life_keeps_every_promise() -> None:
     assert outcome.how == "", outcome.last
     assert outcome.events > 10
     assert outcome.minutes["open"] + outcome.minutes["closed"] > 900
+
+
+def test_what_waits_for_a_moment_happens_when_the_log_says_that() -> None:
+    rows = [{"day": day, "opens": "10:00", "closes": "18:00"} for day in ("mon", "tue", "wed", "thu", "fri")]
+    killed = Item(600.0, "killed", moment="work-begins", after_s=5.0)
+    outcome = Life("moment", 1.0, [killed], Setting(1_767_571_200.0, "UTC", rows, "03:30")).live()
+    began, again = [
+        float(line.split()[1]) for line in outcome.last if " work-begins " in line or "run ended unexpectedly" in line
+    ]
+    assert 5.0 <= again - began < 9.0
+    assert outcome.how == ""
 
 
 def test_every_promise_is_on_the_page() -> None:

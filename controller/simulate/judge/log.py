@@ -1,0 +1,139 @@
+"""Reads the event log of a simulated kiosk after each step, and judges what it says."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from controller.kiosk.interface import EventRow
+from controller.kiosk.store.event_log import SHOWN
+from controller.run.state_machine import State
+from controller.simulate.happen.script import moment_of
+from controller.simulate.judge.promises import Broken
+from controller.simulate.world import SimulatedWorld
+
+if TYPE_CHECKING:
+    from controller.kiosk.service import Service
+
+CHECK_BEGINS: Final = "Started: Drift check."
+MOST_WORDS: Final = 240
+MOST_AGAIN: Final = 20
+"""Of the same words; the longest pause between two starts of the player is 30 s."""
+WORDS_S: Final = 300.0
+
+
+class LogWitness:
+    """``rows``: by number, those that are surely written; ``read``: the number of the last one.
+
+    ``digested``: all lines in the order in which they were read, without ``here``, the folder of this life.
+    ``state``: the stage's, as it says, and ``fault``: what was wrong when that was "fault" last.
+    ``moment`` hears of each line.
+    """
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        self._world = world
+        self.read = 0
+        self.rows: dict[int, EventRow] = {}
+        self.digested: list[str] = []
+        self.here = "\0"
+        self.state = self.fault = ""
+        self.begun_checks: set[str] = set()
+        self.moment: Callable[[str], None] = lambda _: None
+        self._held: deque[EventRow] = deque(maxlen=SHOWN)
+        self._alerted, self._alerted_number, self._kills = 0, 0, 0
+        self._due_check = ""
+        self._recent: deque[tuple[float, str]] = deque()
+        self._often: Counter[str] = Counter()
+
+    # -- the service
+
+    def begins(self) -> None:
+        self._held.clear()
+        self.state = State.OFF.value
+
+    def killed(self) -> None:
+        """The service was, perhaps between an alert and the note that it was sent."""
+        # Sent before it was killed, and not yet looked at.
+        self._alerted_number = max([self._alerted_number, *(row.number for row in self._world.alerted)])
+        self._alerted = len(self._world.alerted)
+        self._kills += 1
+
+    def numbers_again(self) -> None:
+        """What was logged from ``read`` on has numbers that others had, which were never written."""
+        self._alerted_number = min(self._alerted_number, self.read)
+
+    # -- judging
+
+    def listen(self, service: Service, check_begins_rightly: Callable[[], bool]) -> list[EventRow]:
+        """Read what is new, and return it. Raises Broken."""
+        number = service.log.number
+        if service.log.problem is None:
+            # What was logged while nothing could be written has been written now.
+            self.rows.update((row.number, row) for row in self._held)
+            self._held.clear()
+        if number == self.read:
+            return []
+        new = service.log.after(self.read)
+        for row in new:
+            self.read = row.number
+            text = row.text.replace(self.here, "")
+            self.digested.append(f"{row.number} {row.unix_s!r} {row.level} {row.code} {text}")
+            if service.log.problem is None:
+                self.rows[row.number] = row
+            else:
+                self._held.append(row)
+            self._said(row)
+            self.moment(moment_of(row.code, row.text))
+            if row.code == "crash":
+                raise Broken("no crash", row.text)
+            if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
+                raise Broken("remedy", f"{row.code}: {row.text}")
+            if row.code == "state":
+                self._changes_state(row)
+            elif row.code == "task-due":
+                if not check_begins_rightly():
+                    raise Broken("at night", row.text)
+                self._due_check = row.text.partition("(")[2].partition(")")[0]
+            elif row.text == CHECK_BEGINS:
+                self._check_begins(service)
+        return list(new)
+
+    def alerts(self) -> None:
+        """What was sent since the last look. Raises Broken."""
+        world = self._world
+        for row in world.alerted[self._alerted :]:
+            if row.number <= self._alerted_number and not self._kills:
+                raise Broken("alerts", f"event {row.number} was sent after {self._alerted_number}")
+            if row.number > self._alerted_number:
+                self._alerted_number, self._kills = row.number, 0
+        self._alerted = len(world.alerted)
+
+    def _changes_state(self, row: EventRow) -> None:
+        """Who tries again after a fault still says what was wrong."""
+        state, _, reason = row.text.removeprefix("The stage is ").rstrip(".").partition(": ")
+        if state == State.FAULT.value:
+            self.fault = reason
+        elif state == State.POWERING.value and self.state == State.FAULT.value:
+            before = reason.partition("Before: ")[2].rstrip(".")
+            if not before or before not in self.fault:
+                raise Broken("says why it is dark", f"it had a fault ({self.fault}), and says: {row.text}")
+        self.state = state
+
+    def _check_begins(self, service: Service) -> None:
+        if self._due_check in self.begun_checks:
+            raise Broken("once a night", f"{self._due_check} begins again")
+        if service.log.problem is None:
+            # What can't be written may be done again after a kill.
+            self.begun_checks.add(self._due_check)
+
+    def _said(self, row: EventRow) -> None:
+        now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
+        recent.append((now_s, row.text))
+        often[row.text] += 1
+        while now_s - recent[0][0] >= WORDS_S:
+            often[recent.popleft()[1]] -= 1
+        if len(recent) >= MOST_WORDS:
+            raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
+        if often[row.text] >= MOST_AGAIN:
+            raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
