@@ -159,6 +159,9 @@ def _curves(axes: Any, lines: Sequence[Line], marks: Marks, y_range: Range | Non
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if y_range is not None:
         axes.set_ylim(*y_range)
+        bottom, top = axes.get_ylim()
+        if y_range[1] is None:  # by itself matplotlib's margin is of the data's range, too little above a whole marker
+            axes.set_ylim(top=top + 0.04 * (top - bottom))
     axes.grid(True, color="0.9", linewidth=0.6)
 
 
