@@ -106,12 +106,15 @@ class PlayerProcess:
             except OSError:
                 time.sleep(_POLL_S)
         log_tail = self.log.read_bytes()[-_TOLD_BYTES:].decode(errors="replace").strip()
-        silent = "it did not answer in time"
+        said = " ".join(log_tail.split()) or f"it did not answer within {timeout_s:.0f} s"
         self.terminate()
+        # The log is not named: a folder of a run that fails is deleted with it.
         raise WorkError(
             "player-not-started",
-            what=f"The player did not start: {' '.join(log_tail.split()) or silent}",
-            remedy=f"Correct the cause and start again; the player's log is {self.log}.",
+            what=f"The player did not start: {said.removesuffix('.')}.",
+            remedy="Correct the cause, then start again."
+            if log_tail
+            else "Close programs that keep this computer busy, then start again.",
         )
 
     def _hello(self, timeout_s: float) -> dict[str, Any]:
