@@ -125,7 +125,8 @@ def _x_server(life: Living, item: Item) -> None:
 
     def repair() -> None:
         screen.no_server = False
-        life.witness.disturb_picture(0.0)
+        # Without a server a player neither starts nor shows: crashes that are still to come, come now.
+        life.witness.disturb_picture(PLAYER_S * (screen.dies_at_start + screen.dies_at_play))
 
     life.later(item.for_s, repair)
 
