@@ -82,7 +82,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
         *refine_steps(rig, calibrated, {request.name: request.title for request in requests}, refining, after=solvings),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
-        publishing(checked, run, names),
+        publishing(checked, calibrated, names),
         marker("published", "Published", leave=Event.PUBLISHED),
         marker("playing", "Playing", enter=Event.PLAY),
         photograph_step(rig, names, longest_exposure_s=longest_s),

@@ -159,7 +159,7 @@ def make_appearances(
                 *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
-            publish = publishing(checked, run, names)
+            publish = publishing(checked, calibrated, names)
             whole = [*steps, publish] if refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}
@@ -171,16 +171,17 @@ def make_appearances(
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
 
 
-def publishing(checked: Checked, run: Path, names: Sequence[str]) -> Step:
-    """The step that makes these appearances of ``run`` the stage's signed bundle."""
+def publishing(checked: Checked, calibrated: Calibrated, names: Sequence[str]) -> Step:
+    """The step that makes these appearances of the run of ``calibrated`` the stage's signed bundle."""
     stage = checked.stage
     return publish_step(
         stage.folder,
         output_sizes(checked),
         names,
         stage=stage.tables.stage.name,
-        calibration=run.name,
+        calibration=calibrated.folder.name,
         key=signing_key(checked),
+        calibrated=calibrated,
     )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.published import BUNDLE, BundleFigures
 from controller.artefacts.solved import is_solved, read_solved
@@ -44,6 +45,7 @@ def publish_step(
     calibration: str,
     key: Path | None,
     after: Sequence[StepId] = (),
+    calibrated: Calibrated | None = None,
 ) -> Step:
     """Write, sign and install the bundle of these appearances; the artefacts are the bundle and its figures.
 
@@ -51,11 +53,11 @@ def publish_step(
     content depends on more than its own steps, so every run repeats it; unchanged content gives the same bytes.
 
     ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle; ``after``: the steps
-    of this run that make the frames
+    of this run that make the frames; ``calibrated``: what reads the run, where the caller needs it too
     """
     return Step(
         StepId(StepKind.PUBLISH),
-        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key),
+        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key, calibrated),
         inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
         after=tuple(after),
         title="Publishing the signed bundle",
@@ -70,6 +72,7 @@ def _publish(
     names: Sequence[str],
     identity: tuple[str, str],
     key: Path | None,
+    calibrated: Calibrated | None,
     context: Context,
 ) -> Sequence[Path]:
     built, slots = context.folder / BUNDLE, folder / "bundles"
@@ -80,7 +83,7 @@ def _publish(
         context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
     index = publish_solved(
         built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
-        live=_holds_live(slots), hints_ms=hints_ms(folder),
+        live=_holds_live(slots), hints_ms=hints_ms(folder), calibrated=calibrated,
     )  # fmt: skip
     installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
     raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
@@ -157,13 +160,15 @@ def publish_solved(
     live: bool = False,
     hints_ms: Mapping[str, tuple[int, int]] | None = None,
     check: Callable[[], None] = lambda: None,
+    calibrated: Calibrated | None = None,
 ) -> Index:
     """Write the solved appearances of the folder ``run`` to a bundle at ``path``, signed with the key file.
 
     If the folder ``slots`` has the same bundle installed, the file is identical to it. Otherwise its revision is
     one above those installed bundles that ``trust`` accepts. ``live``: include the live-mode data.
     ``hints_ms``: (shown, fade) by name for the bundle's playlist, else ``SHOWN_MS``.
-    ``check`` is called before each appearance and may raise to stop the work.
+    ``check`` is called before each appearance and may raise to stop the work. ``calibrated``: what reads ``run``, else
+    it is read here where a thumbnail is missing.
     Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then unchanged or intact.
     """
     from controller.steps.appearance.live_parts import live_arrays
@@ -177,7 +182,7 @@ def publish_solved(
             calibration=calibration,
             created_unix_s=created_unix_s(run),
             outputs=[(output, *size) for output, size in outputs.values()],
-            appearances=_appearances(run, outputs, names, check),
+            appearances=_appearances(calibrated or Calibrated(run, tuple(outputs)), outputs, names, check),
             key=None if key is None else load_signing_key(key),
             revision=revision,
             schedule=[PlaylistEntry(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
@@ -193,14 +198,14 @@ def publish_solved(
 
 
 def _appearances(
-    run: Path, outputs: Outputs, names: Sequence[str], check: Callable[[], None]
+    calibrated: Calibrated, outputs: Outputs, names: Sequence[str], check: Callable[[], None]
 ) -> Iterator[NewAppearance]:
     from controller.steps.appearance.thumbnails import Thumbnails
 
-    thumbnails = Thumbnails(run, tuple(outputs))
+    thumbnails = Thumbnails(calibrated)
     for name in names:
         check()
-        solved = read_solved(run, name, tuple(outputs))
+        solved = read_solved(calibrated.folder, name, tuple(outputs))
         frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
         metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
         yield NewAppearance(name, frames, thumbnails.of(name), metadata)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
 import cv2
@@ -25,12 +23,12 @@ _XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.
 class Thumbnails:
     """Makes the thumbnails of a run's appearances, and keeps them in the run's folder until they are solved again.
 
-    Builds the light transport for the first thumbnail that is not stored yet.
+    The first thumbnail that is not stored yet needs the light transport of ``calibrated``, whose run it is.
     """
 
-    def __init__(self, folder: Path, projectors: Sequence[str]) -> None:
-        self._folder, self._projectors = folder, tuple(projectors)
-        self._calibrated: Calibrated | None = None
+    def __init__(self, calibrated: Calibrated) -> None:
+        self._calibrated = calibrated
+        self._folder, self._projectors = calibrated.folder, calibrated.projectors
 
     def of(self, name: str) -> bytes | None:
         """The PNG file of a solved appearance of the run; None if its calibration is not in the run."""
@@ -43,8 +41,6 @@ class Thumbnails:
         return data
 
     def _made(self, name: str) -> bytes:
-        if self._calibrated is None:
-            self._calibrated = Calibrated(self._folder, self._projectors)
         calibration = self._calibrated.calibration
         solved = read_solved(self._folder, name, self._projectors)
         seen = self._calibrated.predicted_light([solved.linear[projector] for projector in self._projectors])
