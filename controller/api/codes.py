@@ -13,6 +13,7 @@ from controller.api.photographs import develop
 from controller.calibrate.correspondence.any_code import Bits, Sinusoid, decode_any
 from controller.calibrate.values import Correspondence
 from controller.capture.profile import CameraProfile
+from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError
 
@@ -94,7 +95,7 @@ class _Reader:
                 what=f"The file {path} does not exist.",
                 remedy="Correct its name in captures.toml, or copy the file into the folder.",
             )
-        image = np.asarray(develop(path, camera=self._camera).image.mean(axis=2), np.float32)
+        image = np.asarray(channels.mean(develop(path, camera=self._camera).image), np.float32)
         image = np.where(np.isfinite(image), image, np.float32(1))  # saturated: as bright as can be measured
         if self._shape is not None and image.shape != self._shape:
             raise CalibrationError(

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from controller.api.arrays import as_image
 from controller.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
+from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.transport import LightTransport, factory
@@ -105,7 +106,7 @@ def transport_from_matrices(
         ProjectorCalibration(str(n), _without_metapixels(size), Radiometry(LINEAR.response, mixed[n]), white)
         for n, (size, white) in enumerate(zip(projectors_px, light, strict=True))
     )
-    mask = np.any([white.max(axis=2) > 0 for white in light], axis=0)
+    mask = np.any([channels.largest(white) > 0 for white in light], axis=0)
     calibration = Calibration(parts, np.zeros((*shape, 3), np.float32), mask, np.eye(3))
     patches = patches_of_weights([_largest_one(matrix) for matrix in rows], shape)
     return factory.build_transport(calibration, patches=patches)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.capture.profile import CameraNoise
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 
@@ -227,7 +228,7 @@ def choose_brackets(
 def _darkest(image: FloatImage, lit: Mask | None) -> float:
     """2nd percentile of the grey of what is lit, in ``image``'s full scale."""
     finite = np.where(np.isfinite(image), image, 1.0)
-    strongest, grey = finite.max(axis=2), finite.mean(axis=2)
+    strongest, grey = channels.largest(finite), channels.mean(finite)
     chosen = lit if lit is not None else strongest > DARK_SHARE * max(_brightest(image, None) or 1.0, 1e-6)
     return float(np.percentile(grey[chosen], DARK_PERCENTILE)) if np.any(chosen) else 1.0
 
@@ -253,7 +254,7 @@ def _next(exposures: list[float], exposure_s: float) -> float:
 
 def _brightest(image: FloatImage, lit: Mask | None) -> float | None:
     """99.5th percentile of the lit pixels' strongest channel; None when it is saturated."""
-    strongest = np.max(np.where(np.isfinite(image), image, np.inf), axis=2)
+    strongest = channels.largest(np.where(np.isfinite(image), image, np.inf))
     if lit is not None:
         strongest = strongest[lit]
     finite = strongest[np.isfinite(strongest)]

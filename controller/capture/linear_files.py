@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.files import check_pixels, require_regular
 from controller.core.text import printable
@@ -36,7 +37,7 @@ def read_linear(path: Path, *, bits: tuple[int, ...] = (16,)) -> tuple[FloatImag
     """
     if path.suffix.lower() == ".exr":
         image = np.ascontiguousarray(read_exr(path)[..., :3])
-        return image, np.asarray(~np.isfinite(image).all(axis=2))
+        return image, np.asarray(~channels.finite(image))
     try:
         require_regular(path)
         data = np.fromfile(path, np.uint8)
@@ -47,7 +48,7 @@ def read_linear(path: Path, *, bits: tuple[int, ...] = (16,)) -> tuple[FloatImag
         raise Unreadable(f"it is not a picture of {' or '.join(map(str, bits))} bits")
     full = 2 ** (8 * decoded.itemsize) - 1
     colours = np.repeat(decoded[..., None], 3, axis=2) if decoded.ndim == 2 else decoded[..., 2::-1]
-    return np.asarray(colours / np.float32(full), np.float32), np.any(colours == full, axis=2)
+    return np.asarray(colours / np.float32(full), np.float32), channels.some(colours == full)
 
 
 def read_exr(path: Path) -> FloatImage:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from controller.capture import linear_files
 from controller.capture.demosaic import SensorLevels, demosaic, fill_bad
 from controller.capture.profile import CameraProfile
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import check_pixels, require_regular
@@ -233,4 +234,4 @@ def _read_jpeg(path: Path, response: Float64) -> Photograph:
     decoded = read_jpeg_values(path)
     table = np.asarray(response, np.float32)
     image = np.stack([table[channel][decoded[:, :, channel]] for channel in range(3)], axis=2)
-    return Photograph(image, np.any(decoded >= JPEG_SATURATED, axis=2), None)
+    return Photograph(image, channels.some(decoded >= JPEG_SATURATED), None)

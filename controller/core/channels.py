@@ -30,6 +30,21 @@ def mean(picture: Picture) -> Picture:
     return np.asarray(_over(np.add, picture) / picture.dtype.type(picture.shape[-1]))
 
 
+def total(picture: Picture) -> Picture:
+    """The sum of each pixel's channels, as ``sum(axis=-1)``, of an image of floats."""
+    return _over(np.add, picture)
+
+
+def length(vectors: Picture) -> Picture:
+    """The Euclidean length of each pixel's channels, as ``np.linalg.norm(axis=-1)`` of real numbers."""
+    return np.asarray(np.sqrt(_over(np.add, vectors * vectors)))
+
+
+def some(mask: npt.NDArray[np.bool_]) -> Mask:
+    """Where one of a pixel's channels is true, as ``any(axis=-1)``."""
+    return np.asarray(_over(np.logical_or, mask), np.bool_)
+
+
 def every(mask: npt.NDArray[np.bool_]) -> Mask:
     """Where all of a pixel's channels are true, as ``all(axis=-1)``."""
     return np.asarray(_over(np.logical_and, mask), np.bool_)

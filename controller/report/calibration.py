@@ -29,6 +29,7 @@ from controller.artefacts.pattern_plans import patterns_figures, photographs_sen
 from controller.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.bundle.export import png
 from controller.calibrate.values import Calibration
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
@@ -219,9 +220,9 @@ def _percent(row: Mapping[str, Any] | None) -> float | None:
 def _maps(run: Path, calibration: Calibration, crop: Crop, fine: ByteImage) -> tuple[ReportPicture, ...]:
     errors = read_error_maps(run)
     mask = calibration.object_mask
-    lit = sum((np.asarray(part.white.mean(axis=2) > 0.02 * np.nanmax(part.white)) for part in calibration.projectors),
+    lit = sum((np.asarray(channels.mean(part.white) > 0.02 * np.nanmax(part.white)) for part in calibration.projectors),
               start=np.zeros(mask.shape, int))  # fmt: skip
-    light = sum((part.white.mean(axis=2) for part in calibration.projectors), start=np.zeros(mask.shape))
+    light = sum((channels.mean(part.white) for part in calibration.projectors), start=np.zeros(mask.shape))
     usual = float(np.median(light[mask])) if mask.any() else 1.0
     found = [ReportPicture("Resolution", fine, "the finest metapixel nearby", large=True)]
     found.append(

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from controller.calibrate.values import Calibration
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.report import plots
 from controller.report.page import ReportPicture
@@ -42,7 +43,7 @@ def light_gallery(calibration: Calibration, crop: Crop) -> tuple[Gallery, ...]:
         cut = np.ascontiguousarray(light[crop.rows, crop.columns])
         return to_screen(cut, calibration.camera_to_xyz, white=max(usual, 1e-12))
 
-    seen, thrown = whole.sum(axis=2), indirect.sum(axis=2)
+    seen, thrown = channels.total(whole), channels.total(indirect)
     known = mask & (seen > FAINT * float(np.median(seen[mask]) if mask.any() else 0))
     share = np.where(known, 100 * thrown / np.maximum(seen, 1e-12), np.nan).astype(np.float32)
     middle, high = (float(np.nanpercentile(share, q)) for q in (50, 95)) if known.any() else (0.0, 0.0)

@@ -14,6 +14,7 @@ from typing import Final
 import cv2
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import masked_blur
 from controller.core.channels import finite
@@ -91,11 +92,11 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     middle = np.median(inside, axis=0)
     spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
     limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
-    strange = measured & (np.abs(error - middle) > limit).any(axis=2)
+    strange = measured & channels.some(np.abs(error - middle) > limit)
     both = measured & finite(photograph.first) & finite(photograph.last)
     moved = masked_blur(np.abs(masked_blur(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
     noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
-    strange |= both & (moved > CHANGED * scale + noise).any(axis=2)
+    strange |= both & channels.some(moved > CHANGED * scale + noise)
     core = cv2.morphologyEx(strange.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OUTLIER_PX, OUTLIER_PX), np.uint8))
     side = 2 * MARGIN_PX + 1
     around = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0

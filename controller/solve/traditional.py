@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 
 from controller.calibrate.values import Calibration
+from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.checks import check_image
 from controller.core.errors import UsageError
@@ -36,7 +37,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
     frames = [np.zeros((*p.metapixels.valid.shape, 3), np.float32) for p in calibration.projectors]
     projector = calibration.projectors[n]
     metapixels = projector.metapixels
-    usable = metapixels.valid & np.isfinite(metapixels.centre_px).all(axis=-1)
+    usable = metapixels.valid & channels.finite(metapixels.centre_px)
     centre = metapixels.centre_px[usable].astype(np.float64)
     wanted = np.maximum(target - calibration.black, 0)
     light = _sampled(wanted, centre)

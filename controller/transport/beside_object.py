@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.values import Calibration, PhaseMap
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 
 BORDER_PX: Final = 2
@@ -50,7 +51,7 @@ def beside_object(calibration: Calibration) -> OffObject | None:
     for n, part in enumerate(calibration.projectors):
         found = np.zeros(part.metapixels.valid.shape, np.bool_)
         if part.phase_map is not None:
-            brightest = part.white.max(axis=2)
+            brightest = channels.largest(part.white)
             seen, cells = _cells(brightest, part.phase_map, found.shape)
             on, off = (_light(brightest, seen & where, cells, found.shape) for where in (inside, outside))
             if off.sum() > LEAST_ROOM * on.sum():
@@ -71,7 +72,7 @@ def _beside(on: FloatImage, off: FloatImage) -> Mask:
 def _cells(brightest: FloatImage, phase_map: PhaseMap, shape: tuple[int, ...]) -> tuple[Mask, npt.NDArray[np.int32]]:
     """Camera pixels (rows, columns) that a projector lights, and the number of the projector pixel that does."""
     rows, columns = shape
-    known: Mask = np.asarray(np.isfinite(phase_map.projector_px).all(axis=2))
+    known: Mask = np.asarray(channels.finite(phase_map.projector_px))
     places = np.where(known[..., None], phase_map.projector_px, -1)
     x, y = np.moveaxis(np.rint(np.clip(places, -1, max(rows, columns))).astype(np.int32), 2, 0)
     within = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)

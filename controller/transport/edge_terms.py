@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.calibrate.metapixels.depth_edges import EdgeShares
+from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.transport.camera_box import CameraBox
 from controller.transport.operator import LightTransport
@@ -194,13 +195,13 @@ def _modelled(
 ) -> npt.NDArray[np.float32]:
     """The model's share for each measurement: its own pictures of the dots, divided by white."""
     found = np.zeros(camera.size, np.float32)
-    full = white.sum(axis=2).ravel()
+    full = channels.total(white).ravel()
     shown_in = pattern.ravel()[projector]
     for number in range(int(pattern.max(initial=-1)) + 1):
         mine = shown_in == number
         if mine.any():
             lit = np.repeat((pattern == number).astype(np.float32)[..., None], 3, axis=2)
-            light = transport.forward_part(n, lit).sum(axis=2).ravel()
+            light = channels.total(transport.forward_part(n, lit)).ravel()
             found[mine] = light[camera[mine]] / full[camera[mine]]
     return found
 

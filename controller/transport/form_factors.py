@@ -12,6 +12,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 from controller.transport.indirect import down
@@ -36,7 +37,7 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
     from scipy.ndimage import distance_transform_edt
 
     count, fine = grid[0] * grid[1], max(1, round(side / ACROSS))
-    known: Mask = np.asarray((np.isfinite(points_m) & np.isfinite(normals)).all(axis=2))
+    known: Mask = np.asarray(channels.every(np.isfinite(points_m) & np.isfinite(normals)))
     patches = (-(-known.shape[0] // fine), -(-known.shape[1] // fine))
     share = down(known[..., None].astype(np.float32), patches, fine)[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -76,7 +77,7 @@ def _areas(point: Float64, good: Mask, grid: tuple[int, int], normal: Float64) -
     # how far apart the rays of adjacent patches are, from all pairs of them
     rays = np.full((*grid, 3), np.nan)
     rays[good.reshape(grid)] = ray
-    steps = [np.linalg.norm(np.diff(rays, axis=axis), axis=2) for axis in (0, 1)]
+    steps = [channels.length(np.diff(rays, axis=axis)) for axis in (0, 1)]
     across = [float(np.nanmedian(step)) if np.isfinite(step).any() else 0.0 for step in steps]
     slant = np.maximum(np.abs(np.sum(ray * normal, axis=1)), STEEPEST)
     return np.asarray(across[0] * across[1] * depth**2 / slant, np.float64)

@@ -14,6 +14,7 @@ from typing import Final, Self
 import numpy as np
 
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 
 ROWS_AT_ONCE: Final = 128
@@ -51,7 +52,7 @@ class ColourPlaces:
         for first in range(0, len(self.white), ROWS_AT_ONCE):
             rows = slice(first, first + ROWS_AT_ONCE)
             light = np.asarray(self.white[rows] @ self.mixing, np.float32)
-            whole = light.sum(axis=2)
+            whole = channels.total(light)
             known = np.isfinite(whole) & (whole > 0)
             with np.errstate(invalid="ignore", divide="ignore"):
                 light /= whole[..., None]

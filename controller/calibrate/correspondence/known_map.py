@@ -17,6 +17,7 @@ from controller.calibrate.correspondence.captures import Captures, coloured, lit
 from controller.calibrate.values import Radiometry
 from controller.capture.pattern_frames import tile_levels
 from controller.capture.patterns import CELL_PX, TILE_MARGIN, PatternKind, PatternPlan
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.channels import finite
 
@@ -76,7 +77,7 @@ def check_map(
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):
         side = pattern.tile_cells * CELL_PX
         at = np.nan_to_num(known_px) + np.float32(0.5)
-        within = np.abs(at % side - np.float32(side / 2)).max(axis=2)
+        within = channels.largest(np.abs(at % side - np.float32(side / 2)))
         use = lit & known & (within < (0.5 - TILE_MARGIN) * side)
         levels = tile_levels(pattern, plan.size_px)
         row, column = (
@@ -87,7 +88,7 @@ def check_map(
         if share is not None:
             expected = expected + share * (cells.reshape(-1, 3).mean(axis=0) - expected)
         with np.errstate(invalid="ignore", divide="ignore"):
-            off = np.abs((coloured(captures, pattern.name, lit.shape) - black) / white - expected).max(axis=2)
+            off = channels.largest(np.abs((coloured(captures, pattern.name, lit.shape) - black) / white - expected))
         use &= np.isfinite(off)
         agreeing += use & (off < WORST_OFF)
         asked += use

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.inverse_map import InverseMap
 from controller.calibrate.correspondence.smoothing import correct_for_paint, fit_curved
 from controller.calibrate.values import Correspondence, PhaseMap
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 INTERPOLATION_PX2: Final = np.array([1 / 2, 1 / 4, 1 / 2])
@@ -67,7 +68,7 @@ def _slopes(inverse: InverseMap) -> tuple[Float64, Mask]:
     a, b, c, d = np.moveaxis(inverse.jacobian.astype(np.float64), -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = np.stack([d, -b, -c, a], axis=-1) / (a * d - b * c)[..., None]
-    known: Mask = inverse.valid & np.isfinite(slope).all(axis=-1)
+    known: Mask = inverse.valid & channels.finite(slope)
     return np.where(known[..., None], slope, 0), known
 
 

@@ -6,6 +6,7 @@ import cv2
 import numba
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 
@@ -64,7 +65,7 @@ def fit_curved(position_px: FloatImage, valid: Mask, otherwise_px: FloatImage) -
     filled = np.where(valid[..., None], position_px, np.float32(0))
     fitted = cv2.filter2D(filled, -1, kernel)
     # in place: a large camera's picture leaves little memory for copies
-    off = np.abs(np.subtract(fitted, filled, out=filled), out=filled).max(axis=2)
+    off = channels.largest(np.abs(np.subtract(fitted, filled, out=filled), out=filled))
     del filled
     off[~valid] = np.inf
     around = np.ones((side, side), np.uint8)

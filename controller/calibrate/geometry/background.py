@@ -7,6 +7,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 
 Floats: TypeAlias = npt.NDArray[np.float64]
@@ -40,7 +41,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
     """
     from scipy.ndimage import distance_transform_edt, median_filter
 
-    known = np.asarray(np.isfinite(points_m).all(axis=2), dtype=np.bool_)
+    known = np.asarray(channels.finite(points_m), dtype=np.bool_)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:

@@ -23,6 +23,7 @@ from controller.calibrate.geometry.normal_equations import (
     solve_positive,
     undistort,
 )
+from controller.core import channels
 from controller.core.arrays import Float64, Mask
 
 __all__ = ["CAMERA_PARAMETERS", "PROJECTOR_PARAMETERS", "Adjusted", "AdjustmentProblem", "AdjustmentState", "adjust"]
@@ -147,7 +148,7 @@ def stepped(state: AdjustmentState, parameters: Float64, inverse_depth: Float64)
 
 def cost_of(problem: AdjustmentProblem, state: AdjustmentState) -> float:
     """Half of: Cauchy loss in noise units, priors, and the gauge that holds the rms baseline at 1."""
-    squared = np.sum(residuals(problem, state) ** 2, axis=2) / problem.noise_px**2
+    squared = channels.total(residuals(problem, state) ** 2) / problem.noise_px**2
     data = _CAUCHY**2 * float(np.sum(np.log1p(squared[problem.seen] / _CAUCHY**2)))
     own = _prior_terms(problem, state)
     return 0.5 * (data + float(own @ own))
@@ -231,7 +232,7 @@ def _prior_jacobian(problem: AdjustmentProblem, state: AdjustmentState) -> Float
 
 def _normal_equations(problem: AdjustmentProblem, state: AdjustmentState) -> _Normal:
     linear = linearise(problem, state)
-    squared = np.sum(linear.residual_px**2, axis=2) / (problem.noise_px * _CAUCHY) ** 2
+    squared = channels.total(linear.residual_px**2) / (problem.noise_px * _CAUCHY) ** 2
     weight = problem.seen / (1.0 + squared) / problem.noise_px**2
     parameters, cross, depth, gradient, depth_gradient = accumulate(
         linear.by_camera, linear.by_projector, linear.by_depth, linear.residual_px, weight

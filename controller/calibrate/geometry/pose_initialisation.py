@@ -15,6 +15,7 @@ import numpy.typing as npt
 from controller.calibrate.geometry import bundle_adjustment as ba
 from controller.calibrate.geometry import epipolar
 from controller.calibrate.values import Correspondence
+from controller.core import channels
 from controller.core.arrays import Float64, Mask
 
 _CANDIDATES = 6
@@ -41,7 +42,7 @@ def sample_pixels(correspondences: Sequence[Correspondence], most: int) -> tuple
 
     Returns ``camera_px`` (points, 2), ``projector_px`` (points, N, 2), ``seen`` (points, N).
     """
-    valid = np.stack([c.valid & np.isfinite(c.projector_px).all(axis=2) for c in correspondences])
+    valid = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
     shared = valid.sum(axis=0) >= 2
     chosen = np.zeros(shared.shape, dtype=np.bool_)
     for own in valid:

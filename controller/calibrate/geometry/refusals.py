@@ -10,6 +10,7 @@ import numpy as np
 from controller.calibrate.geometry import bundle_adjustment as ba
 from controller.calibrate.geometry import pose_initialisation as hypotheses
 from controller.calibrate.values import Correspondence
+from controller.core import channels
 from controller.core.errors import CalibrationError
 
 JUMP_PX = 2.0
@@ -50,7 +51,7 @@ def broken_share(own: Correspondence) -> float:
         ahead, behind = [slice(None)] * 2, [slice(None)] * 2
         ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
         one, other = tuple(behind), tuple(ahead)
-        step = np.linalg.norm(own.projector_px[other] - own.projector_px[one], axis=2)
+        step = channels.length(own.projector_px[other] - own.projector_px[one])
         both = valid[one] & valid[other]
         usual = float(np.median(step[both])) if both.any() else 0.0
         beside[one] |= valid[one] & (~valid[other] | (np.nan_to_num(step) > usual + JUMP_PX))

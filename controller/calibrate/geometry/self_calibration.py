@@ -16,6 +16,7 @@ from controller.calibrate.geometry.refusals import broken_share, inconsistent, n
 from controller.calibrate.geometry.surface_points import object_points
 from controller.calibrate.geometry.values import CameraPrior, Reconstruction, parameter_names
 from controller.calibrate.values import Correspondence
+from controller.core import channels
 from controller.core.arrays import Float64
 from controller.core.errors import CalibrationError, UsageError, WorkError
 
@@ -241,10 +242,10 @@ def _refine(
     state = replace(state, inverse_depth=pose_initialisation.triangulated(problem, state))
     for _ in range(2):
         adjusted = ba.adjust(problem, state, tick=tick)
-        distance = np.linalg.norm(ba.residuals(problem, adjusted.state), axis=2)
+        distance = channels.length(ba.residuals(problem, adjusted.state))
         noise = _noise_px(problem, distance)
         seen = problem.seen & (distance < 5.0 * noise)
-        kept = seen.any(axis=1)
+        kept = np.asarray(seen.any(axis=1), np.bool_)
         state = replace(adjusted.state, inverse_depth=adjusted.state.inverse_depth[kept])
         problem = pose_initialisation.restricted(
             replace(problem, seen=seen, noise_px=noise), kept, range(seen.shape[1])

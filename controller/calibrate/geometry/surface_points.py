@@ -14,6 +14,7 @@ from controller.calibrate.geometry.surface_fit import fit_patches, whole_pixels
 from controller.calibrate.geometry.triangulation import fit_planes, inverse_depth_map
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.values import Correspondence, Geometry, Pinhole
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 
@@ -53,7 +54,7 @@ def object_points(
     Raises CalibrationError as ``scale.metres_per_unit``, and "geometry-uncertain".
     """
     rays = _ray_map(state.camera, camera_size)
-    seen = np.stack([c.valid & np.isfinite(c.projector_px).all(axis=2) for c in correspondences])
+    seen = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
     observed = np.stack([c.projector_px for c in correspondences])
     intrinsics = np.concatenate([np.exp(state.intrinsics[:, :1]), state.intrinsics[:, 1:]], axis=1)
     noise_px = max(noise_px, LEAST_NOISE_PX)
@@ -84,7 +85,7 @@ def object_points(
         reprojection_rms_px=float(np.sqrt(np.mean(residual[known].astype(np.float64) ** 2))),
         scale_known=prior.distance_m is not None or bool(prior.distances),
     )
-    sigma_m = (relative * np.linalg.norm(points, axis=2) * unit_m).astype(np.float32)
+    sigma_m = (relative * channels.length(points) * unit_m).astype(np.float32)
     return ObjectPoints(geometry, unit_m, unit_rel_sigma, sigma_m)
 
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.inverse_map import cells_of
 from controller.calibrate.metapixels.regularize import typical_spacing_px
 from controller.calibrate.values import Correspondence, Metapixels
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
 
@@ -50,7 +51,7 @@ def edge_pixels(metapixels: Metapixels, correspondence: Correspondence) -> Mask:
     limit = JUMP * typical_spacing_px(centre)
     torn = ~metapixels.valid
     for axis in (0, 1):
-        jump = np.linalg.norm(np.diff(centre, axis=axis), axis=2) > limit
+        jump = channels.length(np.diff(centre, axis=axis)) > limit
         first, second = np.delete(torn, -1, axis) | jump, np.delete(torn, 0, axis) | jump
         torn = np.insert(first, rows - 1 if axis == 0 else columns - 1, torn.take(-1, axis), axis)
         torn |= np.insert(second, 0, torn.take(0, axis), axis)
@@ -123,12 +124,12 @@ def measure_shares(
     camera and projector pixel and share of each measurement, as in ``EdgeShares``
     """
     near = _nearest_lit(lit, reach_px)
-    full = white.sum(axis=2)
+    full = channels.total(white)
     bright = full[full > 0]
     faintest = FAINTEST * float(np.percentile(bright, 99)) if bright.size else np.inf
     owner = _owners(position_px, near)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = (image - black).sum(axis=2) / full
+        share = channels.total(image - black) / full
         known = (owner >= 0) & (full > faintest) & np.isfinite(share)
     camera = np.flatnonzero(known).astype(np.int32)
     return camera, owner[known].astype(np.int32), share[known].astype(np.float32)

@@ -18,6 +18,7 @@ from controller.calibrate.metapixels.blur import measure_blur
 from controller.calibrate.metapixels.footprints import measure_footprints
 from controller.calibrate.values import Correspondence, Metapixels, PhaseMap
 from controller.capture.patterns import PatternPlan
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 
 
@@ -88,7 +89,7 @@ def _channels(image: FloatImage) -> tuple[float, float, float]:
     """Mean light of the three channels; alike for a grey image or none at all."""
     if image.ndim != 3:
         return 1.0, 1.0, 1.0
-    finite = np.isfinite(image).all(axis=2)
+    finite = channels.finite(image)
     if not finite.any():
         return 1.0, 1.0, 1.0
     red, green, blue = (max(float(np.mean(image[..., c][finite])), 0.0) for c in range(3))

@@ -9,6 +9,7 @@ import numpy as np
 from controller.calibrate.correspondence.inverse_map import invert_map
 from controller.calibrate.metapixels.from_phase import carry_covariance
 from controller.calibrate.values import Correspondence, Geometry, Metapixels, Pinhole
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 PIXEL_SIGMA_PX: Final = 0.4
@@ -59,9 +60,9 @@ def modelled_correspondence(geometry: Geometry, n: int) -> Correspondence:
     px, depth = project(projector, points)
     ray = points - (-projector.rotation.T @ projector.translation_m)
     with np.errstate(invalid="ignore", divide="ignore"):
-        facing = -np.sum(geometry.normals * ray, axis=2) / np.linalg.norm(ray, axis=2) > GRAZING
+        facing = -channels.total(geometry.normals * ray) / channels.length(ray) > GRAZING
         width, height = projector.size_px
-        inside = (px > -0.5).all(axis=2) & (px[..., 0] < width - 0.5) & (px[..., 1] < height - 0.5) & (depth > 0)
+        inside = channels.every(px > -0.5) & (px[..., 0] < width - 0.5) & (px[..., 1] < height - 0.5) & (depth > 0)
     valid = inside & facing
     valid &= ~_in_shadow(px, depth, valid, projector.size_px)
     position: FloatImage = np.where(valid[..., None], px, np.nan).astype(np.float32)

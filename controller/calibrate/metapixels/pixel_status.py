@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from controller.calibrate.metapixels.regularize import fill_holes
 from controller.calibrate.values import Metapixels
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 STEEPEST: Final = 4.0
@@ -44,7 +45,7 @@ def pixel_status(metapixels: Metapixels, white: FloatImage) -> npt.NDArray[np.ui
     found[~valid & _between(valid)] = PixelStatus.SHADOW
     found[valid] = PixelStatus.GOOD
     found[valid & (_slant(metapixels) > STEEPEST)] = PixelStatus.GRAZING
-    unknown: Mask = np.asarray(~np.isfinite(white).all(axis=2))
+    unknown: Mask = np.asarray(~channels.finite(white))
     found[_on(fill_holes(metapixels), unknown)] = PixelStatus.SATURATED
     return found
 
@@ -86,7 +87,7 @@ def _on(metapixels: Metapixels, marked: Mask) -> Mask:
     """Pixels whose metapixel has marked camera pixels within a standard deviation of its centre."""
     rows, columns = marked.shape
     hit = np.zeros(metapixels.valid.shape, np.bool_)
-    at = np.argwhere(metapixels.valid & np.isfinite(metapixels.centre_px).all(axis=2))
+    at = np.argwhere(metapixels.valid & channels.finite(metapixels.centre_px))
     if not at.size or not marked.any():
         return hit
     centre = metapixels.centre_px[at[:, 0], at[:, 1]]

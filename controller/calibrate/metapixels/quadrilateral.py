@@ -14,6 +14,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.calibrate.values import Metapixels
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 from controller.core.jit import compiled
 
@@ -46,7 +47,7 @@ def quadrilateral_corners(metapixels: Metapixels) -> FloatImage:
     with np.errstate(invalid="ignore", divide="ignore"):
         corner = np.where(count == 4, plain, total) / count
     quads = np.stack([corner[i : i + rows, j : j + columns] for i, j in _AROUND], axis=2)
-    quads[~valid | ~np.isfinite(slopes[0] + slopes[1]).all(axis=2)] = np.nan
+    quads[~valid | ~channels.finite(slopes[0] + slopes[1])] = np.nan
     return quads.astype(np.float32)
 
 

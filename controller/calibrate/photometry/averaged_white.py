@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from controller.calibrate.correspondence.captures import lit_pixels
+from controller.core import channels
 from controller.core.arrays import FloatImage
 
 AROUND: Final = (15, 15)
@@ -50,7 +51,7 @@ class WhiteSums:
             return white
         mean = self._total / np.float32(self._count)
         variance = np.maximum(self._squares - self._total * mean, 0) / np.float32(self._count * (self._count - 1))
-        lit = np.flatnonzero((lit_pixels(white) & np.isfinite(mean).all(axis=2)).ravel())
+        lit = np.flatnonzero((lit_pixels(white) & channels.finite(mean)).ravel())
         if lit.size < FEWEST_PIXELS:
             return white
         some = lit[:: max(1, lit.size // SOME_PIXELS)]
@@ -59,7 +60,9 @@ class WhiteSums:
             ratio = white.reshape(-1, 3)[some] / mean.reshape(-1, 3)[some]
         mean *= np.median(ratio, axis=0).astype(np.float32)
         apart = white - mean
-        own, other = (cv2.boxFilter(np.nan_to_num(one).sum(axis=2), -1, AROUND) for one in (variance, apart * apart))
+        own, other = (
+            cv2.boxFilter(channels.total(np.nan_to_num(one)), -1, AROUND) for one in (variance, apart * apart)
+        )
         share = np.divide(own, other, out=np.ones_like(own), where=other > own)[..., None]
         averaged = mean + share * apart
         return np.where(np.isfinite(averaged), np.maximum(averaged, 0), white).astype(np.float32)

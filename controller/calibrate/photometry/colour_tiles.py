@@ -16,6 +16,7 @@ from controller.calibrate.values import Radiometry
 from controller.capture.pattern_frames import tile_levels
 from controller.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame
 from controller.capture.profile import CameraNoise
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 FEWEST_PIXELS = 4
@@ -144,8 +145,8 @@ def tile_code(
     noise: CameraNoise | None = None,
 ) -> tuple[Cells, Cells]:
     """The cells by which tiles are found, for several measurements. Parameters and errors as for ``measure_tiles``."""
-    half = np.asarray(white.sum(axis=2) / 2, np.float32)
-    return read_code(captures, plan, black.sum(axis=2) + half, half, known_px, noise or CameraNoise())
+    half = np.asarray(channels.total(white) / 2, np.float32)
+    return read_code(captures, plan, channels.total(black) + half, half, known_px, noise or CameraNoise())
 
 
 def _levels_of(cells: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.int64]:

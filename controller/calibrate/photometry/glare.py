@@ -15,6 +15,7 @@ import numpy as np
 
 from controller.calibrate.photometry.reflectance import own_reflectance, subset, subset_of
 from controller.calibrate.values import Calibration, Geometry
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 BLOCK_PX: Final = 24
@@ -56,7 +57,7 @@ def veiling_glare(calibration: Calibration, geometry: Geometry | None) -> float:
     shape = subset_of(geometry, thin)
     paint, indirect = own_reflectance(few, shape), np.sum(thrown, axis=0)
     veil = spread_by_lens(np.asarray(indirect + np.sum([part.white for part in few.projectors], axis=0), np.float32))
-    known: Mask = np.asarray(few.object_mask & np.isfinite(paint).all(axis=2))
+    known: Mask = np.asarray(few.object_mask & channels.finite(paint))
     shares = _shares(indirect, paint, veil, known)
     if shares.size < FEWEST:
         return 0.0

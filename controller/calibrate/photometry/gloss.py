@@ -12,6 +12,7 @@ import numpy as np
 
 from controller.calibrate.photometry.reflectance import falling_light, subset, subset_of
 from controller.calibrate.values import Calibration, Geometry
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 SHARPNESS: Final = 25.0
@@ -45,7 +46,7 @@ def gloss_strength(calibration: Calibration, geometry: Geometry | None) -> float
     seen = whites[:, use].astype(np.float64) / falling[:, use, None]
     # a median: most pixels mirror no projector
     seen /= np.median(seen / seen[:1], axis=1, keepdims=True)
-    seen = (seen / np.percentile(seen.mean(axis=0), 99, axis=0)).mean(axis=2)
+    seen = channels.mean(seen / np.percentile(seen.mean(axis=0), 99, axis=0))
     found = [_along(_against(lobes, n), _against(seen, n)) for n in range(len(parts))]
     strength, correlation = np.median(found, axis=0)
     if correlation < LEAST_CORRELATION:

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 
 BLOCK_PX: Final = 14
@@ -126,11 +127,11 @@ Place = tuple[slice, slice]
 
 def _brightness(white: FloatImage) -> FloatImage:
     """(rows, columns) of the brightest channel, relative to the brightest pixels; NaN where not known."""
-    known = np.isfinite(white).all(axis=2)
+    known = channels.finite(white)
     if not known.any():
         return np.full(known.shape, np.nan, np.float32)
     full = np.percentile(white[known], 99, axis=0)
-    return np.where(known, (white / np.maximum(full, 1e-30)).max(axis=2), np.nan).astype(np.float32)
+    return np.where(known, channels.largest(white / np.maximum(full, 1e-30)), np.nan).astype(np.float32)
 
 
 def _on_one_surface(depth_m: FloatImage) -> Iterator[Place]:
@@ -174,7 +175,7 @@ def _sums(
     seen = of_all = 0.0
     for part in parts:
         dark, light = part.dark[here], part.light[here]
-        known = (dark | ~lit) & np.isfinite(light).all(axis=2)
+        known = (dark | ~lit) & channels.finite(light)
         if known.mean() < WHOLE or dark.mean() < LEAST_DARK:
             continue
         veil = float(part.veil[here][dark].mean())

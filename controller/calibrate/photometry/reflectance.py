@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from controller.calibrate.values import Calibration, Geometry
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 
 BRIGHT: Final = 0.3
@@ -34,7 +35,7 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
         shapes = np.stack([np.where(on, shape, 0) for on, shape in zip(lit, falling_light(geometry), strict=True)])
         light = np.where(shapes[..., None] > 0, whites, 0).sum(axis=0)
         falling = np.einsum("nyx,nc->yxc", shapes, _strengths(whites, shapes)).astype(np.float32)
-    known = mask & (falling.min(axis=2) > FAINTEST * float(np.median(falling[mask]) if mask.any() else 1.0))
+    known = mask & (channels.smallest(falling) > FAINTEST * float(np.median(falling[mask]) if mask.any() else 1.0))
     if not known.any():
         return np.full(calibration.black.shape, np.nan, np.float32)
     found = np.divide(light, falling, out=np.full(light.shape, np.nan, np.float32), where=known[..., None])
@@ -46,9 +47,9 @@ def falling_light(geometry: Geometry) -> list[FloatImage]:
     shapes = []
     for projector in geometry.projectors:
         towards = -projector.rotation.T @ projector.translation_m - geometry.points_m
-        distance = np.linalg.norm(towards, axis=2)
+        distance = channels.length(towards)
         with np.errstate(invalid="ignore", divide="ignore"):
-            cosine = (towards * geometry.normals).sum(axis=2) / distance
+            cosine = channels.total(towards * geometry.normals) / distance
             shapes.append(np.nan_to_num(np.maximum(cosine, 0) / distance**2, posinf=0.0).astype(np.float32))
     return shapes
 
@@ -69,7 +70,7 @@ def _strengths(whites: FloatImage, shapes: FloatImage) -> FloatImage:
     strengths = np.ones((len(whites), 3), np.float32)
     bright = [shape > BRIGHT * shape.max(initial=0) for shape in shapes]
     for n in range(1, len(whites)):
-        both = bright[0] & bright[n] & (whites[0].min(axis=2) > 0)
+        both = bright[0] & bright[n] & (channels.smallest(whites[0]) > 0)
         if both.any():
             ratio = whites[n][both] / whites[0][both] * (shapes[0][both] / shapes[n][both])[:, None]
             strengths[n] = np.median(ratio, axis=0)

@@ -22,6 +22,7 @@ from controller.calibrate.photometry.averaged_white import WhiteSums
 from controller.calibrate.values import Radiometry
 from controller.capture.patterns import PHASE_STEPS, Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import gaussian_blur
 from controller.core.channels import every, finite
@@ -119,15 +120,15 @@ def indirect_share(
         f = _fine_contrast(seen, float(full.mean()))
         share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
     sigma = np.hypot(seen.coarse.sigma, FLOOR).astype(np.float32)
-    known = np.isfinite(share).all(axis=2) & (sigma.max(axis=2) < WORST_SIGMA)
-    known &= (white > FAINTEST * _bright(white)).all(axis=2)
+    known = channels.finite(share) & (channels.largest(sigma) < WORST_SIGMA)
+    known &= channels.every(white > FAINTEST * _bright(white))
     smooth = _smoothed(np.where(known[..., None], share, 0).astype(np.float32), sigma, known, position_px)
     return np.clip(_filled(smooth, known), 0, 1).astype(np.float32)
 
 
 def _fine_contrast(seen: SinusoidContrast, full: float) -> FloatImage:
     """(rows, columns, 1) over the channels, 1 where it is not known; from around where the pixel is out of focus."""
-    own, around = seen.fine.contrast.mean(axis=2) / np.float32(full), seen.fine_around / np.float32(full)
+    own, around = channels.mean(seen.fine.contrast) / np.float32(full), seen.fine_around / np.float32(full)
     sharp = np.clip((own - OUT_OF_FOCUS[0]) / (OUT_OF_FOCUS[1] - OUT_OF_FOCUS[0]), 0, 1)
     mean = (sharp * own + (1 - sharp) * np.minimum(around, OUT_OF_FOCUS[1]))[..., None]
     return np.asarray(np.where(np.isfinite(mean), np.clip(mean, LEAST_FINE_CONTRAST, 1), 1), np.float32)
@@ -157,10 +158,10 @@ def indirect_figures(share: FloatImage, white: FloatImage) -> tuple[float, float
     """Median and 95th percentile of the share over the camera pixels that the projector lights directly."""
     light = np.nan_to_num(white)
     direct = light * (1 - share)
-    lit = direct.min(axis=2) > LEAST_LIT_SHARE * float(np.percentile(direct, 99.9))
+    lit = channels.smallest(direct) > LEAST_LIT_SHARE * float(np.percentile(direct, 99.9))
     if not lit.any():
         return 0.0, 0.0
-    values = (share * light).sum(axis=2)[lit] / light.sum(axis=2)[lit]
+    values = channels.total(share * light)[lit] / channels.total(light)[lit]
     return float(np.median(values)), float(np.percentile(values, 95))
 
 
@@ -215,7 +216,7 @@ def _contrast_around(powers: Sequence[FloatImage], white: FloatImage) -> FloatIm
 
 def _light_around(image: FloatImage) -> FloatImage:
     """(rows, columns): of all channels, mean of each pixel's neighbourhood."""
-    return np.asarray(cv2.boxFilter(np.nan_to_num(image).sum(axis=2), -1, AROUND), np.float32)
+    return np.asarray(cv2.boxFilter(channels.total(np.nan_to_num(image)), -1, AROUND), np.float32)
 
 
 def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[FloatImage, FloatImage]:

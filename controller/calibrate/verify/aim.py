@@ -13,6 +13,7 @@ from typing import Final
 import cv2
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage, Mask
 
 SQUARE_PX: Final = 3
@@ -132,7 +133,7 @@ def levels(picture: FloatImage, aim: Aim) -> tuple[tuple[float, ...], float]:
 
 def _grey(image: FloatImage) -> FloatImage:
     # What was saturated is bright enough for anything that is asked here.
-    return np.asarray(np.nan_to_num(image, nan=1.0).mean(axis=2), np.float32)
+    return np.asarray(channels.mean(np.nan_to_num(image, nan=1.0)), np.float32)
 
 
 def _smooth(image: FloatImage) -> FloatImage:

@@ -20,6 +20,7 @@ import numpy as np
 from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.calibrate.verify.registration import Motion, no_motion, register, warp
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import finite, smallest, total
 
 STILL_PX = 0.1
 """Motion of a projector's picture, in its pixels, or of the camera's that still counts as none: the model's own
@@ -203,7 +204,7 @@ def _projector(
     light: TransportModel, n: int, part: ProjectorCalibration, frame: FloatImage, seen: FloatImage
 ) -> ProjectorDrift:
     """Register one projector's picture in its own pixels."""
-    use = light.lit[n] & np.isfinite(seen).all(axis=2)
+    use = light.lit[n] & finite(seen)
     white = np.where(use[:, :, None], part.white, 0).astype(np.float32)
     strength = light.gaussian_mean(white * white, n)
     faint = 1e-3 * float(np.percentile(strength, 99)) + 1e-30
@@ -219,7 +220,7 @@ def _projector(
         alone[:, :, k] = frame[:, :, k]
         channels.append(on_projector(light.forward_part(n, alone)))
     picture, reference = on_projector(seen), np.asarray(np.sum(channels, axis=0), np.float32)
-    level = strength.min(axis=2)
+    level: FloatImage = smallest(strength)
     weight = np.clip(level / max(float(np.median(level[level > faint])) if np.any(level > faint) else 1.0, faint), 0, 1)
     weight = np.where(level > faint, weight, 0).astype(np.float32)
     share = float((weight[:, :, None] * picture).sum() / max(float((weight[:, :, None] * reference).sum()), 1e-30))
@@ -241,7 +242,7 @@ def _gains(channels: Sequence[FloatImage], seen: FloatImage, weight: FloatImage)
     ``channels``: what each looks like alone; an outer frame of NaN is left out.
     """
     rows, columns = weight.shape
-    known = (weight > 0) & np.isfinite(np.stack(channels)).all(axis=(0, 3)) & np.isfinite(seen).all(axis=2)
+    known = (weight > 0) & np.isfinite(np.stack(channels)).all(axis=(0, 3)) & finite(seen)
     y, x = np.nonzero(known)
     a = np.stack([channel[known] for channel in channels]).astype(np.float64)
     b, w = seen[known].astype(np.float64), weight[known].astype(np.float64)
@@ -260,7 +261,7 @@ def _gains(channels: Sequence[FloatImage], seen: FloatImage, weight: FloatImage)
 
 def _local_px(fitted: FloatImage, seen: FloatImage, weight: FloatImage) -> float:
     """The rms, over parts of the picture, of the shift that they still ask for (Lucas and Kanade 1981)."""
-    known = (weight > 0) & np.isfinite(fitted).all(axis=2) & np.isfinite(seen).all(axis=2)
+    known = (weight > 0) & finite(fitted) & finite(seen)
     known &= cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
     if not known.any():
         return math.nan
@@ -272,7 +273,7 @@ def _local_px(fitted: FloatImage, seen: FloatImage, weight: FloatImage) -> float
     size = (max(16, weight.shape[1] // 8), max(16, weight.shape[0] // 8))
 
     def around(image: FloatImage) -> FloatImage:
-        return np.asarray(cv2.boxFilter((w * image).sum(axis=2), -1, size), np.float32)
+        return np.asarray(cv2.boxFilter(total(w * image), -1, size), np.float32)
 
     xx, xy, yy, ex, ey = (around(image) for image in (dx * dx, dx * dy, dy * dy, dx * error, dy * error))
     det = xx * yy - xy * xy
@@ -291,7 +292,7 @@ def _camera(calibration: Calibration, found: Sequence[ProjectorDrift], seen: Dri
     rows, columns = expected.shape[:2]
     factor = max(1, math.ceil(math.sqrt(rows * columns / CAMERA_PIXELS)))
     near = cv2.dilate(calibration.object_mask.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
-    known = near & np.isfinite(seen.white).all(axis=2)
+    known = near & finite(seen.white)
     pictures = [np.where(known[:, :, None], image, 0).astype(np.float32) for image in (expected, seen.white)]
     whole = _shrunk(known.astype(np.float32), factor) > 0.99
     motion = register(_shrunk(pictures[0], factor), _shrunk(pictures[1], factor), whole.astype(np.float32))
@@ -329,7 +330,7 @@ def _enlarged(motion: Motion, factor: int) -> Motion:
 
 
 def _ambient(calibration: Calibration, seen: DriftPhotographs) -> tuple[float, float]:
-    use = calibration.object_mask & np.isfinite(seen.black).all(axis=2)
+    use = calibration.object_mask & finite(seen.black)
     if not use.any():
         return math.nan, math.nan
     white = sum(float(part.white[use].mean(dtype=np.float64)) for part in calibration.projectors)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from controller.calibrate.values import Calibration
 from controller.calibrate.verify.drift import TransportModel
 from controller.calibrate.verify.error_causes import COLOURS, WORDS, ErrorCause
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.core.lettering import write
 
@@ -72,11 +73,11 @@ def attribute_error(
     predicted = light.forward_part(n, shown)
     if indirect is not None:
         predicted = predicted + indirect
-    measured: Mask = np.asarray(np.isfinite(seen).all(axis=2), np.bool_)
+    measured: Mask = np.asarray(channels.finite(seen), np.bool_)
     light_seen = np.where(measured[:, :, None], seen - calibration.black, predicted).astype(np.float32)
     error = light_seen - predicted
-    squared = np.where(lit & measured, np.sum(error * error, axis=2), 0).astype(np.float32)
-    power = np.sum(light_seen * light_seen, axis=2)
+    squared = np.where(lit & measured, channels.total(error * error), 0).astype(np.float32)
+    power = channels.total(light_seen * light_seen)
     typical = float(power[lit].mean()) if lit.any() else 1.0
     near_error, near_power = _near(squared), _near(np.where(lit, power, 0))
     bad = lit & (near_error > BAD**2 * np.maximum(near_power, 1e-4 * typical))
@@ -94,13 +95,13 @@ def attribute_error(
     moved, dimmed = _explained(light, n, shown, predicted, error, lit & measured)
     label(ErrorCause.DIMMED, dimmed > EXPLAINED, bad)
     if indirect is not None:
-        near_indirect = _near(np.where(lit, np.sum(indirect * indirect, axis=2), 0))
+        near_indirect = _near(np.where(lit, channels.total(indirect * indirect), 0))
         much = near_indirect > INDIRECT_SHARE**2 * near_power
         own = _near(_without_lamp(light_seen, predicted, lit & measured)) > EXPLAINED * near_error
         label(ErrorCause.INDIRECT, much & own & (near_error < near_indirect), bad & (labels != ErrorCause.DARK))
     label(ErrorCause.MOVED, (moved > EXPLAINED) & (moved > dimmed), bad)
     label(ErrorCause.EDGE, _edges(x, y, lit), bad)
-    bright = part.white.min(axis=2) > UNDECODED_SHARE * float(np.percentile(part.white, 99.9))
+    bright = channels.smallest(part.white) > UNDECODED_SHARE * float(np.percentile(part.white, 99.9))
     label(ErrorCause.UNDECODED, bright & ~lit, calibration.object_mask)
     label(ErrorCause.SATURATED, ~measured, lit)
     return ErrorAttribution(labels, squared, lit)
@@ -113,7 +114,7 @@ def _without_lamp(seen: FloatImage, predicted: FloatImage, use: Mask) -> FloatIm
     of_lamp = np.sum(np.where(within, seen * predicted, 0), axis=(0, 1), dtype=np.float64)
     of_lamp /= np.maximum(np.sum(np.where(within, predicted * predicted, 0), axis=(0, 1), dtype=np.float64), 1e-30)
     rest = np.where(within, seen - of_lamp.astype(np.float32) * predicted, 0)
-    squared: FloatImage = np.sum(rest * rest, axis=2)
+    squared: FloatImage = channels.total(rest * rest)
     return squared
 
 
@@ -124,7 +125,7 @@ def _near(image: npt.NDArray[Any]) -> FloatImage:
 def _noise(seen: FloatImage, exposure_s: float) -> FloatImage:
     """(rows, columns): standard deviation of the three channels together, in full scales per second."""
     variance = SHOT * np.nan_to_num(seen) / exposure_s + (READ / exposure_s) ** 2
-    return np.asarray(np.sqrt(variance.sum(axis=2)), np.float32)
+    return np.asarray(np.sqrt(channels.total(variance)), np.float32)
 
 
 def _places(light: TransportModel, n: int, shape: tuple[int, ...]) -> tuple[FloatImage, FloatImage, FloatImage]:
@@ -132,8 +133,8 @@ def _places(light: TransportModel, n: int, shape: tuple[int, ...]) -> tuple[Floa
     rows, columns = shape[:2]
     across, down = (axis / max(rows, columns) for axis in np.meshgrid(np.arange(columns), np.arange(rows)))
     ramps = np.stack([across, down, across**2 + down**2], axis=2).astype(np.float32)
-    sums = [light.forward_part(n, np.repeat(ramps[:, :, k : k + 1], 3, axis=2)).sum(axis=2) for k in range(3)]
-    whole = light.forward_part(n, np.ones((rows, columns, 3), np.float32)).sum(axis=2)
+    sums = [channels.total(light.forward_part(n, np.repeat(ramps[:, :, k : k + 1], 3, axis=2))) for k in range(3)]
+    whole = channels.total(light.forward_part(n, np.ones((rows, columns, 3), np.float32)))
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y, both = (np.where(whole > 0, one / whole, np.nan) * max(rows, columns) ** power
                       for one, power in zip(sums, (1, 1, 2), strict=True))  # fmt: skip
@@ -171,7 +172,7 @@ def _explained(
     slopes = [light.forward_part(n, np.asarray(np.gradient(shown, axis=axis), np.float32)) for axis in (1, 0)]
 
     def around(one: FloatImage, other: FloatImage) -> FloatImage:
-        return _near(np.where(use, np.sum(one * other, axis=2), 0))
+        return _near(np.where(use, channels.total(one * other), 0))
 
     ee = np.maximum(around(error, error), 1e-30)
     xx, xy, yy = around(slopes[0], slopes[0]), around(slopes[0], slopes[1]), around(slopes[1], slopes[1])
@@ -220,7 +221,7 @@ def _where(here: Mask, lit: Mask) -> str:
 
 def attribution_picture(why: ErrorAttribution, calibration: Calibration, name: str) -> ByteImage:
     """The labels in colour over the object in grey, with a legend below: (rows, columns, 3) uint8 RGB."""
-    white = sum((part.white.mean(axis=2) for part in calibration.projectors), start=calibration.black.mean(axis=2))
+    white = sum((channels.mean(part.white) for part in calibration.projectors), start=channels.mean(calibration.black))
     grey = (
         np.sqrt(np.clip(white / max(float(np.percentile(white[calibration.object_mask], 99)), 1e-30), 0, 1)) * 150 + 30
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import CalibrationError
 
@@ -64,7 +65,7 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
             what=f"The prediction {predicted.shape} and the photograph {photographed.shape} differ in size.",
             remedy="Do not change the camera's picture size, and verify again.",
         )
-    use = mask & np.all(np.isfinite(predicted) & np.isfinite(photographed) & np.isfinite(black), axis=2)
+    use = mask & channels.every(np.isfinite(predicted) & np.isfinite(photographed) & np.isfinite(black))
     seen = np.where(use[:, :, None], photographed - black, 0).astype(np.float64)
     light_predicted = np.where(use[:, :, None], predicted - black, 0).astype(np.float64)
     light = float(np.sum(seen**2))
@@ -90,8 +91,8 @@ def grade_of(relative_rms: float) -> Grade:
 
 def _error_map(light_predicted: Float64, seen: Float64, use: Mask) -> FloatImage:
     size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
-    error = cv2.boxFilter(np.sum((light_predicted - seen) ** 2, axis=2), -1, size)
-    light = cv2.boxFilter(np.sum(seen**2, axis=2), -1, size)
+    error = cv2.boxFilter(channels.total((light_predicted - seen) ** 2), -1, size)
+    light = cv2.boxFilter(channels.total(seen**2), -1, size)
     floor = 1e-4 * float(np.sum(seen**2)) / max(int(np.count_nonzero(use)), 1)
     ratio = np.sqrt(np.maximum(error, 0) / np.maximum(light, floor))
     return np.where(use, ratio, np.nan).astype(np.float32)

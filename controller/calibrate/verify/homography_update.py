@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.values import Radiometry
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 
 ON_PROJECTOR: Final = ("projector_px", "shown_px")
@@ -38,7 +39,7 @@ def update_positions(arrays: Arrays, matrix: Float64) -> dict[str, npt.NDArray[A
         else:
             found[name] = array
     if "valid" in found:
-        known = np.isfinite(found["centre_px"]).all(axis=2)
+        known = channels.finite(found["centre_px"])
         found["valid"] = found["valid"] & known
     return found
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 
 BLURS_PX = (4.0, 1.5, 0.8)
@@ -72,7 +73,7 @@ def register(reference: FloatImage, seen: FloatImage, weight: FloatImage, *, sea
     -------
     Motion, with ``found`` False where less than a percent of the picture is known or nothing fits
     """
-    known = (weight > 0) & np.isfinite(reference).all(axis=2) & np.isfinite(seen).all(axis=2)
+    known = (weight > 0) & channels.finite(reference) & channels.finite(seen)
     if np.count_nonzero(known) < max(400, weight.size // 100):
         return no_motion(weight.shape, reference.shape[2])
     weight = np.where(known, weight / weight[known].max(), 0).astype(np.float32)
@@ -254,7 +255,7 @@ def _tangents(frame: _Frame, p: Float64, x: Float64, y: Float64) -> tuple[Float6
 def _first_shift(reference: FloatImage, seen: FloatImage, weight: FloatImage) -> Float64:
     """The whole-pixel shift with the best correlation over the pixels that both then know (Padfield 2012)."""
     rows, columns = weight.shape
-    mean = [np.log1p(np.maximum(image.mean(axis=2), 0)) for image in (reference, seen)]
+    mean = [np.log1p(np.maximum(channels.mean(image), 0)) for image in (reference, seen)]
     known = (weight > 0).astype(np.float32)
     high = [np.where(known > 0, image - _smooth(image[:, :, None], weight, 12.0)[:, :, 0], 0) for image in mean]
     size = (cv2.getOptimalDFTSize(rows + rows // 2), cv2.getOptimalDFTSize(columns + columns // 2))

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 
 BEYOND_REACH: Final = 0.2
@@ -21,6 +22,6 @@ def appearance_weights(target: FloatImage, reachable: Mask, white: float) -> Flo
 
     ``target`` (rows, columns, 3) radiance; ``white`` its white, > 0; ``reachable`` as ``solve.feasibility`` finds it
     """
-    light = target.mean(axis=2) / np.float32(white) + np.float32(DARKEST)
+    light = channels.mean(target) / np.float32(white) + np.float32(DARKEST)
     weights = light ** np.float32(-DARKNESS_EXPONENT) * np.where(reachable, 1, BEYOND_REACH)
     return np.asarray(weights / weights.mean(dtype=np.float64), np.float32)

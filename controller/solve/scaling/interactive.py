@@ -28,6 +28,7 @@ from controller.bundle.live_maps import (
     thresholds,
 )
 from controller.calibrate.values import Radiometry
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.checks import check_shape, not_finite
 from controller.solve.appearance import Base
@@ -206,7 +207,7 @@ def _block(maps: LiveMaps) -> int:
 
 def _used(maps: LiveMaps) -> npt.NDArray[np.int32]:
     """(height, 2): the first column with base light in each row, and the one after the last."""
-    lit = maps.gain.max(axis=2) > 0
+    lit = channels.largest(maps.gain) > 0
     found = lit.any(axis=1)
     first, last = lit.argmax(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1)
     return np.stack([np.where(found, first, 0), np.where(found, last, 0)], 1).astype(np.int32)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.capture.linear_files import Unreadable, exr_chromaticities, read_exr
+from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.core.files import read_picture_bytes
@@ -51,7 +52,7 @@ def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> Non
             remedy=f"Render or scale it to {size[0]} x {size[1]}, as seen from the camera.",
         )
     if not np.isfinite(picture).all():
-        wrong = int(np.count_nonzero(~np.isfinite(picture).all(axis=2)))
+        wrong = int(np.count_nonzero(~channels.finite(picture)))
         raise UsageError(
             "target-not-finite",
             what=f"{path.name} has {wrong} pixels that are not finite numbers.",

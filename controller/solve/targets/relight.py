@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from controller.calibrate.values import Geometry
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.solve.targets.patterns import Colour
@@ -46,7 +47,7 @@ def gloss(
     half = towards_light - directions
     half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-6)
     lit = np.clip(normals @ towards_light, 0, 1)
-    highlight = np.clip(np.sum(normals * half, axis=2), 0, 1) ** np.float32(shininess) * (lit > 0)
+    highlight = np.clip(channels.total(normals * half), 0, 1) ** np.float32(shininess) * (lit > 0)
     body = np.float32(ambient) + np.float32(1 - ambient) * lit
     image = body[..., None] * np.asarray(base_colour, dtype=np.float32) + np.float32(strength) * highlight[..., None]
     return Target(np.where(known[..., None], np.clip(image, 0, 1), 0).astype(np.float32), known)
@@ -58,7 +59,7 @@ def recolour(image: FloatImage, mask: Mask, tint: Colour) -> Target:
     ``image`` (rows, columns, 3) or (rows, columns), linear; values that are not finite leave the mask.
     """
     full = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-    known = mask & np.isfinite(full).all(axis=2)
+    known = mask & channels.finite(full)
     tinted = np.where(known[..., None], full, 0) * np.asarray(tint, dtype=np.float32)
     return Target(np.clip(tinted, 0, 1).astype(np.float32), known)
 
@@ -72,7 +73,7 @@ def smooth_normals(
     """
     from scipy import ndimage
 
-    known = mask & np.isfinite(geometry.normals).all(axis=2) & np.isfinite(geometry.points_m).all(axis=2)
+    known = mask & channels.finite(geometry.normals) & channels.finite(geometry.points_m)
     distance, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
     filled = mask & (distance <= reach_px) & known.any()
     normals = np.where(filled[..., None], geometry.normals[tuple(nearest)], 0).astype(np.float32)

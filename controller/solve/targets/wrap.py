@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from controller.calibrate.values import Geometry
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.solve.targets.values import Target
@@ -51,7 +52,7 @@ def object_space(
     """
     from scipy import ndimage
 
-    known = np.isfinite(geometry.points_m).all(axis=2) & np.isfinite(geometry.normals).all(axis=2)
+    known = channels.finite(geometry.points_m) & channels.finite(geometry.normals)
     wanted = known & mask
     if not wanted.any():
         raise WorkError(
@@ -151,8 +152,8 @@ def facing(geometry: Geometry, mask: Mask, shading: float) -> FloatImage:
     """(rows, columns) 1 - shading (1 - cos) of the angle between surface and view; 1 where the normal is unknown."""
     points = np.nan_to_num(geometry.points_m)
     view = points / np.maximum(np.linalg.norm(points, axis=2, keepdims=True), 1e-9)
-    cosine = np.clip(-np.sum(np.nan_to_num(geometry.normals) * view, axis=2), 0, 1)
-    known = mask & np.isfinite(geometry.normals).all(axis=2)
+    cosine = np.clip(-channels.total(np.nan_to_num(geometry.normals) * view), 0, 1)
+    known = mask & channels.finite(geometry.normals)
     return np.where(known, 1 - np.float32(shading) * (1 - cosine), 1).astype(np.float32)
 
 

@@ -17,6 +17,7 @@ from controller.artefacts.photographs import PATTERN as PATTERN_NAME
 from controller.calibrate.verify.drift import DriftPhotographs, find_drift
 from controller.capture.pattern_frames import device_frame, frame
 from controller.capture.patterns import Pattern, PatternKind
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
@@ -59,7 +60,7 @@ def drift_steps(rig: Rig, calibrated: Calibrated, *, longest_exposure_s: float) 
 
 def exposure_for(light: FloatImage, available_s: Sequence[float], longest_s: float) -> float:
     """The longest exposure that keeps an expected picture (full scales per second) below full scale."""
-    brightest = float(np.percentile(light.max(axis=2), 99.9))
+    brightest = float(np.percentile(channels.largest(light), 99.9))
     wanted_s = FULL_SHARE / max(brightest, 1e-9)
     usable = [value for value in available_s if value <= min(wanted_s, longest_s)]
     return max(usable, default=min(available_s))

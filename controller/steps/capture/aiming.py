@@ -19,6 +19,7 @@ from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_exposure
 from controller.capture.jpeg_response import nominal_response
 from controller.capture.raw import read_photograph
+from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.storage import write_atomically
 from controller.rig.rig import Rig
@@ -73,7 +74,7 @@ def take_test_shots(
     projectors = [{"projector": one.name, **asdict(found)}
                   for one, found in zip(rig.projectors, aim.projectors, strict=True)]  # fmt: skip
     shares, clipped = levels(picture, aim)
-    level = float(np.nanquantile(np.nan_to_num(picture.max(axis=2), nan=1.0), 0.99))
+    level = float(np.nanquantile(np.nan_to_num(channels.largest(picture), nan=1.0), 0.99))
     figures: dict[str, Any] = {
         "projectors": projectors, "overlap": aim.overlap, "too_dark": aim.too_dark, "too_soft": aim.too_soft,
         "camera_focus": aim.camera_focus, "exposure": level, "exposure_s": exposure_s, "measured_unix_s": time.time(),

@@ -21,6 +21,7 @@ from controller.calibrate.correspondence.coloured_code import decode_colours
 from controller.calibrate.correspondence.known_map import MapCheck, check_map
 from controller.capture.pattern_frames import device_frame
 from controller.capture.patterns import Code, Pattern, PatternKind, PatternPlan, plan_patterns
+from controller.core import channels
 from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
 from controller.rig.rig import Rig, RigProjector
@@ -155,7 +156,7 @@ def _readable(taking: _Taking, plan: PatternPlan) -> float:
     """Share of the lit camera pixels whose coloured code is clear."""
     captures, one = taking.developed()
     cells = decode_colours(captures, plan, noise_of(one))
-    light = np.nan_to_num(captures["white"] - captures["black"]).sum(axis=2)
+    light = channels.total(np.nan_to_num(captures["white"] - captures["black"]))
     lit = light > LIT_SHARE * np.percentile(light[::7, ::7], 99)
     return float(np.mean((cells[0].sure & cells[1].sure)[lit])) if lit.any() else 0.0
 

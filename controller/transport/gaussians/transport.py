@@ -14,6 +14,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.calibrate.values import Calibration
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.transport.camera_box import CameraBox
 from controller.transport.gaussians.blur import blur_planes, gaussian_taps, sharpened, without_blur
@@ -59,7 +60,8 @@ class PatchTransport(LightTransport):
         for n, projector in enumerate(projectors):
             forward_planes(patches, gain, plain, ones, (n, n + 1), total)
             white = projector.white
-            lit[n] = calibration.object_mask & (total[0] > 0) & (white.max(axis=2) > FAINTEST * white.max(initial=0))
+            bright = channels.largest(white) > FAINTEST * white.max(initial=0)
+            lit[n] = calibration.object_mask & (total[0] > 0) & bright
             inverse = np.divide(1, total[0], out=np.zeros(shape, np.float32), where=lit[n])
             planes = image_planes(white)
             colour = sharpened(planes, taps) if blurred else planes

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.values import PhaseMap
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.windows.order import place_cells, settle, take_turns
 from controller.transport.windows.profiles import GROUP, Profiles, build_profiles, build_small_profiles
@@ -111,7 +112,7 @@ def _apart(phase_map: PhaseMap, mixing: FloatImage) -> Float64:
 
 def _halo(spread_px2: FloatImage, apart: Float64, table: Profiles) -> int:
     """How far windows reach beyond their tile, pixels."""
-    known = spread_px2[np.isfinite(spread_px2).all(axis=2)].astype(np.float64)
+    known = spread_px2[channels.finite(spread_px2)].astype(np.float64)
     if not known.size:
         return NEAR
     return max(_reach(known + more, table) for more in np.unique(apart[:, 2:], axis=0))

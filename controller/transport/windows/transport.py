@@ -17,6 +17,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.calibrate.values import Calibration, PhaseMap
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.transport.camera_box import CameraBox
 from controller.transport.operator import FAINTEST, LightTransport
@@ -72,7 +73,7 @@ class WindowTransport(LightTransport):
         """From a phase map and a white image (rows, columns, 3) for each projector; ``mask``: the object."""
         # a pixel of the object is made of samples beside it, too
         near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if colours.size else mask
-        bright = tuple(near & (white.max(axis=2) > FAINTEST * white.max(initial=0)) for white in whites)
+        bright = tuple(near & (channels.largest(white) > FAINTEST * white.max(initial=0)) for white in whites)
         windows = build_windows(maps, whites, colours, bright, mixing)
         sizes = tuple((int(rows), int(columns)) for rows, columns in windows.size)
         lit = np.zeros((len(maps), *mask.shape), np.bool_)

@@ -18,7 +18,10 @@ def test_they_are_numpys_for_any_shape(shape: tuple[int, ...], channel_count: in
     np.testing.assert_array_equal(channels.largest(picture), picture.max(axis=-1))
     np.testing.assert_array_equal(channels.smallest(picture), picture.min(axis=-1))
     np.testing.assert_allclose(channels.mean(picture), picture.mean(axis=-1), rtol=1e-6)
+    np.testing.assert_allclose(channels.total(picture), picture.sum(axis=-1), rtol=1e-6)
+    np.testing.assert_allclose(channels.length(picture), np.linalg.norm(picture, axis=-1), rtol=1e-6)
     np.testing.assert_array_equal(channels.every(picture > 0.3), (picture > 0.3).all(axis=-1))
+    np.testing.assert_array_equal(channels.some(picture > 0.3), (picture > 0.3).any(axis=-1))
 
 
 def test_what_is_not_finite_stays_so() -> None:
