@@ -9,6 +9,7 @@ strong in two photographs; the tiles that show full channels tell how strong it 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -333,8 +334,9 @@ def _solve(
     return np.stack([basis @ own for basis, own in zip(bases, knots, strict=True)])
 
 
+@functools.lru_cache(maxsize=16)
 def _basis(power: float) -> Float64:
-    """(256, KNOTS): the natural cubic spline through values at knots equally far apart in x^power."""
+    """(256, KNOTS), not to be changed: the natural cubic spline through knots equally far apart in x^power."""
     from scipy.interpolate import CubicSpline
 
     at = (np.arange(256) / 255) ** power
@@ -359,14 +361,9 @@ def _kept(residual: Float64) -> Float64:
 
 
 def _rising(values: Float64) -> Float64:
-    """Pool adjacent violators: the closest sequence that never falls, from 0 to 1."""
-    groups: list[tuple[float, int]] = []
-    for value in np.clip(values, 0, 1):
-        mean, size = float(value), 1
-        while groups and groups[-1][0] > mean:
-            below, count = groups.pop()
-            mean, size = (mean * size + below * count) / (size + count), size + count
-        groups.append((mean, size))
-    pooled = np.concatenate([np.full(size, mean) for mean, size in groups])
+    """The closest sequence that never falls, from 0 to 1."""
+    from scipy.optimize import isotonic_regression
+
+    pooled = np.asarray(isotonic_regression(np.clip(values, 0, 1)).x, np.float64)
     pooled[0], pooled[-1] = 0.0, 1.0
     return np.round(pooled, 12)

@@ -251,42 +251,83 @@ def _bright(white: FloatImage) -> FloatImage:
 
 def _smoothed(share: FloatImage, sigma: FloatImage, known: Mask, position_px: FloatImage) -> FloatImage:
     """Mean over neighbours on the same surface in like light, by their certainty."""
-    start = np.stack([cv2.medianBlur(np.ascontiguousarray(share[..., c]), 3) for c in range(3)], axis=2)
-    out = share.copy()
-    position = np.where(np.isfinite(position_px), position_px, np.float32(-1e6)).astype(np.float32)
-    _mean_of_like(share, np.asarray(start, np.float32), sigma, known, position, out)
+    out = np.empty_like(share)
+    across, down = (
+        np.ascontiguousarray(np.where(np.isfinite(position_px[..., axis]), position_px[..., axis], np.float32(-1e6)))
+        for axis in (0, 1)
+    )
+    for c in range(3):
+        seen = np.where(known, share[..., c], np.float32(0))
+        start = np.where(known, cv2.medianBlur(np.ascontiguousarray(share[..., c]), 3), np.float32(0))
+        variance = np.where(known, sigma[..., c] ** 2, np.float32(1))
+        mean = np.ascontiguousarray(share[..., c])
+        _mean_of_like(seen, start, variance, known, across, down, mean)
+        out[..., c] = mean
     return out
 
 
-@compiled(parallel=True)
-def _mean_of_like(
-    share: FloatImage, start: FloatImage, sigma: FloatImage, known: Mask, position: FloatImage, out: FloatImage
+@compiled(fastmath=True)
+def _add_like(
+    start: FloatImage,
+    variance: FloatImage,
+    across: FloatImage,
+    down: FloatImage,
+    other: FloatImage,
+    other_variance: FloatImage,
+    other_across: FloatImage,
+    other_down: FloatImage,
+    certain: FloatImage,
+    share: FloatImage,
+    limit: np.float32,
+    total: FloatImage,
+    weight: FloatImage,
 ) -> None:
+    """Add those of the ``other`` pixels of a row that are like ours; all (columns,)."""
+    for i in range(total.size):
+        off = other[i] - start[i]
+        like = off * off <= np.float32(LIKE_SIGMAS**2) * (variance[i] + other_variance[i])
+        near = max(abs(other_across[i] - across[i]), abs(other_down[i] - down[i])) <= limit
+        w = certain[i] if like and near else np.float32(0)
+        total[i] += w * share[i]
+        weight[i] += w
+
+
+@compiled(parallel=True, fastmath=True)
+def _mean_of_like(
+    share: FloatImage,
+    start: FloatImage,
+    variance: FloatImage,
+    known: Mask,
+    across: FloatImage,
+    down: FloatImage,
+    out: FloatImage,
+) -> None:
+    """Of one channel; all (rows, columns), finite. The innermost loop runs along a row, so that it uses vectors."""
     rows, columns = known.shape
+    certain = np.empty((rows, columns), np.float32)
     for row in numba.prange(rows):
         for column in range(columns):
-            if not known[row, column]:
-                continue
-            for c in range(3):
-                total, weight = 0.0, 0.0
-                centre, own = start[row, column, c], sigma[row, column, c]
-                for r in range(max(row - RADIUS_PX, 0), min(row + RADIUS_PX + 1, rows)):
-                    for k in range(max(column - RADIUS_PX, 0), min(column + RADIUS_PX + 1, columns)):
-                        if not known[r, k]:
-                            continue
-                        away = max(abs(r - row), abs(k - column))
-                        if abs(position[r, k, 0] - position[row, column, 0]) > STEEPEST_PX * away + 1:
-                            continue
-                        if abs(position[r, k, 1] - position[row, column, 1]) > STEEPEST_PX * away + 1:
-                            continue
-                        other = sigma[r, k, c]
-                        if abs(start[r, k, c] - centre) > LIKE_SIGMAS * np.sqrt(own * own + other * other):
-                            continue
-                        w = 1 / (other * other)
-                        total += w * share[r, k, c]
-                        weight += w
-                if weight > 0:
-                    out[row, column, c] = total / weight
+            certain[row, column] = 1 / variance[row, column] if known[row, column] else np.float32(0)
+    for row in numba.prange(rows):
+        total, weight = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+        first, end = columns, 0
+        for column in range(columns):
+            if known[row, column]:
+                first, end = min(first, column), column + 1
+        for r in range(max(row - RADIUS_PX, 0), min(row + RADIUS_PX + 1, rows)):
+            for shift in range(-RADIUS_PX, RADIUS_PX + 1):
+                limit = np.float32(STEEPEST_PX * max(abs(r - row), abs(shift)) + 1)
+                a, e = max(first, -shift), min(end, columns - shift)
+                if a < e:
+                    here, there = (row, slice(a, e)), (r, slice(a + shift, e + shift))
+                    _add_like(
+                        start[here], variance[here], across[here], down[here],
+                        start[there], variance[there], across[there], down[there],
+                        certain[there], share[there], limit, total[a:e], weight[a:e],
+                    )  # fmt: skip
+        for column in range(first, end):
+            if known[row, column] and weight[column] > 0:
+                out[row, column] = total[column] / weight[column]
 
 
 def _filled(share: FloatImage, known: Mask) -> FloatImage:
