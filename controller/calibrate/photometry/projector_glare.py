@@ -87,7 +87,9 @@ def projector_glare(whites: Sequence[FloatImage], n: int, parts: Sequence[DarkPa
     found, groups = [], []
     for here in _on_one_surface(depth_m):
         own = brightness[n][here]
-        low, high = np.percentile(own, EDGE_PERCENT) if np.isfinite(own).all() else (1.0, 1.0)
+        if not _may_be_an_edge(own):
+            continue
+        low, high = np.percentile(own, EDGE_PERCENT)
         if low > SHADOW * high:
             continue
         others = [m for m in range(len(whites)) if m != n and _shows_an_edge(own, brightness[m][here])]
@@ -152,11 +154,18 @@ def _on_one_surface(depth_m: FloatImage) -> Iterator[Place]:
                 yield here
 
 
+def _may_be_an_edge(block: FloatImage) -> bool:
+    """False where its percentiles can't tell an edge, or a pixel is not known: most blocks, much sooner known."""
+    return bool(block.min() <= SHADOW * block.max())
+
+
 def _shows_an_edge(own: FloatImage, other: FloatImage) -> bool:
     """Whether a block has a sharp edge of ``own`` light, and the ``other`` projector lights all of it."""
     if not np.isfinite(other).all() or other.min() < LEAST_LIT:
         return False
     ratio = own / other
+    if not _may_be_an_edge(ratio):
+        return False
     low, high = np.percentile(ratio, EDGE_PERCENT)
     quarter = (high - low) / 4
     between = (ratio > low + quarter) & (ratio < high - quarter)
