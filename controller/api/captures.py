@@ -14,7 +14,7 @@ import numpy.typing as npt
 from controller.api.photographs import develop, merge_brackets
 from controller.capture.pattern_frames import device_frame
 from controller.capture.patterns import plan_patterns
-from controller.capture.profile import CameraProfile
+from controller.capture.profile import CameraProfile, true_exposure
 from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import UsageError
 
@@ -157,7 +157,7 @@ class _Folder(Mapping[str, FloatImage]):
     def __getitem__(self, name: str) -> FloatImage:
         taken = self._files[name]
         images = [develop(path, camera=self._camera).image for path, _ in taken]
-        seconds = [self._true_s(exposure_s) for _, exposure_s in taken]
+        seconds = [true_exposure(self._camera, exposure_s) for _, exposure_s in taken]
         if len(images) > 1:
             noise = None if self._camera is None else self._camera.noise
             return merge_brackets(images, seconds, noise=noise).radiance
@@ -168,9 +168,6 @@ class _Folder(Mapping[str, FloatImage]):
 
     def __len__(self) -> int:
         return len(self._files)
-
-    def _true_s(self, exposure_s: float) -> float:
-        return exposure_s if self._camera is None else self._camera.true_exposure(exposure_s)
 
 
 def description_of(path: Path) -> dict[str, Any]:

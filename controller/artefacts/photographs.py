@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import CAPTURES, read_json, safe_name, stem, write_json
-from controller.capture.profile import CameraNoise, CameraProfile, load_profile
+from controller.capture.profile import CameraNoise, CameraProfile, load_profile, true_exposure
 from controller.capture.raw import Photograph, read_photograph
 from controller.core.arrays import FloatImage
 from controller.run.step_id import ShotId
@@ -98,8 +98,7 @@ class PhotographSet:
 
     def _taken(self, run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
         name, projector = (row["name"], row["projector"]) if "projector" in row else self._of_format_1(row["name"])
-        told_s = float(row["exposure_s"])
-        exposure_s = told_s if profile is None else profile.true_exposure(told_s)
+        exposure_s = true_exposure(profile, float(row["exposure_s"]))
         return Taken(name, run / row["path"], exposure_s, profile=profile, projector=projector)
 
     def _of_format_1(self, name: str) -> tuple[str, str | None]:

@@ -68,6 +68,10 @@ class CameraProfile:
                 return float(true)
         return reported_s
 
+    def knows(self, reported_s: float) -> bool:
+        """Whether the time of an exposure that the camera reports as ``reported_s`` was measured, and is corrected."""
+        return any(abs(reported / reported_s - 1) < SAME_EXPOSURE for reported in self.exposures[:, 0])
+
     def save(self, folder: Path) -> Path:
         """Write ``camera.npz`` into a run's folder."""
         arrays: dict[str, npt.NDArray[np.generic]] = {
@@ -81,6 +85,11 @@ class CameraProfile:
             arrays["response"] = self.response
         save_arrays(folder / FILE_NAME, arrays)
         return folder / FILE_NAME
+
+
+def true_exposure(profile: CameraProfile | None, reported_s: float) -> float:
+    """As ``CameraProfile.true_exposure``; as the camera reports where nothing was measured of it."""
+    return reported_s if profile is None else profile.true_exposure(reported_s)
 
 
 def load_profile(folder: Path) -> CameraProfile | None:

@@ -18,7 +18,7 @@ from controller.artefacts.published import has_photograph, read_photograph_of
 from controller.artefacts.solved import read_solved
 from controller.bundle.export import png
 from controller.capture.linear_files import exr_bytes
-from controller.capture.profile import load_profile
+from controller.capture.profile import load_profile, true_exposure
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of, write_atomically
 from controller.exchange.content import Content
@@ -85,8 +85,7 @@ def _photographs(run: Path) -> Iterator[_Photograph]:
             if path in known:
                 continue
             known.add(path)
-            given_s = float(row["exposure_s"])
-            seconds = given_s if profile is None else profile.true_exposure(given_s)
+            seconds = true_exposure(profile, float(row["exposure_s"]))
             taken = Taken(row["name"], path, seconds, profile=profile, projector=row.get("projector"))
             yield _Photograph(path.parent.name, taken)
 

@@ -34,9 +34,8 @@ def speeds(white: float, available_s: Sequence[float], longest_s: float, profile
     found = bracket(1 / white, WANTED, available_s, longest_s)
     if profile is None or not len(profile.exposures) or len(found) < 2:
         return found
-    known = {float(value) for value in profile.exposures[:, 0]}
     low, high = (factor / white for factor in LONG)
-    usable = [value for value in available_s if low <= value <= min(high, longest_s) and _listed(value, known)]
+    usable = [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
     if not usable:
         return found
     return [found[0], min(usable, key=lambda value: abs(math.log(value * white / WANTED[1])))]

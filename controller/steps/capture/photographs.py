@@ -29,7 +29,7 @@ from controller.capture.latency import (
     fingerprint,
     same_picture,
 )
-from controller.capture.profile import CameraProfile, load_profile
+from controller.capture.profile import CameraProfile, load_profile, true_exposure
 from controller.core.arrays import ByteImage
 from controller.rig.camera_watch import CameraWatch
 from controller.rig.rig import Rig
@@ -209,8 +209,7 @@ def take_photograph(
 
 def _as_measured(taken: Taken, profile: CameraProfile | None) -> Taken:
     """With what is known of the camera: its true exposure, if that differs from what it says."""
-    exposure_s = taken.exposure_s if profile is None else profile.true_exposure(taken.exposure_s)
-    return replace(taken, profile=profile, exposure_s=exposure_s)
+    return replace(taken, profile=profile, exposure_s=true_exposure(profile, taken.exposure_s))
 
 
 def _taken(identity: ShotId, path: Path, exposure_s: float) -> Taken:
