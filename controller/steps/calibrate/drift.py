@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from controller.artefacts.photographs import PATTERN as PATTERN_NAME
 from controller.calibrate.verify.drift import DriftPhotographs, find_drift
 from controller.capture.pattern_frames import device_frame, frame
 from controller.capture.patterns import Pattern, PatternKind
+from controller.capture.profile import CameraProfile, load_profile
 from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.rig.rig import Rig
@@ -31,6 +33,8 @@ PATTERN = Pattern("drift", PatternKind.RANDOM, seed=17)
 """Not the pattern on which a calibration is graded."""
 FULL_SHARE = 0.7
 """Share of full scale for the brightest pixels: room for additional light."""
+NEAR = 0.2, 1.3
+"""Of the wanted exposure, those that a known one may have: darker pictures have more noise, brighter ones clip."""
 BLACK_TIMES = 8.0
 """The black photograph's exposure over that of white."""
 
@@ -58,12 +62,22 @@ def drift_steps(rig: Rig, calibrated: Calibrated, *, longest_exposure_s: float) 
     ]
 
 
-def exposure_for(light: FloatImage, available_s: Sequence[float], longest_s: float) -> float:
-    """The longest exposure that keeps an expected picture (full scales per second) below full scale."""
+def exposure_for(
+    light: FloatImage, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None = None
+) -> float:
+    """The longest exposure that keeps an expected picture (full scales per second) below full scale.
+
+    Where the camera's times are wrong, it is the nearest one whose true time ``profile`` has, if one is ``NEAR``: with
+    another, the lamp would seem brighter or darker than it is.
+    """
     brightest = float(np.percentile(channels.largest(light), 99.9))
-    wanted_s = FULL_SHARE / max(brightest, 1e-9)
-    usable = [value for value in available_s if value <= min(wanted_s, longest_s)]
-    return max(usable, default=min(available_s))
+    wanted_s = min(FULL_SHARE / max(brightest, 1e-9), longest_s)
+    found = max((value for value in available_s if value <= wanted_s), default=min(available_s))
+    if profile is None or profile.knows(found):
+        return found
+    low, high = (factor * wanted_s for factor in NEAR)
+    known = [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
+    return min(known, key=lambda value: abs(math.log(value / wanted_s)), default=found)
 
 
 def shown_frames(calibrated: Calibrated, pattern: Pattern) -> dict[str, ByteImage]:
@@ -77,15 +91,15 @@ def shown_frames(calibrated: Calibrated, pattern: Pattern) -> dict[str, ByteImag
 
 def _photograph(rig: Rig, calibrated: Calibrated, longest_s: float, context: Context) -> Sequence[Path]:
     inherit_camera(calibrated.folder, context.folder)
-    calibration, available = calibrated.calibration, rig.acquirer.exposures_s()
+    calibration, available, profile = calibrated.calibration, rig.acquirer.exposures_s(), load_profile(context.folder)
     frames = shown_frames(calibrated, PATTERN)
     plan = []
     for part in calibration.projectors:
-        exposure_s = exposure_for(part.white + calibration.black, available, longest_s)
+        exposure_s = exposure_for(part.white + calibration.black, available, longest_s, profile)
         shown = partial(_one, part.name, frames[part.name])
         plan.append(Planned(PATTERN_NAME, shown, exposure_s, projector=part.name))
     lit = sum((part.white for part in calibration.projectors), start=calibration.black)
-    white_s = exposure_for(lit, available, longest_s)
+    white_s = exposure_for(lit, available, longest_s, profile)
     whites = {name: np.full_like(image, 255) for name, image in frames.items()}
     plan.append(Planned("white", lambda: whites, white_s))
     (black_s,) = bracket(white_s, (BLACK_TIMES,), available, longest_s)
