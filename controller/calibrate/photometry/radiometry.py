@@ -129,8 +129,7 @@ def measure_radiometry(
             f"three responses, white by {100 * fit.additivity:.0f} %.",
             remedy=REMEDY,
         )
-    # a white segment could be mistaken for it
-    if indirect is not None and not fit.segment:
+    if indirect is not None:
         fit = _evened(tiles, fit)
     stray = float(fit.stray.mean())
     flicker = float(np.abs(fit.strength - 1).max())
@@ -181,7 +180,8 @@ def _evened(tiles: TileMeasurements, fit: _RadiometryFit) -> _RadiometryFit:
     for _ in range(UNEVEN_ROUNDS):
         residual = _residual(steady.at(change), fit)
         uneven = uneven_light(tiles, residual, weight * _kept(residual - uneven))
-        fit = _fit(dataclasses.replace(steady, ratio=steady.ratio - uneven, weight=weight))
+        left = dataclasses.replace(steady, ratio=steady.ratio - uneven, weight=weight)
+        fit = _fit(left, with_segment=fit.segment > 0)
         change = fit.strength
     fit.strength, fit.additivity = first * change, additivity
     return fit
@@ -206,7 +206,7 @@ def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryF
             gamma = _gamma_of(fit.response)
             continue
         # while indirect light is not known, tiles with much of it are not worse than others
-        _fit_strength(steady, weight if tiles.indirect.any() else tiles.weight, fit)
+        _fit_strength(steady, weight if tiles.indirect.any() else tiles.weight, fit, with_segment=with_segment)
         steady = tiles.at(fit.strength)
         weight = tiles.weight * _kept(_residual(steady, fit))
         if np.max(np.abs(fit.response - before)) < CONVERGED:
@@ -218,24 +218,30 @@ def _fit(tiles: TileMeasurements, *, with_segment: bool = False) -> _RadiometryF
     return fit
 
 
-def _fit_strength(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit) -> None:
+def _fit_strength(tiles: TileMeasurements, weight: Float64, fit: _RadiometryFit, *, with_segment: bool) -> None:
     """The lamp's strength in each photograph: against the others by all tiles, against white by full channels.
 
     Where a channel is full its light is known, whatever the response is; below, a stronger lamp looks like another
     response. Tiles of no ``weight`` (tiles, 3) do not fit, and would tell another lamp.
+
+    A white segment takes light from full channels, too, so ``with_segment`` their light is not known: a weaker lamp
+    looks like a smaller segment. Then the photographs are as strong as white on the mean.
     """
     fitted = tiles.ratio - _residual(tiles, fit)
     against = np.sum(weight * fitted * tiles.ratio, axis=1), np.sum(weight * fitted**2, axis=1)
     light, known = (np.bincount(tiles.photograph, one, len(fit.strength)) for one in against)
     each = np.divide(light, known, out=np.ones_like(light), where=known > 0)
+    strength = fit.strength * (each / each.mean())
+    if with_segment:
+        fit.strength = np.clip(strength / strength.mean(), 1 - MOST_FLICKER, 1 + MOST_FLICKER)
+        return
     full = (tiles.levels == 255) @ fit.mixing.T * (1 - fit.stray)
     some = np.flatnonzero((weight * full).sum(axis=1) > 0)
     if some.size < FEWEST_FULL:
         return
     each_full = weight[some] * full[some]
     found = 1 + np.sum(each_full * (tiles.ratio - fitted)[some], axis=1) / np.sum(each_full * full[some], axis=1)
-    strength = fit.strength * (each / each.mean()) * np.median(found)
-    fit.strength = np.clip(strength, 1 - MOST_FLICKER, 1 + MOST_FLICKER)
+    fit.strength = np.clip(strength * np.median(found), 1 - MOST_FLICKER, 1 + MOST_FLICKER)
 
 
 def _channels(tiles: TileMeasurements, response: Float64) -> Float64:

@@ -142,9 +142,10 @@ def test_a_lamp_that_flickers_throws_more_light_at_other_surfaces_too(flicker: t
     assert seen == pytest.approx(max(abs(change) for change in flicker), abs=0.01)
 
 
-def thrown_back(share: float, spread_px: float) -> tuple[dict[str, FloatImage], KnownIndirect]:
+def thrown_back(share: float, spread_px: float, *, segment: float = 0.0) -> tuple[dict[str, FloatImage], KnownIndirect]:
     """A scene of which ``share`` comes by way of other surfaces: from around, as a Gaussian of ``spread_px``."""
-    captures, truth = dict(before_response(scene())), scene()
+    truth = scene(white_segment=segment)
+    captures = dict(before_response(truth))
     black, white = captures["black"], captures["white"] - captures["black"]
     for pattern in PLAN.of_kind(PatternKind.COLOUR_TILES):
         own = captures[pattern.name] - black
@@ -154,7 +155,7 @@ def thrown_back(share: float, spread_px: float) -> tuple[dict[str, FloatImage], 
     for pattern in PLAN.of_kind(PatternKind.GRAY):
         own = captures[pattern.name] - black
         captures[pattern.name] = (black + (1 - share) * own + share / 2 * white).astype(np.float32)
-    known = Radiometry(truth.response(), np.array(truth.mixing))
+    known = Radiometry(truth.response(), np.array(truth.mixing), segment)
     return captures, KnownIndirect((share * white).astype(np.float32), known)
 
 
@@ -237,6 +238,17 @@ def test_a_white_segment_in_the_colour_wheel_is_measured(share: float) -> None:
     assert radiometry.segment == pytest.approx(share, abs=0.01)
     assert report.segment == radiometry.segment
     assert max(off(radiometry, wheel)) < 0.01
+
+
+@pytest.mark.parametrize("share", [0.06, 0.15])
+def test_light_of_other_tiles_is_no_smaller_segment_and_no_weaker_lamp(share: float) -> None:
+    captures, known = thrown_back(share, 50.0, segment=0.2)
+    for indirect in (None, known):
+        radiometry, report = measure_radiometry(captures, PLAN, indirect=indirect)
+        assert radiometry.segment == pytest.approx(0.2, abs=0.01)
+        assert report.flicker < 0.01
+    off_64 = radiometry.response[:, 64] / scene().response()[:, 64] - 1
+    assert np.abs(off_64).max() < 0.03
 
 
 def test_colours_that_add_have_no_segment() -> None:
