@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.core.errors import VelaturaError
+from controller.core.errors import CalibrationError
 from controller.solve.judged import TITLES
 from controller.study.lab.measuring import SET_COLUMNS, set_cells
 from controller.study.lab.subject import BenchChange, StageControl, Subject
@@ -171,9 +171,8 @@ def _run_level(subject: Subject, undisturbed: Trial, disturbance: Disturbance, l
             return DisturbanceResult(disturbance, level, made, None)
         again = hand.again(key)
         return DisturbanceResult(disturbance, level, run_trial(again.subject, key), again.worst_percent)
-    except VelaturaError as error:
-        if error.code == "cancelled":
-            raise
+    except CalibrationError as error:
+        # Anything else, such as a full disk, ends the experiment: it says nothing about the disturbance.
         return DisturbanceResult(disturbance, level, None, None, error.what)
     finally:
         hand.disturb()

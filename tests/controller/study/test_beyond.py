@@ -14,7 +14,7 @@ import pytest
 from controller.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.calibrate.verify.registration import Motion
 from controller.core.arrays import FloatImage
-from controller.core.errors import CalibrationError
+from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.solve.judged import PixelSet
 from controller.steps.modes import DotOptions
 from controller.study.experiments.adaptation import ADAPTED, CUT, adaptation
@@ -32,6 +32,7 @@ from controller.study.lab.subject import BenchChange, Dots, ReachableTarget, Rec
 from controller.study.lab.trial import Trial
 from controller.study.values import column
 from controller.transport import build_transport
+from hal.errors import DeviceError
 from tests.controller.study.array_stage import CAMERA, ArrayLight, array_subject
 
 
@@ -46,6 +47,8 @@ class Clumsy:
     subject: Subject
     changes: tuple[BenchChange, ...] = ()
     done: list[str] = field(default_factory=list)
+    fails: dict[str, Exception] = field(default_factory=dict)
+    """By name of the calibration that it ends."""
 
     def disturb(self, *changes: BenchChange) -> None:
         self.changes = changes
@@ -73,6 +76,8 @@ class Clumsy:
     def again(self, name: str, options: DotOptions | None = None, *, beyond: str | None = None) -> Recalibration:
         assert beyond is None or beyond in self.done
         self.done.append(name)
+        if name in self.fails:
+            raise self.fails[name]
         if any(change.get("gloss", 0) > 0.02 for change in self.changes):
             raise CalibrationError("too-glossy", what="The object mirrors.", remedy="Dull it.")
         subject = dataclasses.replace(self.subject, light=array_subject().light)
@@ -178,6 +183,26 @@ def test_every_disturbance_grows_until_the_error_has_doubled_and_one_that_cannot
     assert holds["lamp flicker"]
     assert holds["highlights"] is False
     assert hand.changes == ()
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        WorkError("no-space", what="The disk has no space.", remedy="Free some."),
+        WorkError("run-too-slow", what="The run took too long.", remedy="Start it again."),
+        UsageError("response-missing", what="There is no response.", remedy="Measure it."),
+        DeviceError("camera-silent", what="The camera is silent.", remedy="Switch it on."),
+    ],
+    ids=lambda failure: type(failure).__name__,
+)
+def test_what_fails_for_another_reason_than_the_calibration_is_no_result(failure: Exception) -> None:
+    subject, hand = stage()
+    hand.fails["camera-noise-10"] = failure
+    with pytest.raises(type(failure)) as raised:
+        robustness(subject)
+    assert raised.value is failure
+    assert hand.done[-1] == "camera-noise-10", "nothing is measured after it"
+    assert hand.changes == (), "the stage is left as it was"
 
 
 def _trial(in_reach: tuple[float, float], lit: tuple[float, float]) -> Trial:
