@@ -15,12 +15,11 @@ from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
 from controller.kiosk.supervisors.player_channel import PlayerChannel
+from controller.kiosk.supervisors.player_patience import Patience
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
 
 ANSWER_S: Final = 0.8
-MOST_MISSES: Final = 2
-"""Unanswered questions in a row after which a player counts as hung."""
 READY_S: Final = 8.0
 HEALTHY_S: Final = 20.0
 """A player that ran for so long is started again at once when it dies."""
@@ -95,7 +94,8 @@ class PlayerSupervisor:
         self._channel = channel or PlayerChannel()
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
-        self._misses, self._failed = 0, 0
+        self._patience, self._failed = Patience(), 0
+        self._reached: Showing | None = None
         self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
         self._turns: tuple[Turn, ...] | None = None
         self._skipped = False
@@ -121,20 +121,18 @@ class PlayerSupervisor:
             return
         try:
             self._follow(self._ask({"op": "status"}))
-            self._misses = 0
+            self._patience.begins()
         except TimeoutError:
-            self._misses += 1
-            if self._misses >= MOST_MISSES:
+            if self._ends_for_silence():
                 self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
         except (OSError, ValueError, KeyError):
             self._channel.close()
-            self._misses += 1
-            if self._misses >= MOST_MISSES + 2:
+            if self._ends_for_silence(refused=True):
                 self._restart(
                     Decision("player-gone", "The player refused the connection.", "It is started again.", "error")
                 )
         except WorkError as error:
-            self._misses = 0
+            self._patience.begins()
             problem = Decision(error.code, error.what, error.remedy, "error")
             waited = self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
             if self._dark and waited and error.code.startswith("bundle-"):
@@ -175,7 +173,8 @@ class PlayerSupervisor:
             what, remedy = (error.what, error.remedy) if isinstance(error, VelaturaError) else (str(error), "")
             self._trouble(Decision("player-not-started", what, remedy or "It is tried again.", "error"))
             return
-        self._started_at_s, self._misses, self._identified = self._monotonic(), 0, False
+        self._patience.begins()
+        self._started_at_s, self._reached, self._identified = self._monotonic(), None, False
         self._noticed, self._hello = None, hello
         self._turns, self._skipped = None, False
         self._identities = {}
@@ -205,6 +204,10 @@ class PlayerSupervisor:
         self._view = replace(self._view, shown=None, problem=why, outputs=None, restarts=self._view.restarts + 1)
         if self._monotonic() >= self._start_at_s:
             self._start()
+
+    def _ends_for_silence(self, *, refused: bool = False) -> bool:
+        as_wanted = self._reached is not None and self._reached == self.want
+        return self._patience.ends(self._monotonic(), as_wanted=as_wanted, refused=refused)
 
     # -- showing
 
@@ -240,6 +243,7 @@ class PlayerSupervisor:
         outputs = self._view.outputs
         if outputs is None and self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
+        self._reached = want
         self._view = replace(self._view, shown=shown, problem=outputs, warning=self._warning(status))
 
     def _see_outputs(self, status: dict[str, Any]) -> None:
