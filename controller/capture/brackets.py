@@ -30,7 +30,8 @@ BRIGHT_PERCENTILE = 99.5
 LIT_SHARE = 0.05
 TOO_DARK = 0.1
 """Below this level a percentile is dominated by noise."""
-BRACKET_CEILING = 0.8
+BRIGHTEST_MINIMUM = 0.4
+"""Of full scale: with very much noise, what an exposure measures well begins here at the latest."""
 DARK_SHARE = 0.01
 """Of the brightest: darker pixels are hardly lit, and their noise hardly matters."""
 DARK_PERCENTILE = 2
@@ -208,11 +209,12 @@ def choose_brackets(
     before. With a 12-bit camera that is a factor of ten, and two exposures span almost two decades of light.
     """
     noise = noise or CameraNoise()
-    first = choose_exposure(image, exposure_s, available_s, lit=lit, target=BRACKET_CEILING / 1.07)
+    # the patterns' exposure, whose true time the ratios of the bracket then tell
+    first = choose_exposure(image, exposure_s, available_s, lit=lit)
     if not first.settled:
         return BracketChoice((first.exposure_s,), False)
     exposures = _ascending(available_s)
-    level = min(minimum_level(noise), BRACKET_CEILING / 2)
+    level = min(minimum_level(noise), BRIGHTEST_MINIMUM)
     dark = _darkest(image, lit)
     needed = level * exposure_s / max(dark, 1e-5) / first.exposure_s
     step = BEFORE_CLIPPING / level

@@ -147,6 +147,17 @@ def test_brackets_measure_the_brightest_and_the_darkest(decades: float) -> None:
     assert np.sqrt(NOISE.shot * signal + NOISE.read**2) / signal < 0.03 or len(chosen) == 4
 
 
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.3, 300))
+def test_a_bracket_begins_with_the_exposure_of_the_patterns(brightest: float) -> None:
+    radiance = brightest * np.random.default_rng(1).uniform(0.2, 1.0, (40, 60, 3)).astype(np.float32)
+    exposure_s, fine = 0.5 / brightest, tuple(0.001 * 1.001**step for step in range(9000))
+    image = expose(radiance, exposure_s)
+    chosen = choose_exposure(image, exposure_s, fine)
+    assert chosen.settled
+    assert choose_brackets(image, exposure_s, fine, noise=NOISE).exposures_s[0] == chosen.exposure_s
+
+
 def test_everything_between_two_exposures_is_measured_well() -> None:
     radiance = scene(1.5)
     chosen = bracketed(radiance)
