@@ -17,7 +17,6 @@ import numpy as np
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import masked_blur
-from controller.core.channels import finite
 from controller.solve.bounded.solver import solve_bounded
 from controller.solve.bounded.weights import appearance_weights
 from controller.solve.drive_levels import DriveLevels
@@ -83,7 +82,7 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     Left out is what was not measured, what changed while the photograph was taken, and areas whose error has nothing to
     do with that of the others.
     """
-    measured = mask & finite(photograph.radiance)
+    measured = mask & channels.finite(photograph.radiance)
     if not measured.any():
         return measured
     scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
@@ -93,7 +92,7 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
     limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
     strange = measured & channels.some(np.abs(error - middle) > limit)
-    both = measured & finite(photograph.first) & finite(photograph.last)
+    both = measured & channels.finite(photograph.first) & channels.finite(photograph.last)
     moved = masked_blur(np.abs(masked_blur(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
     noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
     strange |= both & channels.some(moved > CHANGED * scale + noise)
@@ -107,7 +106,7 @@ def refusal(
     photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask, trusted: Mask
 ) -> str | None:
     """Why a photograph says nothing about the result, for people; None where it does."""
-    measured = mask & finite(photograph.radiance)
+    measured = mask & channels.finite(photograph.radiance)
     wanted = float((predicted - stage.black)[measured].sum(dtype=np.float64))
     seen = float((photograph.radiance - stage.black)[measured].sum(dtype=np.float64))
     if not measured.any() or seen < DARKEST * wanted:

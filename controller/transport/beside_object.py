@@ -72,7 +72,7 @@ def _beside(on: FloatImage, off: FloatImage) -> Mask:
 def _cells(brightest: FloatImage, phase_map: PhaseMap, shape: tuple[int, ...]) -> tuple[Mask, npt.NDArray[np.int32]]:
     """Camera pixels (rows, columns) that a projector lights, and the number of the projector pixel that does."""
     rows, columns = shape
-    known: Mask = np.asarray(channels.finite(phase_map.projector_px))
+    known = channels.finite(phase_map.projector_px)
     places = np.where(known[..., None], phase_map.projector_px, -1)
     x, y = np.moveaxis(np.rint(np.clip(places, -1, max(rows, columns))).astype(np.int32), 2, 0)
     within = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)

@@ -37,7 +37,7 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
     from scipy.ndimage import distance_transform_edt
 
     count, fine = grid[0] * grid[1], max(1, round(side / ACROSS))
-    known: Mask = np.asarray(channels.every(np.isfinite(points_m) & np.isfinite(normals)))
+    known = channels.finite(points_m) & channels.finite(normals)
     patches = (-(-known.shape[0] // fine), -(-known.shape[1] // fine))
     share = down(known[..., None].astype(np.float32), patches, fine)[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -19,7 +19,6 @@ from controller.capture.pattern_frames import tile_levels
 from controller.capture.patterns import CELL_PX, TILE_MARGIN, PatternKind, PatternPlan
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.core.channels import finite
 
 WORST_OFF: Final = 0.15
 """Of white: a camera pixel that is farther from what it should see, in any channel, sees another tile."""
@@ -71,7 +70,7 @@ def check_map(
     black = coloured(captures, "black", known_px.shape[:2])
     white = coloured(captures, "white", black.shape[:2]) - black
     lit = lit_pixels(white)
-    known: Mask = finite(known_px)
+    known: Mask = channels.finite(known_px)
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
     agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):

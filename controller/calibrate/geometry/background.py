@@ -41,7 +41,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
     """
     from scipy.ndimage import distance_transform_edt, median_filter
 
-    known = np.asarray(channels.finite(points_m), dtype=np.bool_)
+    known = channels.finite(points_m)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:

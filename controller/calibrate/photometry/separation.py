@@ -25,7 +25,6 @@ from controller.capture.profile import CameraNoise
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import gaussian_blur
-from controller.core.channels import every, finite
 from controller.core.jit import compiled
 
 COARSE: Final = ("phase-x", "phase-y")
@@ -231,9 +230,9 @@ def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[
 
 def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
     """How much brighter the lamp was at white than at each step: the steps must add up to half the white each."""
-    use = finite(white) & every(white > FAINTEST * 10 * _bright(white))
+    use = channels.finite(white) & channels.every(white > FAINTEST * 10 * _bright(white))
     for image in images:
-        use &= finite(image)
+        use &= channels.finite(image)
     at = np.flatnonzero(use)
     if at.size < 10 * len(images):
         return np.ones(len(images))
@@ -244,7 +243,7 @@ def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
 
 
 def _bright(white: FloatImage) -> FloatImage:
-    known = white[finite(white)]
+    known = white[channels.finite(white)]
     some = known[:: max(1, len(known) // SOME_PIXELS)] if len(known) else np.zeros((1, 3), np.float32)
     return np.asarray(np.percentile(some, 99, axis=0), np.float32)
 
@@ -257,10 +256,10 @@ def _smoothed(share: FloatImage, sigma: FloatImage, known: Mask, position_px: Fl
         for axis in (0, 1)
     )
     for c in range(3):
-        seen = np.where(known, share[..., c], np.float32(0))
-        start = np.where(known, cv2.medianBlur(np.ascontiguousarray(share[..., c]), 3), np.float32(0))
-        variance = np.where(known, sigma[..., c] ** 2, np.float32(1))
         mean = np.ascontiguousarray(share[..., c])
+        seen = np.where(known, mean, np.float32(0))
+        start = np.where(known, cv2.medianBlur(mean, 3), np.float32(0))
+        variance = np.where(known, sigma[..., c] ** 2, np.float32(1))
         _mean_of_like(seen, start, variance, known, across, down, mean)
         out[..., c] = mean
     return out

@@ -73,7 +73,7 @@ def attribute_error(
     predicted = light.forward_part(n, shown)
     if indirect is not None:
         predicted = predicted + indirect
-    measured: Mask = np.asarray(channels.finite(seen), np.bool_)
+    measured = channels.finite(seen)
     light_seen = np.where(measured[:, :, None], seen - calibration.black, predicted).astype(np.float32)
     error = light_seen - predicted
     squared = np.where(lit & measured, channels.total(error * error), 0).astype(np.float32)

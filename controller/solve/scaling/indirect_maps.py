@@ -82,5 +82,5 @@ def _places(
     part = (np.stack([number, GENERATOR * number % SAMPLES], axis=-1) + 0.5) / SAMPLES
     first = np.stack(np.divmod(np.arange(grid[0] * grid[1]), grid[1]), axis=-1)
     at = np.floor((first + part[:, None]) * side).astype(np.int64)
-    inside = np.asarray(channels.every(at < np.array(size)), np.bool_)
+    inside = channels.every(at < np.array(size))
     return np.minimum(at, np.array(size) - 1).astype(np.uint16), inside
