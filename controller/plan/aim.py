@@ -8,7 +8,7 @@ import numpy as np
 
 from controller.core.arrays import Float64
 from controller.plan.optics import best_focus
-from controller.plan.values import Placement, ProjectorModel, Spot, Surface
+from controller.plan.values import MountingPoint, Placement, ProjectorModel, Surface
 
 ROUNDS: Final = 40
 DOWN: Final = (0.0, 1.0, 0.0)
@@ -16,8 +16,8 @@ STEEPEST: Final = 0.999
 """Cosine to the vertical from which "upright" means nothing, and the picture's top points away from the audience."""
 
 
-def aimed(model: ProjectorModel, spot: Spot, surface: Surface, fill: float) -> Placement | None:
-    """The projector at ``spot``, upright, with the seen part of ``surface`` in the middle of its picture.
+def aimed(model: ProjectorModel, mounting_point: MountingPoint, surface: Surface, fill: float) -> Placement | None:
+    """The projector at ``mounting_point``, upright, with the seen part of ``surface`` in the middle of its picture.
 
     Direction and zoom depend on each other through the lens shift and are found together. ``fill``: the share of the
     picture, along its tighter side, that the object takes; less where the zoom does not reach so far, more where even
@@ -27,7 +27,7 @@ def aimed(model: ProjectorModel, spot: Spot, surface: Surface, fill: float) -> P
     middle = 0.5 * (size - 1.0)
     shift = np.asarray(model.lens_shift) * size
     centre = middle + np.array([-shift[0], shift[1]])
-    position = np.asarray(spot.position_m, np.float64)
+    position = np.asarray(mounting_point.position_m, np.float64)
     seen = surface.points_m[surface.area_m2 > 0]
     target, focal = seen.mean(axis=0), model.throw_ratio[0] * size[0]
     local, across = np.empty_like(seen), _level(target - position)
@@ -45,7 +45,9 @@ def aimed(model: ProjectorModel, spot: Spot, surface: Surface, fill: float) -> P
             break
         target = target + float(local[:, 2].mean()) * (turned.T @ (*miss, 0.0))
     weight = surface.area_m2[surface.area_m2 > 0] / local[:, 2] ** 2
-    return Placement(model, spot, turned, focal, (float(centre[0]), float(centre[1])), best_focus(local[:, 2], weight))
+    return Placement(
+        model, mounting_point, turned, focal, (float(centre[0]), float(centre[1])), best_focus(local[:, 2], weight)
+    )
 
 
 def _level(forward: Float64) -> Float64:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import Float64, Mask
 from controller.plan.resolution import FAINT, MEAN, LineProjector, finest_wave
-from controller.plan.search import Chosen
+from controller.plan.search import PlacementPlan
 from controller.plan.values import Illumination, Placement, PlanGoal, Surface
 
 
@@ -42,7 +42,7 @@ CAMERA_BLUR_PX: Final = 0.25
 """Of a projector pixel: what a camera adds whose pixels are a third of that, blurred by 0.7 of its own."""
 
 
-def figures_of(best: Chosen, surface: Surface, goal: PlanGoal) -> dict[str, Any]:
+def figures_of(best: PlacementPlan, surface: Surface, goal: PlanGoal) -> dict[str, Any]:
     """Placements in words of a stand and a lens, and what the seen surface gets of each and of all."""
     weight = surface.area_m2 / surface.area_m2.sum()
     found = combined_light([one.lit for one in best.candidates], np.stack([one.useful for one in best.candidates]))
@@ -95,8 +95,8 @@ def _placed(placement: Placement) -> dict[str, Any]:
     ahead = placement.rotation[2]
     return {
         "model": placement.model.name,
-        "place": placement.spot.name,
-        "position_m": list(placement.spot.position_m),
+        "place": placement.mounting_point.name,
+        "position_m": list(placement.mounting_point.position_m),
         "rotation": placement.rotation.tolist(),
         "pan_degrees": math.degrees(math.atan2(ahead[0], ahead[2])),
         "tilt_up_degrees": math.degrees(math.asin(-ahead[1])),

@@ -10,12 +10,12 @@ from pydantic import Field
 
 from controller.config.loader import parse_tables, read_toml
 from controller.config.models import ConfigTable, Name, Positive, Size
-from controller.plan.values import PlanGoal, ProjectorModel, Spot
+from controller.plan.values import MountingPoint, PlanGoal, ProjectorModel
 
 Metres3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Two = Annotated[tuple[float, float], Field(strict=False)]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-MOST_SPOTS: Final = 5000
+MOST_POINTS: Final = 5000
 _AXIS: Final = 'one of "+x", "-x", "+y", "-y", "+z", "-z"'
 
 
@@ -110,7 +110,7 @@ class PlanTables(ConfigTable):
     projectors: Annotated[tuple[ProjectorsTable, ...], Field(strict=False, min_length=1, max_length=16)] = Field(
         description="a list of [[projectors]] tables, one for each model"
     )
-    places: Annotated[tuple[PlacesTable, ...], Field(strict=False, max_length=MOST_SPOTS)] = Field(
+    places: Annotated[tuple[PlacesTable, ...], Field(strict=False, max_length=MOST_POINTS)] = Field(
         default=(), description="a list of [[places]] tables with name and position_m"
     )
     shell: ShellTable | None = Field(default=None, description="the table [shell]; optional")
@@ -128,12 +128,12 @@ class PlanTables(ConfigTable):
             for _ in range(table.count)
         ]  # fmt: skip
 
-    def spots(self) -> list[Spot]:
+    def mounting_points(self) -> list[MountingPoint]:
         """Every place, those of the shell named by their angles and distance."""
-        named = [Spot(table.name, table.position_m) for table in self.places]
+        named = [MountingPoint(table.name, table.position_m) for table in self.places]
         return named + ([] if self.shell is None else _on_shell(self.shell))
 
-    def aims(self) -> PlanGoal:
+    def plan_goal(self) -> PlanGoal:
         table = self.goal
         return PlanGoal(
             table.lux, table.detail_mm, table.overlap, table.steepest_degrees, table.fill, table.body_m, table.apart_m
@@ -172,25 +172,25 @@ def _check_places(tables: PlanTables) -> None:
         names.add(table.name)
     if not tables.places and tables.shell is None:
         raise tables.place.missing("places", "[[places]] with name and position_m, or a table [shell]")
-    if tables.shell is not None and len(tables.spots()) > MOST_SPOTS:
-        allowed = f"large enough for at most {MOST_SPOTS} positions"
+    if tables.shell is not None and len(tables.mounting_points()) > MOST_POINTS:
+        allowed = f"large enough for at most {MOST_POINTS} positions"
         raise tables.shell.place.wrong_value(
             "step_degrees", tables.shell.step_degrees, "gives too many positions", allowed
         )
 
 
-def _on_shell(shell: ShellTable) -> list[Spot]:
-    spots = []
+def _on_shell(shell: ShellTable) -> list[MountingPoint]:
+    points = []
     for distance in _steps(*shell.distance_m, shell.step_m):
         for above in _steps(*shell.above_degrees, shell.step_degrees):
             for right in _steps(*shell.right_degrees, shell.step_degrees):
                 name = f"{right:+.0f}° right, {above:+.0f}° up, {distance:.2f} m"
-                spots.append(Spot.round_the_object(name, right_degrees=right, above_degrees=above, distance_m=distance))
-    return spots
+                points.append(MountingPoint.around_object(name, right, above, distance))
+    return points
 
 
 def _steps(first: float, last: float, step: float) -> list[float]:
-    count = min(int(np.floor((last - first) / step + 1e-9)) + 1, MOST_SPOTS + 1)
+    count = min(int(np.floor((last - first) / step + 1e-9)) + 1, MOST_POINTS + 1)
     return [float(first + k * step) for k in range(count)]
 
 

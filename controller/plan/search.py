@@ -19,7 +19,7 @@ from controller.core.arrays import Float64, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.plan.aim import aimed
 from controller.plan.optics import Shadows, lit_by
-from controller.plan.values import Illumination, Placement, PlanGoal, ProjectorModel, Spot, Surface
+from controller.plan.values import Illumination, MountingPoint, Placement, PlanGoal, ProjectorModel, Surface
 
 MOST_EXCHANGES: Final = 50
 STARTS: Final = 4
@@ -39,7 +39,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class PlacementPlan:
     """A plan. ``quality`` 0..1; ``at_points`` (N,) its measure at each point; ``tried``: how many sets were judged."""
 
     candidates: tuple[Candidate, ...]
@@ -87,7 +87,7 @@ class Measure:
 
 def candidates_of(
     models: Sequence[ProjectorModel],
-    spots: Sequence[Spot],
+    mounting_points: Sequence[MountingPoint],
     surface: Surface,
     shadows: Shadows,
     goal: PlanGoal,
@@ -96,18 +96,18 @@ def candidates_of(
     tell: ProgressCallback = lambda share, text: None,
     cancel: threading.Event | None = None,
 ) -> list[list[Candidate]]:
-    """For each model, it at every spot where it can stand and reaches the object at all.
+    """For each model, it at every mounting point where it can stand and reaches the object at all.
 
     Where its body would stand between audience and object is no place. Raises UsageError("plan-no-place") if a model
     has none, WorkError("cancelled").
     """
     known: dict[ProjectorModel, list[Candidate]] = {}
     different = list(dict.fromkeys(models))
-    for number, (model, spot) in enumerate(itertools.product(different, spots)):
+    for number, (model, mounting_point) in enumerate(itertools.product(different, mounting_points)):
         check(cancel)
-        tell(number / (len(different) * len(spots)), f"{model.name} at {spot.name}")
+        tell(number / (len(different) * len(mounting_points)), f"{model.name} at {mounting_point.name}")
         found = known.setdefault(model, [])
-        placement = aimed(model, spot, surface, goal.fill)
+        placement = aimed(model, mounting_point, surface, goal.fill)
         if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
             continue
         lit = lit_by(placement, surface, shadows)
@@ -124,14 +124,14 @@ def candidates_of(
     return [known[model] for model in models]
 
 
-def chosen(
+def choose_placements(
     by_model: Sequence[Sequence[Candidate]],
     surface: Surface,
     goal: PlanGoal,
     *,
     tell: ProgressCallback = lambda share, text: None,
     cancel: threading.Event | None = None,
-) -> Chosen:
+) -> PlacementPlan:
     """One place for every model, best together. The same arguments give the same plan.
 
     Raises UsageError("plan-too-crowded") where no set keeps its distances, WorkError("cancelled").
@@ -163,7 +163,7 @@ def chosen(
             remedy="Add positions, or use a smaller [goal] apart_m or body_m.",
         )
     at_points = measure.at_points(best[1])[0]
-    return Chosen(tuple(flat[index] for index in best[1]), best[0], at_points, tried)
+    return PlacementPlan(tuple(flat[index] for index in best[1]), best[0], at_points, tried)
 
 
 def _greedy(first: int, groups: Sequence[slice], measure: Measure, fits: _Fits) -> tuple[list[int] | None, int]:

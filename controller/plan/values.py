@@ -33,15 +33,15 @@ class ProjectorModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class MountingPoint:
     """A place where a projector can stand: ``position_m`` (3,) of its lens."""
 
     name: str
     position_m: tuple[float, float, float]
 
     @classmethod
-    def round_the_object(cls, name: str, *, right_degrees: float, above_degrees: float, distance_m: float) -> Spot:
-        """A place on a sphere of ``distance_m`` round the object, by degrees to the audience's right and above it."""
+    def around_object(cls, name: str, right_degrees: float, above_degrees: float, distance_m: float) -> MountingPoint:
+        """A place on a sphere of ``distance_m`` around the object, by degrees to the audience's right and above it."""
         azimuth, height = np.deg2rad(right_degrees), np.deg2rad(above_degrees)
         x, y, z = distance_m * np.array(
             [np.sin(azimuth) * np.cos(height), -np.sin(height), -np.cos(azimuth) * np.cos(height)]
@@ -57,7 +57,7 @@ class Placement:
     """
 
     model: ProjectorModel
-    spot: Spot
+    mounting_point: MountingPoint
     rotation: Float64
     focal_px: float
     centre_px: tuple[float, float]
@@ -66,7 +66,7 @@ class Placement:
     @property
     def position_m(self) -> Float64:
         """(3,) of the lens."""
-        return np.asarray(self.spot.position_m, np.float64)
+        return np.asarray(self.mounting_point.position_m, np.float64)
 
     @property
     def throw_ratio(self) -> float:

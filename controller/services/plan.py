@@ -17,7 +17,7 @@ from controller.plan.drawing import layout, value_map
 from controller.plan.figures import combined_light, figures_of
 from controller.plan.optics import lit_by
 from controller.plan.plan_file import EXAMPLE, PlanTables, read_plan
-from controller.plan.search import Chosen, candidates_of, chosen
+from controller.plan.search import PlacementPlan, candidates_of, choose_placements
 from controller.plan.target_object import TargetObject, read_target_object, sampled
 from controller.plan.values import Placement, PlanGoal, Surface
 from controller.plan.view import seen_from
@@ -46,7 +46,7 @@ def write_example(path: Path) -> Mapping[str, Any]:
 def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
     """Choose places for the projectors of ``file``; write plan.html and plan.json into the folder ``out``.
 
-    Raises UsageError as ``read_plan``, ``read_target_object``, ``sampled``, ``candidates_of`` and ``chosen``.
+    Raises UsageError as ``read_plan``, ``read_target_object``, ``sampled``, ``candidates_of``, ``choose_placements``.
     """
     tables = read_plan(file)
     tracker = Tracker(STEPS, WEIGHTS, reporter)
@@ -56,16 +56,23 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
         file.parent / table.mesh, height_m=table.height_m, up=table.up, front=table.front
     )
     audience = np.asarray(tables.audience.positions_m, np.float64)
-    goal = tables.aims()
+    goal = tables.plan_goal()
     surface = sampled(target_object, tables.goal.points, audience, SEED)
     tracker.end()
     tracker.begin(1)
     candidates = candidates_of(
-        tables.models(), tables.spots(), surface, target_object, goal, audience, tell=tracker.advance, cancel=cancel
+        tables.models(),
+        tables.mounting_points(),
+        surface,
+        target_object,
+        goal,
+        audience,
+        tell=tracker.advance,
+        cancel=cancel,
     )
     tracker.end()
     tracker.begin(2)
-    best = chosen(candidates, surface, goal, tell=tracker.advance, cancel=cancel)
+    best = choose_placements(candidates, surface, goal, tell=tracker.advance, cancel=cancel)
     tracker.end()
     tracker.begin(3)
     figures = figures_of(best, surface, goal)
@@ -80,12 +87,12 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
 def _page(
     tables: PlanTables,
     target_object: TargetObject,
-    best: Chosen,
+    best: PlacementPlan,
     surface: Surface,
     audience: Float64,
     figures: Mapping[str, Any],
 ) -> Page:
-    goal = tables.aims()
+    goal = tables.plan_goal()
     placements = [candidate.placement for candidate in best.candidates]
     room = ReportPicture("The room", layout(placements, surface, audience), "metres from the centre of the object")
     galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]
@@ -96,7 +103,7 @@ def _page(
         )
     return Page(
         title=f"Plan for {Path(tables.object.mesh).stem}",
-        summary=f"{len(placements)} projectors in {len(tables.spots())} places; {best.tried} sets were compared. "
+        summary=f"{len(placements)} projectors in {len(tables.mounting_points())} places; {best.tried} sets compared. "
         "Predicted from data sheets: vignetting, lamp age and paint are not included.",
         goals=tuple(_goals(figures, goal)),
         rows=(),

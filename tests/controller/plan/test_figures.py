@@ -6,7 +6,7 @@ from typing import Any
 
 from controller.plan.figures import figures_of
 from controller.plan.optics import lit_by
-from controller.plan.search import Candidate, Chosen
+from controller.plan.search import Candidate, PlacementPlan
 from controller.plan.values import PlanGoal
 from tests.controller.plan.test_optics import FACING, Nothing, wall
 
@@ -19,7 +19,7 @@ def on_a_wall(count: int) -> dict[str, Any]:
     surface = wall(steps=21, half_m=0.2)
     lit = lit_by(FACING, surface, Nothing())
     candidates = (Candidate(FACING, lit, lit.useful(GOAL.steepest_degrees)),) * count
-    return figures_of(Chosen(candidates, 1.0, lit.lux, 1), surface, GOAL)
+    return figures_of(PlacementPlan(candidates, 1.0, lit.lux, 1), surface, GOAL)
 
 
 def test_one_projector_makes_waves_of_little_more_than_two_pixels_and_three_make_finer_ones() -> None:

@@ -15,12 +15,12 @@ from controller.core.arrays import Float64, Mask
 from controller.plan.aim import aimed
 from controller.plan.optics import FWHM, best_focus, blur, lit_by
 from controller.plan.target_object import TargetObject, sampled
-from controller.plan.values import Placement, ProjectorModel, Spot, Surface
+from controller.plan.values import MountingPoint, Placement, ProjectorModel, Surface
 from tests.controller.plan.conftest import EYE
 
 FACING = Placement(
     ProjectorModel("plain", (400, 300), 600.0, (1.0, 3.0), (0.0, 0.0), 0.02, 0.35),
-    Spot("here", (0.0, 0.0, -2.0)), np.eye(3), 800.0, (199.5, 149.5), 2.0,
+    MountingPoint("here", (0.0, 0.0, -2.0)), np.eye(3), 800.0, (199.5, 149.5), 2.0,
 )  # fmt: skip
 """Two metres before the origin, looking at it."""
 
@@ -105,7 +105,7 @@ def test_the_balls_far_side_and_what_another_thing_shades_get_nothing(
     target_object: TargetObject, model: ProjectorModel
 ) -> None:
     surface = sampled(target_object, 800, np.concatenate((EYE, -EYE)), seed=1)
-    placement = aimed(model, Spot("front", (0.0, 0.0, -1.5)), surface, 0.9)
+    placement = aimed(model, MountingPoint("front", (0.0, 0.0, -1.5)), surface, 0.9)
     assert placement is not None
     lit = lit_by(placement, surface, target_object)
     front = surface.points_m[:, 2] < -0.05
@@ -158,7 +158,7 @@ def test_an_aimed_projector_holds_the_object_in_the_middle_and_stays_level(
     at = distance * np.array([np.sin(a) * np.cos(b), -np.sin(b), -np.cos(a) * np.cos(b)])
     surface = sampled(target_object, 400, EYE, seed=2)
     shifted = replace(model, lens_shift=(side, up))
-    placement = aimed(shifted, Spot("there", (float(at[0]), float(at[1]), float(at[2]))), surface, 0.8)
+    placement = aimed(shifted, MountingPoint("there", (float(at[0]), float(at[1]), float(at[2]))), surface, 0.8)
     assert placement is not None
     np.testing.assert_allclose(placement.rotation @ placement.rotation.T, np.eye(3), atol=1e-12)
     level = np.cross((0.0, 1.0, 0.0), surface.points_m[surface.area_m2 > 0].mean(axis=0) - at)
@@ -175,4 +175,4 @@ def test_an_aimed_projector_holds_the_object_in_the_middle_and_stays_level(
 
 def test_nothing_can_be_aimed_from_within_the_object(target_object: TargetObject, model: ProjectorModel) -> None:
     surface = sampled(target_object, 400, EYE, seed=2)
-    assert aimed(model, Spot("inside", (0.0, 0.0, 0.0)), surface, 0.8) is None
+    assert aimed(model, MountingPoint("inside", (0.0, 0.0, 0.0)), surface, 0.8) is None

@@ -20,12 +20,12 @@ def written(tmp_path: Path, text: str) -> Path:
 def test_the_example_is_a_plan_of_three_projectors_in_places_named_and_all_round(tmp_path: Path) -> None:
     tables = read_plan(written(tmp_path, EXAMPLE))
     assert [model.size_px for model in tables.models()] == [(1400, 1050)] * 3
-    spots = tables.spots()
-    assert spots[0].name == "shelf"
-    assert len({spot.name for spot in spots}) == len(spots) == 1 + 3 * 5 * 13
-    away = np.linalg.norm([spot.position_m for spot in spots[1:]], axis=1)
+    points = tables.mounting_points()
+    assert points[0].name == "shelf"
+    assert len({point.name for point in points}) == len(points) == 1 + 3 * 5 * 13
+    away = np.linalg.norm([point.position_m for point in points[1:]], axis=1)
     np.testing.assert_allclose(np.unique(away.round(9)), (1.0, 1.25, 1.5))
-    assert tables.aims().overlap == 2
+    assert tables.plan_goal().overlap == 2
 
 
 @pytest.mark.parametrize(

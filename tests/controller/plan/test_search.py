@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError, WorkError
-from controller.plan.search import Candidate, Measure, candidates_of, chosen, in_the_way
+from controller.plan.search import Candidate, Measure, candidates_of, choose_placements, in_the_way
 from controller.plan.target_object import TargetObject, sampled
-from controller.plan.values import PlanGoal, ProjectorModel, Spot, Surface
+from controller.plan.values import MountingPoint, PlanGoal, ProjectorModel, Surface
 from tests.controller.plan.conftest import EYE
 
 GOAL = PlanGoal(4000.0, 0.8, 2, 75.0, 0.9, 0.1, 0.3)
 
 
-def on_ring(count: int, distance_m: float = 1.3) -> list[Spot]:
+def on_ring(count: int, distance_m: float = 1.3) -> list[MountingPoint]:
     angles = np.deg2rad(np.linspace(-85, 85, count))
     return [
-        Spot(f"{np.rad2deg(a):.0f}", (float(distance_m * np.sin(a)), -0.5, float(-distance_m * np.cos(a))))
+        MountingPoint(f"{np.rad2deg(a):.0f}", (float(distance_m * np.sin(a)), -0.5, float(-distance_m * np.cos(a))))
         for a in angles
     ]
 
@@ -43,7 +43,7 @@ def test_the_best_set_of_all_is_found(
     target_object: TargetObject, surface: Surface, model: ProjectorModel, goal: PlanGoal, count: int
 ) -> None:
     by_model = tried(target_object, surface, model, goal, count=count)
-    best = chosen(by_model, surface, goal)
+    best = choose_placements(by_model, surface, goal)
     judge = Measure.of(by_model[0], surface, goal)
     at = [np.asarray(one.placement.position_m) for one in by_model[0]]
     allowed = [
@@ -57,28 +57,33 @@ def test_the_best_set_of_all_is_found(
 def test_more_projectors_are_never_worse_and_more_light_wanted_never_better(
     target_object: TargetObject, surface: Surface, model: ProjectorModel
 ) -> None:
-    by_count = [chosen(tried(target_object, surface, model, GOAL, count=n), surface, GOAL).quality for n in (1, 2, 3)]
+    by_count = [
+        choose_placements(tried(target_object, surface, model, GOAL, count=n), surface, GOAL).quality for n in (1, 2, 3)
+    ]
     assert by_count == sorted(by_count)
     demanding = replace(GOAL, lux=40000.0)
-    assert chosen(tried(target_object, surface, model, demanding, count=2), surface, demanding).quality < by_count[1]
+    assert (
+        choose_placements(tried(target_object, surface, model, demanding, count=2), surface, demanding).quality
+        < by_count[1]
+    )
 
 
 def test_a_place_in_the_audiences_view_is_none(
     target_object: TargetObject, surface: Surface, model: ProjectorModel
 ) -> None:
-    spots = [Spot("in front", (0.0, 0.0, -1.0)), Spot("beside", (0.9, 0.0, -0.9))]
-    (found,) = candidates_of([model], spots, surface, target_object, GOAL, EYE)
-    assert [one.placement.spot.name for one in found] == ["beside"]
+    points = [MountingPoint("in front", (0.0, 0.0, -1.0)), MountingPoint("beside", (0.9, 0.0, -0.9))]
+    (found,) = candidates_of([model], points, surface, target_object, GOAL, EYE)
+    assert [one.placement.mounting_point.name for one in found] == ["beside"]
     assert in_the_way(np.array([0.0, 0.0, -1.0]), EYE, surface, 0.1)
     with pytest.raises(UsageError) as refused:
-        candidates_of([model], spots[:1], surface, target_object, GOAL, EYE)
+        candidates_of([model], points[:1], surface, target_object, GOAL, EYE)
     assert refused.value.code == "plan-no-place"
 
 
 def test_two_can_not_stand_in_one_place(target_object: TargetObject, surface: Surface, model: ProjectorModel) -> None:
     by_model = candidates_of([model, model], on_ring(9)[:1], surface, target_object, GOAL, EYE)
     with pytest.raises(UsageError) as refused:
-        chosen(by_model, surface, GOAL)
+        choose_placements(by_model, surface, GOAL)
     assert refused.value.code == "plan-too-crowded"
 
 

@@ -15,9 +15,9 @@ from controller.config.writer import toml_text
 from controller.core.arrays import Float64, FloatImage
 from controller.core.storage import write_atomically
 from controller.plan.figures import figures_of
-from controller.plan.search import Chosen, candidates_of, chosen
+from controller.plan.search import PlacementPlan, candidates_of, choose_placements
 from controller.plan.target_object import TargetObject, read_target_object, sampled
-from controller.plan.values import Placement, PlanGoal, ProjectorModel, Spot, Surface
+from controller.plan.values import MountingPoint, Placement, PlanGoal, ProjectorModel, Surface
 from controller.report.pictures import crop_around
 from controller.study.experiments.placement.measuring import (
     PlacementComparison,
@@ -73,22 +73,22 @@ def set_up(stand: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]
     }
 
 
-def planned(mesh: Path) -> tuple[TargetObject, Chosen, Surface]:
+def planned(mesh: Path) -> tuple[TargetObject, PlacementPlan, Surface]:
     """The plan for a mesh that stands as the bench puts it up; the same each time."""
     target_object = read_target_object(mesh, height_m=0.30, up="+y", front="+z")
     surface = sampled(target_object, POINTS, CAMERA_M, seed=1)
-    by_model = candidates_of([MODEL] * COUNT, _spots(), surface, target_object, GOAL, CAMERA_M)
-    return target_object, chosen(by_model, surface, GOAL), surface
+    by_model = candidates_of([MODEL] * COUNT, _mounting_points(), surface, target_object, GOAL, CAMERA_M)
+    return target_object, choose_placements(by_model, surface, GOAL), surface
 
 
-def _spots() -> list[Spot]:
-    spots = []
+def _mounting_points() -> list[MountingPoint]:
+    points = []
     for distance in (1.1, 1.3, 1.5):
         for above in (5.0, 15.0, 25.0, 35.0):
             for right in range(-60, 61, 10):
                 name = f"{right:+d}, {above:.0f}, {distance:.1f}"
-                spots.append(Spot.round_the_object(name, right_degrees=right, above_degrees=above, distance_m=distance))
-    return spots
+                points.append(MountingPoint.around_object(name, right, above, distance))
+    return points
 
 
 def _stand(number: int, placement: Placement) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def _table(names: Sequence[str], found: Sequence[PlacementComparison]) -> Result
     return ResultTable("placement", "Predicted and measured", columns, tuple(rows))
 
 
-def _plan_table(best: Chosen, surface: Surface) -> ResultTable:
+def _plan_table(best: PlacementPlan, surface: Surface) -> ResultTable:
     figures = figures_of(best, surface, GOAL)
     rows = [
         (
