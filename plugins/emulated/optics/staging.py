@@ -106,7 +106,7 @@ def random_truth(
 
 
 SLOW_PICTURE_S: Final = 120
-QUICK_PX: Final = 4_000_000
+QUICK_PX: Final = 1_000_000
 """Larger pictures take the bench longer than a camera."""
 
 
