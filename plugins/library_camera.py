@@ -32,6 +32,7 @@ class LibraryCamera:
             note=lambda code, what: self._troubles.append((code, what)),
         )
         self._settings: ExposureSettings | None = None
+        self._configured = 0
         try:
             self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
         except BaseException:
@@ -56,15 +57,15 @@ class LibraryCamera:
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
         confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
-        self._settings = confirmed
+        self._settings, self._configured = confirmed, self.process.starts
         return confirmed
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
         """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the process ended."""
         try:
-            if self.process.pid is None and self._settings is not None:
-                # A process that was ended by a deadline has forgotten its exposure.
-                self.process.request("configure", self._settings, deadline=deadline)
+            if self._settings is not None and (self.process.pid is None or self.process.starts != self._configured):
+                # The process was ended, perhaps also started again by another request: its exposure is forgotten.
+                self.configure(self._settings, deadline=deadline)
             left_s = deadline.left_s()
             # The worker ends before the caller does: it knows why there is no picture.
             theirs_s = left_s - min(_MARGIN_S, left_s / 5)

@@ -123,6 +123,27 @@ def test_a_crash_of_the_library_costs_the_picture_and_not_the_controller(camera:
     assert camera.capture(tmp_path / "shot", deadline=in_seconds(20))
 
 
+def test_a_crash_between_two_pictures_does_not_change_the_exposure(camera: GenicamCamera, tmp_path: Path) -> None:
+    """Also where the camera itself has another one by then, as after its power was off."""
+
+    def brightness(camera: GenicamCamera) -> float:
+        (file,) = camera.capture(tmp_path / "shot", deadline=in_seconds(20))
+        return float(read_mosaic(file.path).samples.mean())
+
+    camera.configure(ExposureSettings(0.002, 100), deadline=in_seconds(20))
+    short = brightness(camera)
+    assert camera.process.pid is not None
+    os.kill(camera.process.pid, signal.SIGSEGV)
+    other = open_camera({"address": ADDRESS, "format": "BayerRG8"}, OpenContext(Path()), in_seconds(20))
+    other.configure(ExposureSettings(0.02, 100), deadline=in_seconds(20))
+    long = brightness(other)
+    other.close()
+    assert camera.identity(deadline=in_seconds(20)).model
+    assert camera.troubles()
+    assert brightness(camera) == pytest.approx(short, rel=0.02)
+    assert long > 1.2 * short
+
+
 def test_another_serial_number_and_a_format_it_lacks_are_named() -> None:
     with pytest.raises(DeviceRefused) as other:
         open_camera({"address": ADDRESS, "serial": "7"}, OpenContext(Path()), in_seconds(20))
