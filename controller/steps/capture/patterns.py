@@ -15,7 +15,7 @@ from controller.artefacts.pattern_plans import PhotographOptions
 from controller.artefacts.photographs import BLACK, WHITE, codes_of
 from controller.artefacts.projectors import Light
 from controller.capture.acquire import Shot
-from controller.capture.brackets import choose_brackets, choose_exposure
+from controller.capture.brackets import choose_brackets
 from controller.capture.jpeg_response import nominal_response
 from controller.capture.latency import LONGEST_S
 from controller.capture.pattern_frames import device_frame
@@ -159,12 +159,10 @@ def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_
         )
         image = read_photograph(file.path, response=nominal_response()).measured()
         file.path.unlink()
-        choice = choose_exposure(image, confirmed_s, available)
+        choice = choose_brackets(image, confirmed_s, available, most=WHITE_EXPOSURES)
+        exposure_s = choice.exposures_s[0]
         if choice.settled:
-            brackets = choose_brackets(image, confirmed_s, available, most=WHITE_EXPOSURES)
-            if brackets.settled:
-                return Exposures(choice.exposure_s, brackets.exposures_s)
-        exposure_s = choice.exposure_s
+            return Exposures(exposure_s, choice.exposures_s)
     rig.check_light(deadline=context.deadline)  # a longer exposure does not help with a dead lamp
     raise CalibrationError(
         "exposure-not-found",
