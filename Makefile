@@ -1,5 +1,6 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
-# make test   every test; WORKERS=3 chooses how many run side by side
+# make test   every test but the long ones; WORKERS=3 chooses how many run side by side, TESTS=tests/hal which
+# make test-long   the long ones: booted machines, whole stages, a second renderer
 # make check  lint, types, import contracts, documentation and the fast tests, side by side, in under two minutes
 # make docs   this documentation as a website in build/docs; fails on a broken link
 # make figures   measured figures into the documents that name them, and the pages of the study from their data
@@ -28,13 +29,13 @@ COUNT ?=
 CORES := $(shell nproc 2>/dev/null || echo 2)
 # Many tests wait for devices and programs, so there are more workers than cores. A worker that crashed is not started
 # again: pytest-xdist would run its file again and again, without an end.
-WORKERS ?= $(shell expr $(CORES) + 1)
+WORKERS ?= $(shell expr $(CORES) + 2)
 # Folders of tests that need no other program. `slow` marks those that take seconds.
 FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture config core kiosk/decide plan report solve transport) \
 	tests/plugins/ptp tests/test_architecture.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: deb demo docs figures blender test test-setup fast check lint style types contracts website bench campaign nightly lock clean
+.PHONY: deb demo docs figures blender test test-long test-setup fast check lint style types contracts website bench campaign nightly lock clean
 
 demo:
 	@.ci/setup demo
@@ -43,8 +44,13 @@ demo:
 blender:
 	@.ci/setup-blender
 
+PYTEST := .venv/bin/python -m pytest --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=0
+
 test: test-setup
-	.venv/bin/python -m pytest --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=0 $(TESTS)
+	$(PYTEST) $(if $(TESTS),$(TESTS),-m "not long")
+
+test-long: test-setup
+	$(PYTEST) -m long $(TESTS)
 
 test-setup:
 	@.ci/setup test

@@ -13,6 +13,8 @@ from tests.booted.trees import obstacle
 
 ORDER = ("bare", "playing", "faults", "update", "work", "wiped")
 """Of the files: each goes on with the machine that the one before left."""
+SHORT = "bare"
+"""The file that also `make test` runs, on the older Debian; the others are for `make test-long`."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -24,6 +26,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for place, item in zip(places, ours, strict=True):
         for mark in (pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.skipif(why is not None, reason=str(why))):
             item.add_marker(mark)
+        if item.path.stem != f"test_{SHORT}" or f"[{min(DEBIAN)}" not in item.name:
+            item.add_marker(pytest.mark.long)
         items[place] = item
 
 

@@ -26,6 +26,7 @@ from plugins.emulated.optics.bumps import Bump, write_bumps
 from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY
 
+pytestmark = pytest.mark.long
 LEFT = Bump("projector", "left", shift_px=(1.2, -0.7))
 
 

@@ -28,7 +28,7 @@ from tests.end_to_end.program import (
     velatura,
 )
 
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 NAMES = ("left", "right", "above")
 QUICK = """
 [capture]

@@ -36,7 +36,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied, wait_for
 from tests.end_to_end.test_targets import CAMERA_PX, grey_png
 
-pytestmark = pytest.mark.timeout(1500)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1500)]
 LONG_MS = 800_000
 HEAD = "\n[[appearances]]"
 

@@ -24,7 +24,7 @@ from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Bench, Command, lamps, powers, processes_on, strikes, velatura, wrong_code
 from tests.waiting import eventually
 
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 CAMERA_PX = (776, 520)
 Image = npt.NDArray[np.uint8]
 

@@ -14,7 +14,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Command, velatura
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 TINTS = {"warm": [0.9, 0.6, 0.4], "cold": [0.4, 0.6, 0.9]}
 
 

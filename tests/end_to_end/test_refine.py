@@ -14,7 +14,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Command, powers, shots, velatura, wrong_code
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 NAME = "gloss"
 INDIRECT = {"what": "ambient", "indirect": 0.08}
 WORSE = 1.5

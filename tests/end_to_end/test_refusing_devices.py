@@ -15,7 +15,7 @@ from hal.values import Power
 from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import LONGEST_S, REPOSITORY, Bench, Command, lamps, powers, velatura, wrong_code
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")

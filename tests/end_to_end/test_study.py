@@ -31,7 +31,7 @@ from plugins.emulated.optics.sensor import REFERENCE_APERTURE_F
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import run_of
 
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 
 
 @dataclass

@@ -14,7 +14,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import asked, run_of, velatura
 
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 CAMERA_PX = (776, 520)
 
 

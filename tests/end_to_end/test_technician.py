@@ -22,6 +22,7 @@ from tests.controller.panel.browser import CHROMIUM, chromium, tab
 from tests.end_to_end.program import REPOSITORY, Command, processes_on
 
 pytestmark = [
+    pytest.mark.long,
     pytest.mark.timeout(900),
     pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)"),
 ]

@@ -16,7 +16,7 @@ from tests.real_kernel.machine import obstacle, run
 from tests.real_kernel.uvc_camera import BLACK, FULL, HEIGHT, WIDTH
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.long, pytest.mark.slow]
 
 
 def on_the_machine(file: str, modules: dict[str, str], out: Path, *more: str, suite: str = "bookworm") -> list[str]:

@@ -33,6 +33,7 @@ from tests.plugins.emulated.optics.mitsuba_stage import (
 )
 
 Image = npt.NDArray[np.float64]
+pytestmark = pytest.mark.long
 SIZE_PX = (80, 60)
 BOUNCES = 12
 SAMPLES = 256
