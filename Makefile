@@ -1,7 +1,7 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
 # make test   every test but the long ones; WORKERS=3 chooses how many run side by side, TESTS=tests/hal which
 # make test-long   the long ones: booted machines, whole stages, a second renderer
-# make check  lint, types, import contracts, documentation and the fast tests, side by side, in under two minutes
+# make check  lint, types, import contracts, documentation and the fast tests, side by side, in two minutes
 # make docs   this documentation as a website in build/docs; fails on a broken link
 # make figures   measured figures into the documents that name them, and the pages of the study from their data
 # make blender   Blender, for targets that it renders
@@ -70,7 +70,7 @@ check:
 # The parts of `check` have their set-up done.
 fast:
 	@.venv/bin/python -m hal.runtime.kernels compile
-	.venv/bin/python -m pytest -q -m "not slow" -n $(CORES) --dist loadfile $(FAST)
+	.venv/bin/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(FAST)
 
 style:
 	.venv/bin/ruff check .

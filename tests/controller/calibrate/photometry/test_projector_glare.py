@@ -77,6 +77,7 @@ def _noisy(light: Float64, rng: np.random.Generator) -> FloatImage:
     return (light + rng.standard_normal(light.shape) * np.sqrt(light / 36_000 + 1e-7)).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("veil", "least", "most"), [(even, 1.0, 3.0), (scattered, 0.6, 1.4)], ids=["even", "by angle"])
 @pytest.mark.parametrize("glare", [0.02, 0.04])
 @pytest.mark.parametrize("seed", [0, 1])
@@ -96,6 +97,7 @@ def test_a_veil_is_named() -> None:
     assert "projector left" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounced", [0.0, 0.05, 0.2])
 @pytest.mark.parametrize("lens", [0.0, 0.04])
 @pytest.mark.parametrize("seed", [0, 1])
