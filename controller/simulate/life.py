@@ -123,7 +123,7 @@ class Life:
             # It has another name each time, and the kiosk names files of which its disk takes no more.
             self.witness.log.here = f"{here}/"
             rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.place.rows)
-            make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check))
+            make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check), self.place.bundles)
             self.world.scheduler.on_kill = self.news.set
             self.boot()
             try:

@@ -20,6 +20,8 @@ from controller.simulate.disk import Disk
 from controller.simulate.scheduler import Scheduler
 
 TROUBLES: Final = ("slow", "doubles", "torn", "garbles", "loses", "reorders")
+UNHEARD: Final = ("slow", "garbles", "loses")
+"""Those of which some answers are none, or come too late."""
 END_S: Final = 5.0
 
 

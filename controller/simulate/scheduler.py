@@ -78,13 +78,16 @@ class Program:
 
 
 class Scheduler:
-    """``stretch``: how much longer than asked the pauses of calm tasks are; see ``rush``."""
+    """``stretch``: how much longer than asked the pauses of calm tasks are; see ``rush``. ``brisk``: the name of tasks
+    whose pauses are not, or empty.
+    """
 
     def __init__(self, seed: str) -> None:
         self._random = random.Random(f"{seed} turns")
         self.now_s = 0.0
         self.stretch = 1.0
         self.longest_s = 1800.0
+        self.brisk = ""
         self.crashes: list[tuple[str, BaseException]] = []
         self.turns = 0
         self.on_kill: Callable[[], None] = lambda: None
@@ -139,7 +142,7 @@ class Scheduler:
         me = self.present
         if seconds is not None:
             asked_s = seconds
-            if calm and self.stretch > 1:
+            if calm and self.stretch > 1 and me.name != self.brisk:
                 me.asked_s = asked_s
                 self._calm[me] = None
                 seconds = max(asked_s, min(asked_s * self.stretch, self.longest_s))

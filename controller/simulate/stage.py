@@ -28,11 +28,12 @@ TRUST: Final = Trust((bytes(_KEY.verify_key),))
 _SIDE_PX: Final = 8
 
 
-def make_stage(folder: Path, schedule: Schedule) -> None:
-    """Write all that a kiosk needs to play."""
+def make_stage(folder: Path, schedule: Schedule, bundles: int) -> None:
+    """Write all that a kiosk needs to play; so many bundles are published, one after the other."""
     folder.mkdir()
     (folder / "stage.toml").write_text(_text(schedule), "utf-8")
-    publish(folder, 1_767_225_600)
+    for number in range(bundles):
+        publish(folder, 1_767_225_600 + number)
 
 
 def publish(folder: Path, created_unix_s: int, missing: Collection[str] = ()) -> Path:

@@ -174,9 +174,10 @@ class Devices:
 
         silenced = None if self.mains is None else partial(self.mains.silences, table.name)
         unfed = partial(self._unfed, table.name)
-        # Lit when the service before this one ended: it may burn behind a line that does not answer.
+        # Lit when the service before this one ended: it may burn behind a line that does not answer. So may one of
+        # which nothing is known, because the ledger was damaged: its record has no boot.
         record = self._ledger.read(table.name)
-        maybe_lit = record is not None and record.lit and record.boot == self._world.boot()
+        maybe_lit = record is not None and record.lit and record.boot in ("", self._world.boot())
         return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
                                    deadline=self._world.deadline, maybe_lit=maybe_lit)  # fmt: skip
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Final
 
 from controller.bundle.install import current, previous
-from controller.bundle.reader import Bundle
 from controller.bundle.starts import Starts
-from controller.core.errors import VelaturaError
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
-from controller.simulate.judge.witness import GOES_BACK_S, PLAYER_S, REPAIR_S
-from controller.simulate.stage import TRUST, publish
+from controller.simulate.judge.bundles import SHOWN_S, is_sound
+from controller.simulate.judge.log_file import readable
+from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
+from controller.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
 MEND_FILE_S: Final = 600.0
@@ -36,6 +36,7 @@ def file_damaged(life: Living, item: Item) -> None:
             path.write_bytes(_damaged(before, item))
         if item.who.startswith("kiosk/events"):
             life.witness.log.begun_checks.clear()
+            life.witness.log.damaged(readable(STAGE / "kiosk" / "events.sqlite"))
             life.witness.wanted.unsure_until_hours()
         if item.who.endswith("lamps.json"):
             life.witness.lamps.ledger_lost()
@@ -82,14 +83,15 @@ def bundle_damaged(life: Living, item: Item) -> None:
     newest, earlier = current(bundles), previous(bundles)
     if newest is None:
         return
-    _spoil(newest)
-    if item.how == "all" and earlier is not None:
-        _spoil(earlier)
+    for file in [newest, earlier] if item.how == "all" else [newest]:
+        if file is not None:
+            _spoil(file)
+            witness.bundles.spoilt.setdefault(file.name, world.scheduler.now_s)
     if world.screen.process is not None:
         world.screen.process.kill()
     repaired_s = item.for_s or MEND_FILE_S
     witness.bundle_bad_until_s = max(witness.bundle_bad_until_s, world.scheduler.now_s + repaired_s)
-    witness.disturb(GOES_BACK_S if _goes_back(bundles, earlier) else repaired_s, PLAYER_S)
+    witness.disturb(SHOWN_S if _goes_back(bundles, earlier) else repaired_s, PLAYER_S)
     witness.disturb_player(repaired_s)
 
     def repair() -> None:
@@ -123,8 +125,4 @@ def _goes_back(bundles: Path, earlier: Path | None) -> bool:
     """Whether the player can play the bundle before instead of the newest."""
     if earlier is None or earlier.name == Starts.read(bundles).given_up:
         return False
-    try:
-        Bundle.open_trusted(earlier, TRUST).close()
-    except VelaturaError:
-        return False
-    return True
+    return is_sound(earlier)

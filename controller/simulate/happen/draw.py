@@ -45,9 +45,11 @@ SEVERAL: Final = (0.3, 0.6, 0.9)
 ALIKE: Final = (0.0, 0.1, 0.4)
 """Share of what happens to one projector that has a cause that all of them share, such as their air or their mains."""
 RESTLESS: Final = ("garbled", "flaky", *TROUBLES)
-RESTLESS_S: Final = 900.0
+RESTLESS_S: Final = {"line": 900.0, "player": 450.0}
 """Trouble that comes and goes every second is not drawn for longer: it would take most of the time of a life."""
 LONGEST_S: Final = 40_000.0
+NOTICED_S: Final = 1800.0
+"""It takes people so long at least to notice a damaged bundle, and to publish the appearances again."""
 
 _Weights = Mapping[str, float]
 KINDS: Final[_Weights] = {
@@ -99,7 +101,8 @@ def setting(seed: str) -> Setting:
     soon = chance.random() < 0.5
     zone = chance.choice(CHANGING if soon else ZONES)
     rows = hours(chance, chance.choice((0.1, 0.9, 0.9) if soon else (0.0, 0.1, 0.9)))
-    return Setting(begins(chance, zone, soon=soon).timestamp(), zone, rows, chance.choice(["03:30", "02:30", "23:00"]))
+    drift_check = chance.choice(["03:30", "02:30", "23:00"])
+    return Setting(begins(chance, zone, soon=soon).timestamp(), zone, rows, drift_check, chance.choice((1, 2, 2)))
 
 
 def hours(chance: random.Random, late: float) -> list[dict[str, str]]:
@@ -235,7 +238,7 @@ class _Drawing:
         at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
         how = leaning.drawn(chance, what, HOW[what]) if what in HOW else ""
         lasts_s = round(chance.uniform(*LASTS_S[leaning.drawn(chance, "lasts", list(LASTS_S))]), 1)
-        lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S) if how in RESTLESS else lasts_s
+        lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S[what]) if how in RESTLESS else lasts_s
         name = chance.choice(NAMES)
         match what:
             case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand" | "cable out":
@@ -246,7 +249,7 @@ class _Drawing:
             case "file damaged":
                 return Item(at_s, what, leaning.drawn(chance, "file", FILES), how, number=round(chance.random(), 3))
             case "bundle damaged":
-                return Item(at_s, what, "", how, max(600.0, lasts_s))
+                return Item(at_s, what, "", how, max(NOTICED_S, lasts_s))
             case "killed while writing":
                 return Item(at_s, what, number=round(chance.uniform(1.0, 8.0) ** 2))
             case "clock set":

@@ -13,6 +13,7 @@ from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.lamps import RULES, Lamp
+from controller.simulate.player import UNHEARD
 from controller.simulate.stage import OUTPUTS, publish
 
 GOES_OUT_S: Final = 35.0
@@ -107,9 +108,11 @@ def _player(life: Living, item: Item) -> None:
         screen.hung = True
     else:
         screen.trouble = item.how
+        # Asked seldom, it would leave two questions in a row unanswered only once in hours.
+        life.world.scheduler.brisk = "player" if item.how in UNHEARD else ""
 
         def repair() -> None:
-            screen.trouble = ""
+            screen.trouble = life.world.scheduler.brisk = ""
 
         life.later(item.for_s, repair)
     witness.disturb_picture(item.for_s + again_s)

@@ -45,12 +45,16 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Where and when a life takes place: ``begins_unix_s``, time ``zone``, opening ``rows``, ``drift_check``."""
+    """Where and when a life takes place: ``begins_unix_s``, time ``zone``, opening ``rows``, ``drift_check``.
+
+    ``bundles``: so many were published before: with the second, there is an older one to go back to.
+    """
 
     begins_unix_s: float
     zone: str
     rows: list[dict[str, str]]
     drift_check: str
+    bundles: int = 1
 
 
 def to_json(place: Setting, items: Sequence[Item]) -> str:

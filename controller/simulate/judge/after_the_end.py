@@ -18,8 +18,6 @@ def after_the_end(witness: Witness, service: Service, *, damaged: frozenset[str]
     )
     witness.log.numbers_again()
     there = {row.number: row for row in rows}
-    if damaged & {"kiosk/events.sqlite", "kiosk/events.sqlite-wal"}:
-        witness.log.rows.clear()
     # A full log forgets its oldest; one that is not full has all of them.
     least = min(there) if len(rows) >= SHOWN else 0
     for number, row in list(witness.log.rows.items()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.interface import EventRow
@@ -21,6 +21,9 @@ MOST_WORDS: Final = 240
 MOST_AGAIN: Final = 20
 """Of the same words; the longest pause between two starts of the player is 30 s."""
 WORDS_S: Final = 300.0
+MOST_ENDS: Final = 12
+"""Of a player because of its silence. One that loses two of five answers is ended up to seven times in this time."""
+ENDED: Final = ("player-hung", "player-gone")
 
 
 class LogWitness:
@@ -45,11 +48,13 @@ class LogWitness:
         self._due_check = ""
         self._recent: deque[tuple[float, str]] = deque()
         self._often: Counter[str] = Counter()
+        self._ends_s: deque[float] = deque(maxlen=MOST_ENDS)
 
     # -- the service
 
     def begins(self) -> None:
         self._held.clear()
+        self._ends_s.clear()
         self.state = State.OFF.value
 
     def killed(self) -> None:
@@ -58,6 +63,10 @@ class LogWitness:
         self._alerted_number = max([self._alerted_number, *(row.number for row in self._world.alerted)])
         self._alerted = len(self._world.alerted)
         self._kills += 1
+
+    def damaged(self, left: Mapping[int, str]) -> None:
+        """Its file was: of what was written, these texts can still be read."""
+        self.rows = {number: row for number, row in self.rows.items() if left.get(number) == row.text}
 
     def numbers_again(self) -> None:
         """What was logged from ``read`` on has numbers that others had, which were never written."""
@@ -129,6 +138,10 @@ class LogWitness:
 
     def _said(self, row: EventRow) -> None:
         now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
+        if row.code in ENDED:
+            self._ends_s.append(now_s)
+            if len(self._ends_s) == MOST_ENDS and now_s - self._ends_s[0] < WORDS_S:
+                raise Broken("few ends", f"the player was ended {MOST_ENDS} times in {now_s - self._ends_s[0]:.0f} s")
         recent.append((now_s, row.text))
         often[row.text] += 1
         while now_s - recent[0][0] >= WORDS_S:

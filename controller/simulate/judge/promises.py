@@ -31,6 +31,9 @@ PROMISES: Final = {
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
     "as usual again": "What people changed of the picture ends when the stage closes.",
     "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
+    "bundle shown": "A wanted picture comes, if a bundle can be read and the display is there, whatever else is wrong.",
+    "bundle named": "A bundle that can't be read is named by each service that begins with it, open or closed.",
+    "few ends": "A player that answers now and then is not ended again and again.",
     "work ends": "Work ends by itself, when it is cancelled and when it fails, and lets go of the stage.",
     "devices back": "A camera that is there again is opened again.",
 }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from controller.kiosk.decide.interfaces import Request
 from controller.kiosk.decide.live_changes import LiveChanges
 from controller.run.state_machine import State
+from controller.simulate.judge.bundles import SHOWN_S, BundleWitness
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.lamps import BACK_S, LampWitness
 from controller.simulate.judge.log import LogWitness
@@ -23,8 +24,6 @@ REPAIR_S: Final = 2000.0
 """After a fault: the longest retry out of the state fault, and the lamps' times."""
 PLAYER_S: Final = 120.0
 """After trouble with the player: its longest pause before a start, and a start that fails."""
-GOES_BACK_S: Final = 900.0
-"""Until a player whose bundle is damaged goes back to the one before: starts in vain, of which each waits longer."""
 BLACK_S: Final = 30.0
 DARK_S: Final = 240.0
 HANGS_S: Final = 45.0
@@ -47,6 +46,7 @@ class Witness:
     def __init__(self, world: SimulatedWorld, calendar: Calendar) -> None:
         self._world, self.wanted = world, Wanted(calendar, lambda: world.truth_s)
         self.lamps = LampWitness(world)
+        self.bundles = BundleWitness(world)
         self.log = LogWitness(world)
         self.paused_long = False
         self.disturbed_until_s = SETTLING_S
@@ -71,6 +71,7 @@ class Witness:
         self.paused_long = True
         self._found_since_s.pop("hangs", None)
         self.log.begins()
+        self.bundles.begins()
 
     def player_fell(self) -> None:
         """The player died or hangs, and nothing else is wrong with it."""
@@ -100,13 +101,14 @@ class Witness:
 
     def disturb_player(self, for_s: float) -> None:
         """Trouble with the player, so long, and what it takes until it shows what it should."""
+        self.bundles.disturbed()
         self.player_disturbed_until_s = max(
             self.player_disturbed_until_s, self._world.scheduler.now_s + for_s + PLAYER_S
         )
 
     def disturb_picture(self, for_s: float) -> None:
         """Something between player and projectors fails for so long: both excuses end when the player shows again."""
-        again_s = GOES_BACK_S if self._world.scheduler.now_s + for_s < self.bundle_bad_until_s else 0.0
+        again_s = SHOWN_S if self._world.scheduler.now_s + for_s < self.bundle_bad_until_s else 0.0
         self.disturb(for_s + again_s, PLAYER_S)
         self.disturb_player(for_s + again_s)
 
@@ -153,6 +155,7 @@ class Witness:
         self.log.alerts()
         self._player(service)
         self._devices(service)
+        self.bundles.judge(kiosk, service)
         self._closed(service, state, wanted)
         self._opened(kiosk, service, state, wanted)
         elapsed_s, self._judged_s = now_s - self._judged_s, now_s

@@ -1,0 +1,94 @@
+"""Checks what a kiosk promises of its bundles: one that can be read is shown, and one that can't is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from controller.bundle.fallback import chosen
+from controller.bundle.install import previous
+from controller.bundle.reader import Bundle
+from controller.bundle.starts import Starts
+from controller.core.errors import VelaturaError
+from controller.simulate.disk import STAGE
+from controller.simulate.judge.promises import Broken
+from controller.simulate.stage import OUTPUTS, TRUST
+from controller.simulate.world import SimulatedWorld
+
+if TYPE_CHECKING:
+    from controller.kiosk.api.kiosk import StageKiosk
+    from controller.kiosk.service import Service
+
+NAMED_S: Final = 30.0
+SHOWN_S: Final = 900.0
+"""Until a player whose bundle is damaged goes back to the one before: starts in vain, of which each waits longer."""
+_FOLDER: Final = STAGE / "bundles"
+
+
+class BundleWitness:
+    """``spoilt``: the names of the files that can't be read any more, and when each went bad."""
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        self._world = world
+        self.spoilt: dict[str, float] = {}
+        self._began_s = 0.0
+        self._dark_since_s: float | None = None
+        self._unnamed_since_s: float | None = None
+
+    def begins(self) -> None:
+        """A service does."""
+        self._began_s = self._world.scheduler.now_s
+        self._dark_since_s = self._unnamed_since_s = None
+
+    def disturbed(self) -> None:
+        """Something happened to the player or its display: it begins anew."""
+        self._dark_since_s = None
+
+    def judge(self, kiosk: StageKiosk, service: Service) -> None:
+        """After a step. Raises Broken."""
+        now_s = self._world.scheduler.now_s
+        if not (self.spoilt and self._is_unnamed(kiosk, service)):
+            self._unnamed_since_s = None
+        elif self._unnamed_since_s is None:
+            self._unnamed_since_s = now_s
+        elif now_s - self._unnamed_since_s > NAMED_S:
+            raise Broken("bundle named", f"for {now_s - self._unnamed_since_s:.0f} s: {kiosk.snapshot().warnings}")
+        if not self._is_dark(service):
+            self._dark_since_s = None
+        elif self._dark_since_s is None:
+            self._dark_since_s = now_s
+        elif now_s - self._dark_since_s > SHOWN_S:
+            raise Broken("bundle shown", f"it is black for {now_s - self._dark_since_s:.0f} s")
+
+    def _is_unnamed(self, kiosk: StageKiosk, service: Service) -> bool:
+        """Whether the service began with a bundle that can't be read, and does not say so."""
+        bundle = service.bundles.bundle()
+        if bundle is None or self.spoilt.get(bundle.name, self._began_s) >= self._began_s:
+            return False
+        return not any("bundle" in text for text in kiosk.snapshot().warnings)
+
+    def _is_dark(self, service: Service) -> bool:
+        """Whether a picture is wanted and could be shown, and is not."""
+        screen, want = self._world.screen, service.player.want
+        if screen.appearance or want is None or want.bundle is None or service.player.identifying:
+            return False
+        crashes = screen.hung or screen.trouble or screen.dies_at_start or screen.dies_at_play
+        shows = not screen.why_dark([(output, 0, 0) for output in OUTPUTS.values()])
+        return shows and not crashes and not self._world.disk.blind and self._playable()
+
+    def _playable(self) -> bool:
+        """Whether the installed bundle can be read, or the one before, which was not given up itself."""
+        now, earlier = chosen(_FOLDER), previous(_FOLDER)
+        if now is not None and now.name not in self.spoilt:
+            return True
+        given_up = Starts.read(_FOLDER).given_up
+        return earlier is not None and earlier.name not in {given_up, *self.spoilt}
+
+
+def is_sound(file: Path) -> bool:
+    """Whether a bundle can be read."""
+    try:
+        Bundle.open_trusted(file, TRUST).close()
+    except VelaturaError:
+        return False
+    return True
