@@ -220,6 +220,12 @@ class Life:
 
     def restart(self, *, lit: bool) -> None:
         """As systemd does: asked to end, then started again. Raises Broken."""
+        self.end(lit=lit)
+        self.world.scheduler.sleep(1.0)
+        self.boot()
+
+    def end(self, *, lit: bool) -> None:
+        """It is asked to end, and killed if it does not."""
         program, scheduler = self.program, self.world.scheduler
         assert program is not None
         self.stop.restarting = lit
@@ -230,8 +236,6 @@ class Life:
         while any(task.is_alive() for task in program.tasks) and scheduler.now_s < ends_s and not program.dead:
             scheduler.sleep(0.5)
         self.end_of_program()
-        scheduler.sleep(1.0)
-        self.boot()
 
     def _serve(self) -> None:
         """As ``controller.cli.serve_command.serve``, without panel and socket."""

@@ -95,7 +95,8 @@ class PlayerSupervisor:
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
         self._patience, self._failed = Patience(), 0
-        self._reached: Showing | None = None
+        self._reached: tuple[Showing | None] | None = None
+        """What was wanted when it answered last, which may be nothing; None: it has not answered yet."""
         self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
         self._turns: tuple[Turn, ...] | None = None
         self._skipped = False
@@ -206,7 +207,8 @@ class PlayerSupervisor:
             self._start()
 
     def _ends_for_silence(self, *, refused: bool = False) -> bool:
-        as_wanted = self._reached is not None and self._reached == self.want
+        # While work shows pictures of its own nothing is wanted here, and an end would make its photographs black.
+        as_wanted = self._reached == (self.want,)
         return self._patience.ends(self._monotonic(), as_wanted=as_wanted, refused=refused)
 
     # -- showing
@@ -243,7 +245,7 @@ class PlayerSupervisor:
         outputs = self._view.outputs
         if outputs is None and self._view.problem is not None:
             self._tell(Decision("player-well", "The player shows what it should again."))
-        self._reached = want
+        self._reached = (want,)
         self._view = replace(self._view, shown=shown, problem=outputs, warning=self._warning(status))
 
     def _see_outputs(self, status: dict[str, Any]) -> None:

@@ -18,11 +18,18 @@ from controller.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
 MEND_FILE_S: Final = 600.0
+STOPPED: Final = "stopped"
 
 
 def file_damaged(life: Living, item: Item) -> None:
-    """While the service is away, a file becomes another one. Somebody puts the settings right after a while."""
-    life.end_of_program()
+    """While the service is away, a file becomes another one. Somebody puts the settings right after a while.
+
+    With the arguments "stopped" the service has ended as it should: what its log's write-ahead log had is in the file.
+    """
+    if item.arguments == STOPPED and life.service is not None:
+        life.end(lit=True)
+    else:
+        life.end_of_program()
     path = STAGE / item.who
     before = path.read_bytes() if path.is_file() else None
     if before is not None:

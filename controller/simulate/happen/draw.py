@@ -68,9 +68,11 @@ COMMANDS: Final[_Weights] = {
     "recalibrate": 4, "cancel": 3, "compare": 2, "set-schedule": 3, "seen": 1, "save-settings": 3, "test-shots": 1,
 }  # fmt: skip
 FILES: Final[_Weights] = {
-    "kiosk/events.sqlite": 1, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
+    "kiosk/events.sqlite": 2, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
     "bundles/starts.json": 1, "lamps.json": 1, "kiosk/stage.toml.good": 1,
 }  # fmt: skip
+BEFORE: Final = ("", "stopped")
+"""How the service ended before a file was damaged: killed, or as it should."""
 HOW: Final[Mapping[str, Sequence[str]]] = {
     "line": LINE_TROUBLES,
     "lamp fails": ("", "goes out"),
@@ -247,7 +249,8 @@ class _Drawing:
                 times = chance.randint(1, 4) * how.startswith("crashes")
                 return Item(at_s, what, "", how, lasts_s if how in TROUBLES else 0.0, times)
             case "file damaged":
-                return Item(at_s, what, leaning.drawn(chance, "file", FILES), how, number=round(chance.random(), 3))
+                who, number = leaning.drawn(chance, "file", FILES), round(chance.random(), 3)
+                return Item(at_s, what, who, how, number=number, arguments=leaning.drawn(chance, "before", BEFORE))
             case "bundle damaged":
                 return Item(at_s, what, "", how, max(NOTICED_S, lasts_s))
             case "killed while writing":
