@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -99,10 +98,10 @@ class LampFile:
         with self._lock:
             unknown = {_UNKNOWN: LampRecord(lit=True)} if self.damaged else {}
             records = {**unknown, **self._records, name: record}
-            entries = ",\n".join(f"  {json.dumps(key)}: {_text(value)}" for key, value in sorted(records.items()))
+            text = json.dumps({key: asdict(value) for key, value in sorted(records.items())}, indent=2)
             # The copy first: if the second one fails, the file is as it was.
             for path in (self._copy, self._path):
-                write_atomically(path, f"{{\n{entries}\n}}\n".encode())
+                write_atomically(path, text.encode() + b"\n")
             self._records = records
 
     def _load(self) -> Mapping[str, LampRecord]:
@@ -123,12 +122,6 @@ class LampFile:
             return {}
         self.damaged = True
         return {name: replace(record, lit=True, boot="") for name, record in kept.items()}
-
-
-@lru_cache(maxsize=64)
-def _text(record: LampRecord) -> str:
-    """It inside the file: one lamp's record changes at a time, and all are written."""
-    return json.dumps(asdict(record), indent=2).replace("\n", "\n  ")
 
 
 def _records(path: Path) -> dict[str, LampRecord]:

@@ -41,7 +41,7 @@ class BundleWitness:
         self._dark_since_s = self._unnamed_since_s = None
 
     def disturbed(self) -> None:
-        """Something happened to the player or its display: it begins anew."""
+        """Something happened to the player or its display: it begins again."""
         self._dark_since_s = None
 
     def judge(self, kiosk: StageKiosk, service: Service) -> None:
