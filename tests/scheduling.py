@@ -7,13 +7,12 @@ share nothing, and those that hold two things. Files that share a machine are ru
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any, Final
 
 from xdist.scheduler import LoadFileScheduling
 
 MAKES_THE_DEMO: Final = "tests/end_to_end/test_demo.py"
-"""Its first test makes it, for all workers; without this file, the first test that needs it."""
+"""Its first test makes it, for all workers."""
 NEEDS_THE_DEMO: Final = (
     "tests/end_to_end/test_kiosk_targets.py",
     "tests/end_to_end/test_on_a_cluster.py",
@@ -91,7 +90,7 @@ class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
         return scope_of(nodeid)
 
     def mark_test_complete(self, node: Any, item_index: int, duration: float = 0) -> None:
-        self._demo_is_made |= file_of(self.registered_collections[node][item_index]) in self._makers
+        self._demo_is_made |= file_of(self.registered_collections[node][item_index]) == MAKES_THE_DEMO
         super().mark_test_complete(node, item_index, duration)
 
     def _reschedule(self, node: Any) -> None:
@@ -110,15 +109,8 @@ class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
 
     def _rank(self, file: str, *, busy: bool) -> int:
         """The file of the lowest rank is the next; for a worker that is ``busy`` with a long one, a short one."""
-        waiting = file in NEEDS_THE_DEMO and not self._demo_is_made and self._others_make_it()
+        waiting = file in NEEDS_THE_DEMO and not self._demo_is_made and self._will_be_made()
         return LONG.index(file) + (2 * len(LONG) if busy or waiting else 0) if file in LONG else len(LONG)
 
-    def _others_make_it(self) -> bool:
-        if self._makers == (MAKES_THE_DEMO,):
-            return True
-        return any(file_of(scope) in self._makers for given in self.assigned_work.values() for scope in given)
-
-    @cached_property
-    def _makers(self) -> tuple[str, ...]:
-        own = any(test.startswith(MAKES_THE_DEMO) for test in self.collection)
-        return (MAKES_THE_DEMO,) if own else NEEDS_THE_DEMO
+    def _will_be_made(self) -> bool:
+        return any(test.startswith(MAKES_THE_DEMO) for test in self.collection)

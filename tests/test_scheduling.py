@@ -101,19 +101,6 @@ def test_without_the_demos_own_tests_nothing_waits_for_them() -> None:
     assert worker.given[0] == len(SHORT)
 
 
-def test_without_the_demos_own_tests_the_first_that_needs_it_makes_it_and_the_others_wait() -> None:
-    tests = [f"{file}::test_{n}" for file in (*SHORT, *NEEDS_THE_DEMO) for n in range(3)]
-    scheduling, (maker, other) = scheduled(tests, 2)
-    for _ in range(60):
-        finish_one(scheduling, other)
-    assert not any(tests[test].startswith(NEEDS_THE_DEMO) for test in other.given)
-    finish_one(scheduling, maker)
-    before = len(other.given)
-    for _ in range(9):
-        finish_one(scheduling, other)
-    assert any(tests[test].startswith(NEEDS_THE_DEMO) for test in other.given[before:])
-
-
 def test_a_worker_gets_a_short_file_while_it_is_busy_with_a_long_one() -> None:
     tests = all_tests(1)
     _, made = scheduled(tests, 3)

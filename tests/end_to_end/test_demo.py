@@ -23,7 +23,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import Record, asked, lamps, processes_on, run_of, shots
 
 APPEARANCES = ["photograph", "new-pattern", "checkerboard", "gloss"]
-pytestmark = pytest.mark.timeout(1200)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "bundle-format.md"
 
 

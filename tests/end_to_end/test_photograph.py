@@ -15,7 +15,7 @@ from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command, velatura
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 NAME = "gloss"
 
 
