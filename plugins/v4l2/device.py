@@ -11,12 +11,15 @@ from ctypes import c_int32
 from pathlib import Path
 from typing import Final
 
-from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from plugins.v4l2 import kernel
 from plugins.v4l2.formats import COMPRESSED, VideoFormat, code_of, is_complete_jpeg, number_of
 from plugins.v4l2.nodes import VideoNode, identify
 
 _BUFFERS: Final = 4
+_GOING_S: Final = 0.5
+"""Linux takes a pulled camera away in this time. Closing its device meanwhile can meet a fault of the kernel (seen with
+6.1), which ends this process: ``media_device_unregister_entity`` reads a pointer before it has the lock."""
 _MOST: Final = 4096
 """Entries of a list that are read, in case a driver's lists never end."""
 
@@ -50,7 +53,15 @@ class VideoDevice:
         for each in self._maps:
             each.close()
         self._maps.clear()
+        if self._is_gone():
+            time.sleep(_GOING_S)
         os.close(self._handle)
+
+    def _is_gone(self) -> bool:
+        try:
+            return not kernel.answered(self._handle, kernel.QUERYCAP, kernel.Capability())
+        except DeviceGone:
+            return True
 
     def codes(self) -> list[str]:
         """The codes of its formats."""
