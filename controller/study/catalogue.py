@@ -12,7 +12,7 @@ from controller.study.experiments.appearances.experiment import APPEARANCES
 from controller.study.experiments.drift import DRIFTING
 from controller.study.experiments.earlier import EARLIER
 from controller.study.experiments.effort import EFFORT
-from controller.study.experiments.frequency import FREQUENCY, FREQUENCY_SHARP, sharp_object
+from controller.study.experiments.frequency.experiment import FREQUENCY, FREQUENCY_SHARP, sharp_object
 from controller.study.experiments.live import LIVE
 from controller.study.experiments.placement.experiment import PLACEMENT, planned_object
 from controller.study.experiments.regions import REGIONS

@@ -20,7 +20,7 @@ from controller.artefacts.geometry import read_geometry
 from controller.core.arrays import FloatImage
 from controller.stage.check import check_stage
 from controller.steps.appearance.solving import device_frames
-from controller.study.experiments.frequency import PLANNED, rising_sinusoid
+from controller.study.experiments.frequency.experiment import PLANNED, rising_sinusoid
 from controller.study.experiments.live import live_pictures
 from controller.study.experiments.residual import BRIGHT, residual
 from controller.study.lab.measuring import SET_COLUMNS

@@ -7,7 +7,8 @@ import pytest
 
 from controller.plan.resolution import last_kept
 from controller.solve.metrics import sharpness
-from controller.study.experiments.frequency import bases, kept_contrast, make_waves
+from controller.study.experiments.frequency.experiment import bases
+from controller.study.experiments.frequency.waves import kept_contrast, make_waves
 from controller.study.lab.measuring import normalised_residual, quality, region_means, sharpness_map, unbounded_inverse
 from controller.study.lab.subject import ReachableTarget
 from tests.controller.study.array_stage import CAMERA, array_subject
