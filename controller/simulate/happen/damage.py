@@ -10,7 +10,7 @@ from controller.bundle.install import current, previous
 from controller.bundle.starts import Starts
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
-from controller.simulate.happen.script import Item
+from controller.simulate.happen.script import STOPPED, Item
 from controller.simulate.judge.bundles import SHOWN_S, is_sound
 from controller.simulate.judge.log_file import readable
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
@@ -18,7 +18,6 @@ from controller.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
 MEND_FILE_S: Final = 600.0
-STOPPED: Final = "stopped"
 
 
 def file_damaged(life: Living, item: Item) -> None:

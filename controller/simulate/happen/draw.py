@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 from zoneinfo import ZoneInfo
 
-from controller.simulate.happen.script import Item, Setting
+from controller.simulate.happen.script import STOPPED, Item, Setting
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -71,7 +71,7 @@ FILES: Final[_Weights] = {
     "kiosk/events.sqlite": 2, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
     "bundles/starts.json": 1, "lamps.json": 1, "kiosk/stage.toml.good": 1,
 }  # fmt: skip
-BEFORE: Final = ("", "stopped")
+BEFORE: Final = ("", STOPPED)
 """How the service ended before a file was damaged: killed, or as it should."""
 HOW: Final[Mapping[str, Sequence[str]]] = {
     "line": LINE_TROUBLES,

@@ -8,6 +8,9 @@ from dataclasses import asdict, dataclass
 
 from controller.simulate.scheduler import DAY_S
 
+STOPPED = "stopped"
+"""As the arguments of a damaged file: the service ended as it should before; without it, it was killed."""
+
 
 def moment_of(code: str, text: str) -> str:
     """What an item may wait for: the code of an event, or the state that the stage comes to."""

@@ -11,6 +11,7 @@ from controller.bundle.reader import Bundle
 from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError
 from controller.simulate.disk import STAGE
+from controller.simulate.judge.found import Found
 from controller.simulate.judge.promises import Broken
 from controller.simulate.stage import OUTPUTS, TRUST
 from controller.simulate.world import SimulatedWorld
@@ -32,33 +33,26 @@ class BundleWitness:
         self._world = world
         self.spoilt: dict[str, float] = {}
         self._began_s = 0.0
-        self._dark_since_s: float | None = None
-        self._unnamed_since_s: float | None = None
+        self._found = Found(world)
 
     def begins(self) -> None:
         """A service does."""
         self._began_s = self._world.scheduler.now_s
-        self._dark_since_s = self._unnamed_since_s = None
+        self._found.forget("dark")
+        self._found.forget("unnamed")
 
     def disturbed(self) -> None:
         """Something happened to the player or its display: it begins again."""
-        self._dark_since_s = None
+        self._found.forget("dark")
 
     def judge(self, kiosk: StageKiosk, service: Service) -> None:
         """After a step. Raises Broken."""
-        now_s = self._world.scheduler.now_s
-        if not (self.spoilt and self._is_unnamed(kiosk, service)):
-            self._unnamed_since_s = None
-        elif self._unnamed_since_s is None:
-            self._unnamed_since_s = now_s
-        elif now_s - self._unnamed_since_s > NAMED_S:
-            raise Broken("bundle named", f"for {now_s - self._unnamed_since_s:.0f} s: {kiosk.snapshot().warnings}")
-        if not self._is_dark(service):
-            self._dark_since_s = None
-        elif self._dark_since_s is None:
-            self._dark_since_s = now_s
-        elif now_s - self._dark_since_s > SHOWN_S:
-            raise Broken("bundle shown", f"it is black for {now_s - self._dark_since_s:.0f} s")
+        unnamed_s = self._found.for_s("unnamed", bool(self.spoilt) and self._is_unnamed(kiosk, service))
+        if unnamed_s > NAMED_S:
+            raise Broken("bundle named", f"for {unnamed_s:.0f} s: {kiosk.snapshot().warnings}")
+        dark_s = self._found.for_s("dark", self._is_dark(service))
+        if dark_s > SHOWN_S:
+            raise Broken("bundle shown", f"it is black for {dark_s:.0f} s")
 
     def _is_unnamed(self, kiosk: StageKiosk, service: Service) -> bool:
         """Whether the service began with a bundle that can't be read, and does not say so."""

@@ -9,6 +9,7 @@ from controller.kiosk.decide.live_changes import LiveChanges
 from controller.run.state_machine import State
 from controller.simulate.judge.bundles import SHOWN_S, BundleWitness
 from controller.simulate.judge.calendar import Calendar
+from controller.simulate.judge.found import Found
 from controller.simulate.judge.lamps import BACK_S, LampWitness
 from controller.simulate.judge.log import LogWitness
 from controller.simulate.judge.promises import Broken
@@ -54,10 +55,8 @@ class Witness:
         self.changed_s = 0.0
         self._was_open: bool | None = None
         self._began_s, self._stepped_s = 0.0, 0.0
-        self._black_since_s: float | None = None
         self._back_by_s: float | None = None
-        self._missing_since_s: float | None = None
-        self._found_since_s: dict[str, float] = {}
+        self._found = Found(world)
         self.minutes = {"open": 0.0, "closed": 0.0, "dark": 0.0, "away": 0.0}
         self._judged_s = 0.0
         self._work: Request | None = None
@@ -69,7 +68,7 @@ class Witness:
     def begins(self) -> None:
         self._began_s = self._stepped_s = self._world.scheduler.now_s
         self.paused_long = True
-        self._found_since_s.pop("hangs", None)
+        self._found.forget("hangs")
         self.log.begins()
         self.bundles.begins()
 
@@ -87,7 +86,7 @@ class Witness:
     def killed(self) -> None:
         """The service was, perhaps between an alert and the note that it was sent."""
         self.log.killed()
-        self._missing_since_s = None
+        self._found.forget("camera")
 
     def disturb(self, for_s: float, after_s: float = REPAIR_S) -> None:
         """A fault, so long, and what it takes to get over it."""
@@ -184,7 +183,7 @@ class Witness:
         """A picture that stands still is no sign of a player that lives."""
         screen = self._world.screen
         hangs = screen.hung and screen.process is not None and screen.process.alive
-        if self._found_s("hangs", hangs) > HANGS_S:
+        if self._found.for_s("hangs", hangs) > HANGS_S:
             raise Broken("picture back", f"the player hangs for {HANGS_S:.0f} s, and was not ended")
         self._outputs(service)
 
@@ -194,17 +193,14 @@ class Witness:
         text = "" if problem is None else problem.text
         said = {output for output in OUTPUTS.values() if output in text}
         wrong = sorted(said ^ screen.unplugged) if screen.serves else []
-        if self._found_s("outputs", bool(wrong)) > BLACK_S:
+        if self._found.for_s("outputs", bool(wrong)) > BLACK_S:
             raise Broken("outputs named", f"{', '.join(wrong)} for {BLACK_S:.0f} s, and it says: {text or 'nothing'}")
 
     def _devices(self, service: Service) -> None:
-        world, now_s = self._world, self._world.scheduler.now_s
-        if world.camera.gone or service.devices.camera.device is not None:
-            self._missing_since_s = None
-        elif self._missing_since_s is None:
-            self._missing_since_s = now_s
-        elif now_s - self._missing_since_s > (OPENED_S if world.scheduler.stretch == 1 else REPAIR_S):
-            raise Broken("devices back", f"the camera is there for {now_s - self._missing_since_s:.0f} s")
+        world = self._world
+        there_s = self._found.for_s("camera", not world.camera.gone and service.devices.camera.device is None)
+        if there_s > (OPENED_S if world.scheduler.stretch == 1 else REPAIR_S):
+            raise Broken("devices back", f"the camera is there for {there_s:.0f} s")
 
     @property
     def calm(self) -> bool:
@@ -215,7 +211,7 @@ class Witness:
     def _closed(self, service: Service, state: State, wanted: bool) -> None:
         world, now_s = self._world, self._world.scheduler.now_s
         if wanted or not self.wanted.sure:
-            self._found_s("restless", False)
+            self._found.for_s("restless", False)
             return
         shut_s = now_s - max(self.changed_s, self._began_s)
         if shut_s > BLACK_S and service.reconciler.live != LiveChanges():
@@ -228,7 +224,7 @@ class Witness:
             self.changed_s = max(self.changed_s, now_s - BLACK_S - 1)
         restless = shut_s > BLACK_S and not works and state not in _RESTING
         # Work that is given up in a step leaves the stage as it is until the next.
-        if self._found_s("restless", restless) > 0:
+        if self._found.for_s("restless", restless) > 0:
             raise Broken("rests while closed", f"it is {state.value}, {shut_s:.0f} s after it closed")
         burning = [name for name, lamp in world.lamps.items() if lamp.lit]
         if shut_s > DARK_S and burning and not works and self.calm:
@@ -242,19 +238,15 @@ class Witness:
         asked_black = live.black or service.player.identifying or service.reconciler.working
         dark = {name for name, output in OUTPUTS.items() if output in world.screen.unplugged}
         bright = any(lamp.shines and name not in dark for name, lamp in world.lamps.items()) and bool(shown)
-        if not wanted or bright or asked_black:
-            self._black_since_s = None
-        elif self._black_since_s is None:
-            self._black_since_s = now_s
+        dark_s = self._found.for_s("black", wanted and not bright and not asked_black)
         if not wanted or not self.wanted.sure:
             self._back_by_s = None
-            self._found_s("unexplained", False)
+            self._found.for_s("unexplained", False)
             return
         self._back(shown, asked_black)
         open_s = now_s - max(self.changed_s, self._began_s)
-        dark_s = 0.0 if self._black_since_s is None else now_s - self._black_since_s
         unexplained = dark_s > SETTLING_S and open_s > SETTLING_S and not self._explained(kiosk, service)
-        if self._found_s("unexplained", unexplained) > BLACK_S:
+        if self._found.for_s("unexplained", unexplained) > BLACK_S:
             raise Broken("says why it is dark", f"for {dark_s:.0f} s, while it is {state.value}")
         if not self.calm or open_s < SETTLING_S or asked_black:
             if asked_black:
@@ -273,14 +265,6 @@ class Witness:
             brightness = world.screen.process.brightness
             if shown not in names or abs(brightness - live.brightness) > 0.01:
                 raise Broken("plays while open", f"{shown} at {brightness:g} is shown instead of {wants.appearance}")
-
-    def _found_s(self, what: str, now: bool) -> float:
-        """For how long each step has found this. The step before the first of them may be minutes older."""
-        now_s = self._world.scheduler.now_s
-        if not now:
-            self._found_since_s.pop(what, None)
-            return 0.0
-        return now_s - self._found_since_s.setdefault(what, now_s)
 
     def _back(self, shown: str, asked_black: bool) -> None:
         if self._back_by_s is not None and self._world.scheduler.now_s > self._back_by_s and not asked_black:
