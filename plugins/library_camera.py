@@ -32,7 +32,8 @@ class LibraryCamera:
             note=lambda code, what: self._troubles.append((code, what)),
         )
         self._settings: ExposureSettings | None = None
-        self._configured = 0
+        self._configured: int | None = None
+        """The process that has these settings."""
         try:
             self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
         except BaseException:
@@ -57,13 +58,13 @@ class LibraryCamera:
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
         confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
-        self._settings, self._configured = confirmed, self.process.starts
+        self._settings, self._configured = confirmed, self.process.pid
         return confirmed
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
         """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the process ended."""
         try:
-            if self._settings is not None and (self.process.pid is None or self.process.starts != self._configured):
+            if self._settings is not None and self.process.pid != self._configured:
                 # The process was ended, perhaps also started again by another request: its exposure is forgotten.
                 self.configure(self._settings, deadline=deadline)
             left_s = deadline.left_s()

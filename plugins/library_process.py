@@ -63,14 +63,12 @@ class LibraryProcess:
     ``module``: whose ``main`` runs ``served``; ``library``: its name for people; ``start``: what the worker gets first
     besides the serial number that the camera must have, "" for any; ``note`` is called with (code, sentence) after a
     fault that was corrected. ``took_s``: what the library needed for the last request, without the way there and back.
-    ``starts``: how often the process was started; each has forgotten what the one before was told.
     """
 
     def __init__(
         self, module: str, library: str, *, start: tuple[Any, ...], serial: str, note: Callable[[str, str], object]
     ) -> None:
         self.took_s = 0.0
-        self.starts = 0
         self._module = module
         self._library = library
         self._start = start
@@ -144,7 +142,6 @@ class LibraryProcess:
                     stdin=subprocess.DEVNULL,
                 )
             self._running = process, Connection(ours.detach())
-            self.starts += 1
             self._running[1].send((*self._start, self._serial))
         return self._running
 

@@ -59,9 +59,10 @@ class VideoDevice:
 
     def _is_gone(self) -> bool:
         try:
-            return not kernel.answered(self._handle, kernel.QUERYCAP, kernel.Capability())
+            kernel.answered(self._handle, kernel.QUERYCAP, kernel.Capability())
         except DeviceGone:
             return True
+        return False
 
     def codes(self) -> list[str]:
         """The codes of its formats."""
