@@ -72,7 +72,8 @@ def machine() -> dict[str, int]:
     return {"cores": usable_cpus(), "memory_bytes": pages}
 
 
-def areas() -> list[str]:
-    """Names of the areas there are modules for; a name beginning with an underscore is a helper."""
+def areas() -> dict[str, str]:
+    """The module of each area by its name; those of ``benchmarks.lab`` are parts of others."""
     folder = Path(__file__).parent
-    return sorted(p.stem for p in folder.glob("*.py") if not p.stem.startswith("_"))
+    found = {file.stem: f"benchmarks.{file.parent.name}.{file.stem}" for file in folder.glob("*/[!_]*.py")}
+    return {name: found[name] for name in sorted(found) if not found[name].startswith("benchmarks.lab.")}

@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", default="small", help=f"one of {', '.join(SIZES)}; memory has more")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
     options = parser.parse_args(arguments)
-    area = importlib.import_module(f"benchmarks.{options.name}")
+    area = importlib.import_module(areas()[options.name])
     sizes = getattr(area, "SIZES", SIZES)
     if options.size not in sizes:
         parser.error(f"{options.name} has no size {options.size}; choose one of {', '.join(sizes)}")

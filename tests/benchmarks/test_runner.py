@@ -18,17 +18,18 @@ def test_a_goal_is_judged_from_its_own_side() -> None:
     assert at_least("a", 1.9, None, unit="x", how="").holds is None
 
 
-def test_helpers_are_no_areas() -> None:
+def test_every_module_is_an_area_of_its_own_name_but_those_that_others_share() -> None:
+    modules = [file for file in Path(benchmarks.__file__).parent.rglob("*.py") if not file.stem.startswith("_")]
     found = areas()
-    assert {"calibration", "capture", "bundle", "player", "camera", "projectors", "solve"} <= set(found)
-    assert not [name for name in found if name.startswith("_")]
+    assert sorted(found) == sorted(file.stem for file in modules if file.parent.name != "lab")
+    assert found["solve"] == "benchmarks.solving.solve"
 
 
 def test_rows_are_printed_and_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [Row("speed", "MB/s", 10.0, 12.5, True, "one run"), Row("size", "B", None, 3.0, None, "")]
-    monkeypatch.setattr("benchmarks.projectors.measure", lambda size: rows)
+    monkeypatch.setattr("benchmarks.devices.projectors.measure", lambda size: rows)
     assert __main__.main(["projectors", "--json", str(tmp_path / "deep" / "rows.json")]) == 0
     assert "| speed | 12.5 MB/s | 10 MB/s | yes | one run |" in capsys.readouterr().out
     written = json.loads((tmp_path / "deep" / "rows.json").read_text())

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from benchmarks.serve import install_grey
+from benchmarks.devices.serve import install_grey
 from controller.kiosk import service as services
 from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.service import Service

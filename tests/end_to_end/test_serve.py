@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.serve import NAME, install_grey, wait_for
+from benchmarks.devices.serve import NAME, install_grey, wait_for
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.panel_address import FIRST_LOGIN

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from benchmarks._truth import Truth, developed
+from benchmarks.lab.truth import Truth, developed
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import read_geometry
 from controller.core.arrays import FloatImage

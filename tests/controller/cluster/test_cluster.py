@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from distributed import Client, Scheduler
 
-from benchmarks._synthetic import synthetic_calibration
+from benchmarks.lab.synthetic import synthetic_calibration
 from controller.cluster import connect
 from controller.cluster.appearances import SpreadAppearances
 from controller.cluster.connect import Cluster, connected

@@ -7,7 +7,7 @@ import tracemalloc
 
 import pytest
 
-from benchmarks._synthetic import synthetic_calibration
+from benchmarks.lab.synthetic import synthetic_calibration
 from controller.calibrate.values import Calibration
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image, solve_base

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.response import Series, film, held_out, opencv_response, our_response
+from benchmarks.calibration.response import Series, film, held_out, opencv_response, our_response
 from controller.capture.jpeg_response import JpegResponse, measure_response
 from tests.controller.capture.jpeg.camera_model import EXPOSURES_S, CameraModel, lit_scene
 

@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.response import Series, held_out, memorial, merged, off_by_stops, opencv_response, our_response
+from benchmarks.calibration.response import (
+    Series,
+    held_out,
+    memorial,
+    merged,
+    off_by_stops,
+    opencv_response,
+    our_response,
+)
 
 OPENCVS_WORST = 4.4
 """Device values at 1/8 to 1/512 s, as the work began; ours were 7 to 16 too low."""

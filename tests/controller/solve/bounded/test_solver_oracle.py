@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from benchmarks._synthetic import crop_calibration, synthetic_calibration
+from benchmarks.lab.synthetic import crop_calibration, synthetic_calibration
 from controller.calibrate.values import Calibration, PhaseMap
 from controller.core.arrays import Float64, FloatImage
 from controller.solve.bounded.problem import Problem

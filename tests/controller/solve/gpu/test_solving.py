@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from benchmarks._synthetic import synthetic_calibration
+from benchmarks.lab.synthetic import synthetic_calibration
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks._synthetic import crop_calibration, synthetic_calibration
+from benchmarks.lab.synthetic import crop_calibration, synthetic_calibration
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError

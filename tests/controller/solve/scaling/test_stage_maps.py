@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from benchmarks._synthetic import synthetic_calibration, synthetic_target
+from benchmarks.lab.synthetic import synthetic_calibration, synthetic_target
 from controller.bundle.live_maps import LiveMaps, compensate, compensate_light, light_table
 from controller.calibrate.values import Calibration
 from controller.core.arrays import ByteImage, FloatImage

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks._synthetic import synthetic_calibration
+from benchmarks.lab.synthetic import synthetic_calibration
 from controller.core.errors import UsageError
 from controller.live.sources import LivePicture
 from controller.solve.appearance import base_image, solve_base

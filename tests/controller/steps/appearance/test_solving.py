@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._synthetic import synthetic_target, write_synthetic_run
+from benchmarks.lab.synthetic import synthetic_target, write_synthetic_run
 from controller.artefacts.calibrated import Calibrated
 from controller.core.arrays import FloatImage
 from controller.run.journal import Journal

@@ -1,0 +1,1 @@
+"""Drivers of cameras and projectors, and the kiosk's service."""

@@ -1,0 +1,1 @@
+"""Bundles, the player and live pictures."""

@@ -1,0 +1,1 @@
+"""The light transport and the solves with it: time, memory, cores, graphics processors."""

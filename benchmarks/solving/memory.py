@@ -1,0 +1,145 @@
+"""Memory of a calibration and the solve of its base image, by step; each size in a process of its own.
+
+The calibration is written as a run writes it and read as a run reads it. ``BENCH_RUN=FOLDER`` measures a run that
+exists instead. ``python -m benchmarks.solving.memory FOLDER NAME...`` is one process; it prints one line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks import Row, at_most
+from benchmarks.lab.synthetic import PROJECTOR, write_synthetic_run
+from controller.artefacts.calibration import read_calibration
+from controller.artefacts.geometry import projectors_of
+from controller.solve.appearance import base_image, prepare_base
+from controller.solve.bounded.solver import solve_bounded
+from controller.solve.memory_need import base_peak_bytes, stage_size
+from controller.transport import build_transport
+
+SIZES: Final = tuple(PROJECTOR)
+GOAL: Final = 240.0
+WATCHED_EVERY_S: Final = 0.002
+_PROCESS: Final = re.compile(r"^(RssAnon|RssFile|RssShmem):\s+(\d+)", re.MULTILINE)
+
+
+def measure(size: str) -> list[Row]:
+    """Bytes a projector pixel at the peak of each step, and what the run said that it would need."""
+    if run := os.environ.get("BENCH_RUN"):
+        return _rows(Path(run), projectors_of(Path(run)))
+    with tempfile.TemporaryDirectory(prefix="velatura-memory-", dir=os.environ.get("BENCH_FOLDER")) as folder:
+        # made by a process of its own: formulas need more memory than a solve
+        made = [sys.executable, "-m", "benchmarks.lab.synthetic", folder, size]
+        names = subprocess.run(made, check=True, capture_output=True, text=True).stdout.split()
+        return _rows(Path(folder), names)
+
+
+def _rows(run: Path, names: list[str]) -> list[Row]:
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.solving.memory", str(run), *names],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    pixels, rows = found["pixels"], []
+    for step, peak, kept, seconds in found["steps"]:
+        how = f"{peak / 1e9:.2f} GB; {kept / pixels:.0f} kept after it; {seconds:.1f} s"
+        rows.append(at_most(f"{step}, peak", peak / pixels, None, unit="bytes a projector pixel", how=how))
+    peak = max(step[1] for step in found["steps"])
+    how = f"{peak / 1e9:.2f} GB of {found['projectors']} projectors, {pixels} pixels, camera of {found['camera']}"
+    rows.append(at_most("arrays, largest", peak / pixels, GOAL, unit="bytes a projector pixel", how=how))
+    resident = found["anonymous"]
+    how = (
+        f"{resident / 1e9:.2f} GB with program and kernels; {found['mapped'] / 1e9:.2f} GB of files resident beside it"
+    )
+    rows.append(
+        at_most("process, without mapped files", resident / pixels, GOAL, unit="bytes a projector pixel", how=how)
+    )
+    told = found["told"]
+    rows.append(at_most("told before it begins, by the process", told / resident, None, unit="x",
+                        how=f"{told / 1e9:.2f} GB"))  # fmt: skip
+    return rows
+
+
+class _Watch:
+    """The largest memory of this process that is not a mapped file, and the largest that is."""
+
+    def __init__(self) -> None:
+        self.anonymous = self.mapped = 0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._ended.wait(WATCHED_EVERY_S):
+            found = dict(_PROCESS.findall(Path("/proc/self/status").read_text()))
+            self.anonymous = max(self.anonymous, 1024 * int(found["RssAnon"]))
+            self.mapped = max(self.mapped, 1024 * (int(found["RssFile"]) + int(found["RssShmem"])))
+
+    def end(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+def one_run(run: Path, names: list[str]) -> dict[str, Any]:
+    """Read, build, solve and prepare; the peak of arrays in each step, in bytes."""
+    _warm()
+    steps: list[tuple[str, int, int, float]] = []
+    tracemalloc.start()
+    watch = _Watch()
+
+    def step(name: str, work: Callable[[], Any]) -> Any:
+        tracemalloc.reset_peak()
+        began = time.perf_counter()
+        made = work()
+        seconds = time.perf_counter() - began
+        kept, peak = tracemalloc.get_traced_memory()
+        steps.append((name, peak, kept, seconds))
+        return made
+
+    calibration = step("calibration read", lambda: read_calibration(run, names))
+    told = base_peak_bytes(stage_size(calibration))
+    transport = step("transport", lambda: build_transport(calibration))
+    image = step("base image", lambda: base_image(calibration, "white"))
+    black = calibration.black
+    solution = step("solve", lambda: solve_bounded(transport, image, black))
+    base = step("ready to scale", lambda: prepare_base(transport, image, black, solution))
+    watch.end()
+    return {
+        "pixels": transport.pixels,
+        "projectors": len(transport.sizes),
+        "camera": transport.lit[0].size,
+        "steps": steps,
+        "anonymous": watch.anonymous,
+        "mapped": watch.mapped,
+        "told": told,
+        "sweeps": base.solution.iterations,
+    }
+
+
+def _warm() -> None:
+    """Load the compiled code, so that no compiler is in the figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        names = write_synthetic_run(Path(folder), projector=(34, 44), camera=(82, 122))
+        calibration = read_calibration(Path(folder), names)
+        transport, image = build_transport(calibration), base_image(calibration, "white")
+        prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
+        np.percentile(image, 50)
+
+
+if __name__ == "__main__":
+    print(json.dumps(one_run(Path(sys.argv[1]), sys.argv[2:])))
