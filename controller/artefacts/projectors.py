@@ -24,7 +24,7 @@ class Light:
     ``white`` (camera rows, columns, 3) float32: HDR white of this projector alone less ``black``, NaN where saturated
     ``black`` (camera rows, columns, 3) float32: all projectors at black, NaN where saturated
     ``camera_to_xyz`` (3, 3): linear camera RGB to CIE XYZ (D65)
-    ``segment`` (1,): see ``Radiometry``; None where colours add
+    ``segment`` (1,): see ``Radiometry``; None where colours add; ``paint`` (3, 3, 3): see there, too
     """
 
     response: Float64
@@ -33,10 +33,11 @@ class Light:
     black: FloatImage
     camera_to_xyz: Float64
     segment: Float64 | None = None
+    paint: Float64 | None = None
 
     @property
     def radiometry(self) -> Radiometry:
-        return Radiometry(self.response, self.mixing, _segment(self.segment))
+        return Radiometry(self.response, self.mixing, _segment(self.segment), self.paint)
 
     @staticmethod
     def path(run: Path, projector: str) -> Path:
@@ -222,9 +223,9 @@ LEAST_P95: Final = 0.02
 class Indirect:
     """``indirect-PROJECTOR.npz``: the share of its white that is indirect, and its radiometry in direct light.
 
-    ``share`` (camera rows, columns, 3), 0 to 1, float16 in the file; ``response``, ``mixing``, ``segment``: as of
-    ``Light``; ``stripes``: as of ``ProjectorCalibration``; ``white_gain`` like ``share``: the white image with less
-    noise over that of ``Light``, None where there is no better one
+    ``share`` (camera rows, columns, 3), 0 to 1, float16 in the file; ``response``, ``mixing``, ``segment``,
+    ``paint``: as of ``Light``; ``stripes``: as of ``ProjectorCalibration``; ``white_gain`` like ``share``: the white
+    image with less noise over that of ``Light``, None where there is no better one
     """
 
     share: npt.NDArray[np.floating]
@@ -233,17 +234,18 @@ class Indirect:
     segment: Float64 | None = None
     stripes: FloatImage | None = None
     white_gain: npt.NDArray[np.floating] | None = None
+    paint: Float64 | None = None
 
     @property
     def radiometry(self) -> Radiometry:
-        return Radiometry(self.response, self.mixing, _segment(self.segment))
+        return Radiometry(self.response, self.mixing, _segment(self.segment), self.paint)
 
     def write(self, run: Path, projector: str) -> Path:
         path = npz_path(run, StepKind.INDIRECT, projector)
         kept: dict[str, npt.NDArray[Any]] = {"response": self.response, "mixing": self.mixing}
         kept["share"] = self.share.astype(np.float16)
         gain = None if self.white_gain is None else self.white_gain.astype(np.float16)
-        more = {"segment": self.segment, "stripes": self.stripes, "white_gain": gain}
+        more = {"segment": self.segment, "stripes": self.stripes, "white_gain": gain, "paint": self.paint}
         save_arrays(path, kept | {name: array for name, array in more.items() if array is not None})
         return path
 
@@ -251,7 +253,8 @@ class Indirect:
     def read(cls, run: Path, projector: str) -> Self:
         arrays = load_arrays(npz_path(run, StepKind.INDIRECT, projector))
         found = arrays["share"], arrays["response"], arrays["mixing"]
-        return cls(*found, arrays.get("segment"), arrays.get("stripes"), arrays.get("white_gain"))
+        more = (arrays.get(name) for name in ("segment", "stripes", "white_gain", "paint"))
+        return cls(*found, *more)
 
 
 @dataclass(frozen=True, slots=True)

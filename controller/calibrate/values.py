@@ -70,11 +70,15 @@ class Radiometry:
     ``mixing`` (3, 3) float64: camera channel (row) by projector channel (column), each row summing to 1, so that
     white is white; the strength of the light is in the projector's white image
     ``segment``: share of white that a white segment makes, of what red, green and blue have in common; 0 without one
+    ``paint`` (3, 3, 3) float64: mixing that depends on the paint (``photometry.paint_mixing``): camera channel,
+        projector channel, camera channel of white; its sum over projector channels is 1 where both camera channels
+        are the same, and else 0. None where one mixing holds for all paints
     """
 
     response: Float64
     mixing: Float64
     segment: float = 0.0
+    paint: Float64 | None = None
 
     def emitted(self, light: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """What is shown, (..., 3), of the channels' own light (..., 3): with what a white segment adds to greys."""

@@ -1,8 +1,12 @@
-"""Light that arrives by way of other surfaces, G: camera image = K + (I + G) L p, with L the local transport.
+"""Light that the local transport L does not know, G: camera image = K + (I + G) L p.
 
-After its first bounce light does not remember which projector it came from. So G acts on the direct camera image
-d = L p: (G d)(x) = S(x) up(F down(d))(x). Blocks of camera pixels give each other light by F; S is what a camera pixel
-makes of the light that falls on it, and holds the paint (docs/decisions/0045).
+Most of it arrives by way of other surfaces. After its first bounce light does not remember which projector it came
+from. So G acts on the direct camera image d = L p: (G d)(x) = S(x) up(F down(d))(x). Blocks of camera pixels give each
+other light by F; S is what a camera pixel makes of the light that falls on it, and holds the paint
+(docs/decisions/0045).
+
+Where colours depend on the paint, what L says of them is corrected first: G = D + S up F down (I + D), with D a matrix
+of each camera pixel's three channels (docs/decisions/0099).
 """
 
 from __future__ import annotations
@@ -18,8 +22,16 @@ import numpy.typing as npt
 from controller.core.arrays import FloatImage, Mask
 
 ROUNDS: Final = 30
+ROWS_AT_ONCE: Final = 128
 CONVERGED: Final = 1e-5
 """Relative change of the direct light, at which it is known."""
+LEAST_VOLUME: Final = 0.02
+"""Determinant of I + D: three colours that a paint makes nearly one are no nearer to one than this."""
+LARGEST: Final = 1e4
+"""Of a number of (I + D)^-1 - I: float16 ends at 65504."""
+
+Colours = npt.NDArray[np.floating[Any]]
+"""A matrix for the colours of each pixel (3, 3, rows, columns); float16 where it is kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +43,7 @@ class IndirectLight:
     ``lit`` (rows, columns) bool: camera pixels whose direct light the transport knows
     ``grid``: (rows, columns) of the blocks; ``side``: camera pixels along a block
     ``room`` like ``factors``: of light on surfaces that are none of the object; None: as of the object
+    ``paint`` (3, 3, rows, columns): D, what is added to a camera channel (first axis) of each of them; None: nothing
     """
 
     factors: FloatImage
@@ -39,13 +52,19 @@ class IndirectLight:
     grid: tuple[int, int]
     side: int
     room: FloatImage | None = None
+    paint: Colours | None = None
 
     def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
-        """G d: (rows, columns, 3) indirect light of a direct camera image of that shape.
+        """G d: (rows, columns, 3) light of a direct camera image of that shape, as L says, that is not in it.
 
         ``beside`` like ``direct``: light on surfaces of the room, which the transport does not know
         """
-        return self.scale * self.falling(direct, beside)
+        surfaces = self._of_surfaces(direct, beside)
+        return surfaces if self.paint is None else surfaces + _times(self.paint, direct)
+
+    def _of_surfaces(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
+        painted = direct if self.paint is None else direct + _times(self.paint, direct)
+        return self.scale * self.falling(painted, beside)
 
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
@@ -57,7 +76,8 @@ class IndirectLight:
     def adjoint(self, image: FloatImage) -> FloatImage:
         """G' r of a camera image (rows, columns, 3)."""
         blocks = self.factors.T @ up_adjoint(self.scale * image, self.grid, self.side)
-        return down_adjoint(blocks, self.grid, self.side, self.lit.shape)
+        direct = down_adjoint(blocks, self.grid, self.side, self.lit.shape)
+        return direct if self.paint is None else direct + _times(self.paint.swapaxes(0, 1), direct + image)
 
     def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage:
         """The direct light d on lit pixels with d + G d = ``total`` (rows, columns, 3) there; 0 elsewhere.
@@ -67,10 +87,12 @@ class IndirectLight:
         """
         lit = self.lit[..., None]
         wanted = np.where(lit, total, 0).astype(np.float32)
-        direct = wanted
+        unpainted = None if self.paint is None else _inverse(self.paint)
+        direct = wanted if unpainted is None else wanted + _times(unpainted, wanted)
         size = max(float(np.abs(wanted).max(initial=0)), 1e-30)
         for _ in range(ROUNDS):
-            after = np.where(lit, wanted - self.forward(displayable(direct, reach)), 0)
+            after = np.where(lit, wanted - self._of_surfaces(displayable(direct, reach)), 0)
+            after = after if unpainted is None else after + _times(unpainted, after)
             change = float(np.abs(after - direct).max(initial=0))
             direct = after.astype(np.float32, copy=False)
             if change < CONVERGED * size:
@@ -80,7 +102,30 @@ class IndirectLight:
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All that the products depend on, by name."""
         shape = np.array([*self.grid, self.side])
-        return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape}
+        paint = {} if self.paint is None else {"paint": self.paint}
+        return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape} | paint
+
+
+def _times(matrices: Colours, image: FloatImage) -> FloatImage:
+    """Each pixel's matrix (3, 3, rows, columns) times its colour (rows, columns, 3)."""
+    found = np.empty(image.shape, np.float32)
+    for channel, row in enumerate(matrices):
+        found[..., channel] = sum(one * image[..., other] for other, one in enumerate(row))
+    return found
+
+
+def _inverse(deviation: Colours) -> Colours:
+    """(I + D)^-1 - I of each pixel, (3, 3, rows, columns), where there is one, by Cramer's rule."""
+    found = np.empty(deviation.shape, np.float16)
+    for start in range(0, deviation.shape[2], ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
+        first, second, third = deviation[:, :, rows].astype(np.float32) + np.eye(3, dtype=np.float32)[..., None, None]
+        columns = [np.cross(one, other, axis=0) for one, other in ((second, third), (third, first), (first, second))]
+        volume = np.sum(first * columns[0], axis=0)
+        volume = np.where(np.abs(volume) < LEAST_VOLUME, np.copysign(np.float32(LEAST_VOLUME), volume), volume)
+        inverse = np.stack(columns, axis=1) / volume - np.eye(3, dtype=np.float32)[..., None, None]
+        found[:, :, rows] = np.clip(inverse, -LARGEST, LARGEST)
+    return found
 
 
 def displayable(direct: FloatImage, reach: FloatImage | None = None) -> FloatImage:

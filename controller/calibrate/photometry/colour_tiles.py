@@ -36,7 +36,7 @@ class TileMeasurements:
     ``weight`` (tiles, 3): inverse of its variance; ``photograph`` (tiles,) int64: which one of the tiles' photographs
     it is from, from 0; ``pixels``: camera pixels that they come from; ``indirect`` (tiles, 3): light that was taken
     away from ``ratio``, as it is when the lamp is as strong as at white; ``place`` (tiles, 2) int64: the tile's column
-    and row in the projector's image
+    and row in the projector's image; ``white`` (tiles, 3): mean light of white there, by which light was divided
     """
 
     levels: npt.NDArray[np.int64]
@@ -46,6 +46,7 @@ class TileMeasurements:
     pixels: int
     indirect: Float64
     place: npt.NDArray[np.int64]
+    white: Float64
 
     def at(self, strength: Float64) -> TileMeasurements:
         """As they would be had the lamp been as strong as at white; ``strength`` of it in each photograph."""
@@ -109,7 +110,7 @@ def measure_tiles(
     total = _sums(white[inside], which, number)
     full = np.maximum(np.percentile(white[inside], 99, axis=0), 1e-12) if which.size else np.ones(3)
     used = np.flatnonzero((count >= FEWEST_PIXELS) & np.all(total > 0, axis=1))
-    levels, ratios, weights, photographs, thrown, places = [], [], [], [], [], []
+    levels, ratios, weights, photographs, thrown, places, whites = [], [], [], [], [], [], []
     for photograph, pattern in enumerate(tiles_patterns):
         shown = tile_levels(pattern, plan.size_px)
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
@@ -128,11 +129,12 @@ def measure_tiles(
         ratios.append(ratio[measured])
         weights.append(1 / variance[measured])
         thrown.append(taken[measured])
+        whites.append((total[used] / count[used, None])[measured])
         places.append(np.stack(np.divmod(used[measured], -(-across // side))[::-1], axis=1))
         photographs.append(np.full(np.count_nonzero(measured), photograph, np.int64))
     ratio, weight = np.concatenate(ratios), np.concatenate(weights)
-    shown_in, away, place = (np.concatenate(parts) for parts in (photographs, thrown, places))
-    return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away, place)
+    shown_in, away, place, lit = (np.concatenate(parts) for parts in (photographs, thrown, places, whites))
+    return TileMeasurements(np.concatenate(levels), ratio, weight, shown_in, int(which.size), away, place, lit)
 
 
 def tile_code(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -81,5 +82,9 @@ def update_radiometry(radiometry: Radiometry, gain: tuple[float, float, float]) 
 
     White light of camera channel c is now sum_k mixing[c, k] gain[k] times what it was.
     """
-    mixing = radiometry.mixing * np.asarray(gain)
-    return Radiometry(radiometry.response, mixing / mixing.sum(axis=1, keepdims=True), radiometry.segment)
+    mixing, paint = radiometry.mixing * np.asarray(gain), radiometry.paint
+    if paint is not None:
+        paint = paint * np.asarray(gain)[:, None]
+        # White has changed, too, and paint is told by it.
+        paint = paint @ np.linalg.inv(paint.sum(axis=1))
+    return replace(radiometry, mixing=mixing / mixing.sum(axis=1, keepdims=True), paint=paint)

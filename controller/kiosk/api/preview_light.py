@@ -100,7 +100,8 @@ def sampled(calibrated: Calibrated) -> PreviewLight:
     kept = np.ix_(*at)
     transport = SampledLight.of(whole, at)
     coarse = None if indirect is None else IndirectLight(
-        indirect.factors, indirect.scale[kept], indirect.lit[kept], indirect.grid, inside
+        indirect.factors, indirect.scale[kept], indirect.lit[kept], indirect.grid, inside,
+        paint=None if indirect.paint is None else indirect.paint[:, :, at[0]][..., at[1]],
     )  # fmt: skip
     calibration = calibrated.calibration
     black = np.ascontiguousarray(calibration.black[kept])
@@ -151,8 +152,9 @@ def _read(file: Path) -> PreviewLight | None:
             if "indirect_grid" in parts:
                 rows, columns, side = map(int, parts["indirect_grid"])
                 indirect = IndirectLight(
-                    parts["indirect_factors"], parts["indirect_scale"], parts["indirect_lit"], (rows, columns), side
-                )
+                    parts["indirect_factors"], parts["indirect_scale"], parts["indirect_lit"], (rows, columns), side,
+                    paint=parts.get("indirect_paint"),
+                )  # fmt: skip
             width, height = map(int, parts["camera_px"])
             return PreviewLight(
                 transport, DriveLevels(transport), indirect, parts["black"], parts["camera_to_xyz"], (width, height),

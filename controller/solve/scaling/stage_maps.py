@@ -71,7 +71,7 @@ def scaling_maps(
     dark = reduced(np.maximum(black, 0), factor) * gain.astype(np.float32) / np.float32(unit)
     offset = np.maximum(dark, reduced(plane_image(base.inverse * image_planes(np.maximum(black, 0))), factor))
     thrown = None
-    if indirect is not None:
+    if indirect is not None and indirect.factors.any():
         reach = transport.reach()
         thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, lambda image: reduced(image, factor))
     size_px = present.shape[1], present.shape[0]

@@ -105,6 +105,7 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         black=black,
         camera_to_xyz=_SRGB_TO_XYZ if matrix is None else matrix,
         segment=np.array([radiometry.segment]) if radiometry.segment else None,
+        paint=radiometry.paint,
     )
     figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
     said = tell(context, StepId(StepKind.RADIOMETRY, projector.name), [segment])

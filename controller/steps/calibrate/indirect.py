@@ -81,7 +81,8 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     segment = np.array([radiometry.segment]) if radiometry.segment else None
     known = pixels.phase_map
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
-    found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, _gain(white, light.white))
+    gain = _gain(white, light.white)
+    found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
     unsteadiness = unsteady(name, lamp_flicker(seen.strengths))
     said = tell(context, StepId(StepKind.INDIRECT, name), [unsteadiness])
     return [found.write(folder, name), figures.write(folder, name), said]

@@ -51,6 +51,9 @@ class Scene:
     no_blue: float = 0.0
     """Share of the camera's width, from the left, where the paint throws back hardly any blue."""
     mixing: tuple[tuple[float, float, float], ...] = ((0.88, 0.10, 0.02), (0.08, 0.85, 0.07), (0.01, 0.12, 0.87))
+    spectra: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Light in a camera channel, by albedo and projector channel: ``mixing`` then depends on the paint, and this holds
+    instead of it."""
     apart_px: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     """How far red, green and blue of the projector lie to the right and down, projector px."""
 
@@ -140,12 +143,20 @@ class Stage:
         """Noiseless camera image of a linear frame (rows, columns, 3), without the black level."""
         scene = self.scene
         mixing = np.array(scene.mixing, np.float32)
+        if scene.spectra:
+            of_paint = np.array(scene.spectra, np.float32).swapaxes(0, 1)
+            parts = [self._seen(linear @ of_paint[j].T, (0.0, 0.0)) * self._albedo[..., j : j + 1] for j in range(3)]
+            return self._in_camera(np.asarray(sum(parts), np.float32))
         if any(any(shift) for shift in scene.apart_px):
             parts = [self._seen(linear[..., d : d + 1] * mixing[:, d], scene.apart_px[d]) for d in range(3)]
             seen = np.asarray(sum(parts), np.float32)
         else:
             seen = self._seen(linear @ mixing.T, (0.0, 0.0))
-        blurred = cv2.GaussianBlur(seen * self._albedo, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
+        return self._in_camera(seen * self._albedo)
+
+    def _in_camera(self, light: FloatImage) -> FloatImage:
+        scene = self.scene
+        blurred = cv2.GaussianBlur(light, (0, 0), scene.camera_blur_px * SUPERSAMPLED)
         small = cv2.resize(blurred, scene.camera_px, interpolation=cv2.INTER_AREA)
         return np.asarray(scene.exposure * small, np.float32)
 

@@ -34,6 +34,10 @@ def some(seed: int, *, side: int = 5, strength: float = 0.4) -> IndirectLight:
     return IndirectLight(factors, scale, lit, grid, side)
 
 
+def some_paint(seed: int) -> FloatImage:
+    return np.random.default_rng(seed).uniform(-0.1, 0.1, (3, 3, *SHAPE)).astype(np.float32)
+
+
 def dense(light: IndirectLight, channel: int) -> Float64:
     """Column by column."""
     columns = []
@@ -49,9 +53,10 @@ def picture(seed: int) -> FloatImage:
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(0, 1000), st.integers(1, 9))
-def test_adjoint_is_the_transpose(seed: int, side: int) -> None:
+@given(st.integers(0, 1000), st.integers(1, 9), st.booleans())
+def test_adjoint_is_the_transpose(seed: int, side: int, paint: bool) -> None:
     light, d, r = some(seed, side=side), picture(seed + 1), picture(seed + 2)
+    light = replace(light, paint=some_paint(seed + 3)) if paint else light
     forward, back = np.vdot(light.forward(d).astype(np.float64), r), np.vdot(d, light.adjoint(r).astype(np.float64))
     assert forward == pytest.approx(back, rel=1e-5)
 
@@ -73,6 +78,15 @@ def test_as_its_matrix_and_its_inverse() -> None:
     solved = np.linalg.solve(np.eye(len(matrix)) + matrix, total[..., 1].ravel())
     np.testing.assert_allclose(light.direct_target(total)[..., 1].ravel(), solved, atol=1e-4)
     np.testing.assert_allclose(light.direct_target(total), d, atol=1e-4)
+
+
+def test_paint_changes_light_before_it_falls_on_other_surfaces() -> None:
+    light = replace(some(1), lit=np.ones(SHAPE, np.bool_), paint=some_paint(2))
+    d = picture(5)
+    painted = d + np.einsum("kmyx,yxm->yxk", some_paint(2), d)
+    total = painted + some(1).forward(painted)
+    np.testing.assert_allclose(d + light.forward(d), total, atol=1e-5)
+    np.testing.assert_allclose(light.direct_target(total.astype(np.float32)), d, atol=1e-4)
 
 
 def test_light_is_one_number_for_even_light() -> None:

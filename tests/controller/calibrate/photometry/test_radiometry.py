@@ -21,6 +21,7 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from tests.controller.calibrate.photometry.linearity import check_linearity
 from tests.controller.calibrate.simulator import Scene, Stage
+from tests.controller.calibrate.spectra import as_tuples, colours
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +50,7 @@ def off(found: Radiometry, of: Scene) -> tuple[float, float]:
 def test_response_and_mixing_are_found_within_half_a_percent() -> None:
     radiometry, report = measure_radiometry(before_response(scene()), PLAN)
     assert max(off(radiometry, scene())) < 0.005
+    assert radiometry.paint is None
     np.testing.assert_allclose(radiometry.mixing.sum(axis=1), 1)
     assert report.scatter < 0.005
     assert report.tiles > 150
@@ -88,6 +90,23 @@ def test_a_reflection_that_only_some_pixels_see_does_not_bend_the_response() -> 
         captures[pattern.name] = image
     radiometry, _ = measure_radiometry(captures, PLAN)
     assert max(off(radiometry, scene())) < 0.005
+
+
+def test_mixing_that_depends_on_the_paint_is_found() -> None:
+    """For other paints and other light than those it was found by: against what their spectra say."""
+    spectral = scene(spectra=as_tuples(colours()))  # type: ignore[arg-type]
+    radiometry, report = measure_radiometry(before_response(spectral), PLAN)
+    assert float(np.max(np.abs(radiometry.response - spectral.response()))) < 0.005
+    assert report.scatter < 0.006
+    assert radiometry.paint is not None
+    np.testing.assert_allclose(radiometry.paint.sum(axis=1), np.eye(3), atol=1e-9)
+    rng = np.random.default_rng(5)
+    paint, shown = rng.uniform(0.1, 1.0, (500, 3)), rng.uniform(0.0, 1.0, (500, 3))
+    seen = np.einsum("kjc,tj,tc->tk", colours(), paint, shown)
+    white = np.einsum("kjc,tj->tk", colours(), paint)
+    with_paint = np.einsum("tj,kcj,tc->tk", white, radiometry.paint, shown)
+    alone = white * (shown @ radiometry.mixing.T)
+    assert np.sqrt(np.mean((with_paint - seen) ** 2)) < 0.25 * np.sqrt(np.mean((alone - seen) ** 2))
 
 
 def test_light_that_comes_back_from_the_surroundings_is_told_apart() -> None:

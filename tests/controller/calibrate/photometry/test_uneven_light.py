@@ -48,7 +48,7 @@ def drawn(rows: int, columns: int, seed: int) -> tuple[TileMeasurements, Float64
     weight = 1 / (1e-6 + (OWN * indirect) ** 2)
     photograph = np.repeat([0, 1], [len(k) for k in kept])
     tiles = TileMeasurements(
-        random.integers(0, 256, shape), random.random(shape), weight, photograph, 2, indirect, place
+        random.integers(0, 256, shape), random.random(shape), weight, photograph, 2, indirect, place, np.ones(shape)
     )
     return tiles, 0.02 * random.standard_normal(shape), weight * random.uniform(0.01, 1, shape)
 

@@ -9,6 +9,7 @@ import pytest
 from controller.calibrate.values import Radiometry
 from controller.calibrate.verify.homography_update import update_positions, update_radiometry
 from controller.core.arrays import Float64
+from tests.controller.calibrate.spectra import colours
 
 ROWS, COLUMNS = 40, 60
 TURN: Float64 = np.array([[1.0, -0.004, 1.3], [0.004, 1.0, -0.8], [1e-5, 0.0, 1.0]])
@@ -77,3 +78,15 @@ def test_a_dimmed_channel_changes_the_mixing_and_white_stays_white() -> None:
     found = update_radiometry(Radiometry(np.zeros((3, 256)), mixing), (1.0, 1.0, 0.8)).mixing
     np.testing.assert_allclose(found.sum(axis=1), 1)
     assert found[2, 2] / found[2, 1] == pytest.approx(0.8 * mixing[2, 2] / mixing[2, 1])
+
+
+def test_a_dimmed_channel_changes_colours_on_all_paints_as_their_spectra_say() -> None:
+    gain = (1.0, 0.9, 0.7)
+
+    def told_by_white(light: Float64) -> Float64:
+        return np.asarray(np.einsum("kjc,jm->kcm", light, np.linalg.inv(light.sum(axis=2))))
+
+    before = Radiometry(np.zeros((3, 256)), colours().sum(axis=1), paint=told_by_white(colours()))
+    found = update_radiometry(before, gain).paint
+    assert found is not None
+    np.testing.assert_allclose(found, told_by_white(colours() * np.array(gain)), atol=1e-9)
