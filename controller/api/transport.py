@@ -60,7 +60,8 @@ def indirect_light(
     -------
     ``IndirectLight`` with ``forward(direct)``, the indirect light G d of a direct picture d, ``adjoint(picture)``, and
     ``direct_target(total)``, the d with d + G d = ``total`` where projectors light the object. All are (camera rows,
-    columns, 3) float32, without the black image. None where a projector has no ``indirect`` light
+    columns, 3) float32, without the black image. It also corrects colours that depend on the paint. None where a
+    projector has no ``indirect`` light and no colour depends on the paint
     """
     points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)
     return fit_indirect(calibration, transport.object_mask, points_m, normals)
