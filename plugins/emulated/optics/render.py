@@ -7,7 +7,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -150,14 +150,14 @@ class Renderer:
 
         ``frames``: (rows, columns, 3) uint8 for each projector; ``levels``: its lamp's light, 0 dark to 1 full
         """
-        digests = [hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() for frame in frames]
+        digests = [_digest(frame) for frame in frames]
         key = (*digests, *levels, *self._seen_of(shutter))
         if self._last is not None and self._last[0] == key:
             return self._last[1]
         total = self._ambient.copy()
         for index, (frame, level) in enumerate(zip(frames, levels, strict=True)):
             if level > 0.0:
-                total += np.float32(level) * self._layer(index, frame, digests[index], shutter)
+                total += np.float32(level) * self._layer(index, frame, shutter)
         if self._truth.indirect > 0.0:
             # The mean light on what the camera sees stands for what object and room throw back.
             lit = (total - self._ambient).sum(axis=0, dtype=np.float64) / np.maximum(self._albedo.sum(axis=0), 1e-9)
@@ -178,17 +178,16 @@ class Renderer:
         returned = transfer.light(sent)
         return np.multiply(self._paint, returned, out=returned)
 
-    def _layer(self, index: int, frame: ByteImage, digest: bytes, shutter: Shutter) -> FloatImage:
+    def _layer(self, index: int, frame: ByteImage, shutter: Shutter) -> FloatImage:
         """One projector's light (P, 3) at full lamp, summed over each camera pixel's samples, with what comes back of
         it from object and surfaces.
         """
         projector, kept = self._truth.projectors[index], self._layers[index]
-        if projector.dithering.levels > 1:
-            digest += repr(shutter).encode()
-        if digest in kept:
+        # Of a dithered frame, turns may differ. Those of black do not.
+        each = channels(projector.light, frame, projector.dithering, shutter)
+        if (digest := _digest(each)) in kept:
             kept.move_to_end(digest)
             return kept[digest]
-        each = channels(projector.light, frame, projector.dithering, shutter)
         paint, gloss = self._footprints_of(index)
         layer = self._spread(self._through(index, paint, each))
         if gloss:
@@ -206,13 +205,13 @@ class Renderer:
         if tensor is None:
             parts = sent_by_panels(projector, each, self._on_white[index])
             return functools.reduce(np.add, (lit.light(one) for lit, one in zip(footprints, parts, strict=True)))
-        # The camera's red is a sum over the paint's three albedos, of which each channel lights its own part.
+        # What the camera sees of a channel is a sum over the paint's three albedos.
         seen = []
-        for mixing in tensor:
-            parts = sent_by_panels(projector, each, mixing)
-            by_paint = (lit.light(one) for lit, one in zip(footprints, parts, strict=True))
-            seen.append(functools.reduce(np.add, by_paint).sum(axis=1))
-        return np.stack(seen, axis=1)
+        for channel in range(3):
+            alone = veiled(np.repeat(each[..., channel, None], 3, axis=2), projector.light.glare)
+            by_albedo = footprints[0 if projector.panels.aligned else channel].light(alone)
+            seen.append(by_albedo @ tensor[:, :, channel].T)
+        return functools.reduce(np.add, seen)
 
     def _spread(self, layer: FloatImage) -> FloatImage:
         """The light of a layer, part of which leaves the surface elsewhere."""
@@ -282,6 +281,10 @@ class Renderer:
             aperture_f=aperture_f, focus_m=camera.focus_m,
         )  # fmt: skip
         return flat.reshape(height, width)
+
+
+def _digest(image: npt.NDArray[Any]) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).digest()
 
 
 def _colours(truth: BenchTruth, projector: ProjectorTruth) -> FloatImage | None:
