@@ -3,7 +3,7 @@
 Correspondences are measured at whole camera pixels, so all noise is in the projector coordinates: a point is one
 number, its inverse depth along the camera ray. The Schur complement over the points is therefore a division.
 
-Camera parameters: log f, cx, cy, k1. Projector parameters: log f, cx, cy, rotation (3), centre (3). Square pixels.
+Camera parameters: log f, cx, cy, k1. Projector parameters: log f, cx, cy, k1, rotation (3), centre (3). Square pixels.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from controller.calibrate.geometry.normal_equations import CAMERA as CAMERA_PARAMETERS
+from controller.calibrate.geometry.normal_equations import LENS as LENS_PARAMETERS
 from controller.calibrate.geometry.normal_equations import PROJECTOR as PROJECTOR_PARAMETERS
 from controller.calibrate.geometry.normal_equations import (
     accumulate,
@@ -26,7 +27,15 @@ from controller.calibrate.geometry.normal_equations import (
 from controller.core import channels
 from controller.core.arrays import Float64, Mask
 
-__all__ = ["CAMERA_PARAMETERS", "PROJECTOR_PARAMETERS", "Adjusted", "AdjustmentProblem", "AdjustmentState", "adjust"]
+__all__ = [
+    "CAMERA_PARAMETERS",
+    "LENS_PARAMETERS",
+    "PROJECTOR_PARAMETERS",
+    "Adjusted",
+    "AdjustmentProblem",
+    "AdjustmentState",
+    "adjust",
+]
 
 _GAUGE_SIGMA = 1e-3
 _CAUCHY = 2.4
@@ -37,7 +46,7 @@ class AdjustmentProblem:
     """What was seen, and what is known beforehand.
 
     ``camera_px`` (points, 2); ``projector_px`` (points, N, 2), any value where not ``seen`` (points, N) bool;
-    ``camera_prior``, ``camera_sigma`` (4,); ``projector_prior``, ``projector_sigma`` (N, 3) of log f, cx, cy;
+    ``camera_prior``, ``camera_sigma`` (4,); ``projector_prior``, ``projector_sigma`` (N, 4) of log f, cx, cy, k1;
     ``noise_px``: standard deviation of one projector coordinate, beyond 2.4 of which the Cauchy loss turns flat
     """
 
@@ -53,7 +62,7 @@ class AdjustmentProblem:
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentState:
-    """``camera`` (4,); ``intrinsics`` (N, 3); ``rotations`` (N, 3, 3) camera to projector; ``centres`` (N, 3);
+    """``camera`` (4,); ``intrinsics`` (N, 4); ``rotations`` (N, 3, 3) camera to projector; ``centres`` (N, 3);
     ``inverse_depth`` (points,)."""
 
     camera: Float64
@@ -66,7 +75,7 @@ class AdjustmentState:
 @dataclass(frozen=True, slots=True)
 class Linearised:
     """``residual_px`` (points, N, 2) and its derivatives, 0 where not seen: by the camera (points, N, 2, 4), by the
-    projector's own parameters (points, N, 2, 9), by the inverse depth (points, N, 2)."""
+    projector's own parameters (points, N, 2, 10), by the inverse depth (points, N, 2)."""
 
     residual_px: Float64
     by_camera: Float64
@@ -76,8 +85,8 @@ class Linearised:
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
-    """``cost``: half the robust chi-square plus priors; ``covariance`` (4 + 9 N, 4 + 9 N), gauge: baselines of rms 1;
-    ``depth_sensitivity`` (points, 4 + 9 N): change of each inverse depth with the parameters."""
+    """``cost``: half the robust chi-square plus priors; ``covariance`` (4 + 10 N, 4 + 10 N), gauge: baselines of rms 1;
+    ``depth_sensitivity`` (points, 4 + 10 N): change of each inverse depth with the parameters."""
 
     state: AdjustmentState
     cost: float
@@ -85,9 +94,9 @@ class Adjusted:
     depth_sensitivity: Float64
 
 
-def undistorted(camera: Float64, px: Float64) -> Float64:
-    """(points, 2) x, y at depth 1 of camera pixels."""
-    return undistort(np.ascontiguousarray(camera), np.ascontiguousarray(px))
+def undistorted(lens: Float64, px: Float64) -> Float64:
+    """(points, 2) x, y at depth 1 of pixels (points, 2) of the camera or a projector; ``lens``: log f, cx, cy, k1."""
+    return undistort(np.ascontiguousarray(lens), np.ascontiguousarray(px))
 
 
 def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
@@ -132,16 +141,16 @@ def _placed(state: AdjustmentState) -> tuple[Float64, Float64, Float64, Float64]
 
 
 def stepped(state: AdjustmentState, parameters: Float64, inverse_depth: Float64) -> AdjustmentState:
-    """The state moved by (4 + 9 N,) and (points,); rotations by the exponential map."""
+    """The state moved by (4 + 10 N,) and (points,); rotations by the exponential map."""
     import cv2
 
     own = parameters[CAMERA_PARAMETERS:].reshape(-1, PROJECTOR_PARAMETERS)
-    turns = np.array([cv2.Rodrigues(row[3:6].copy())[0] for row in own])
+    turns = np.array([cv2.Rodrigues(row[LENS_PARAMETERS : LENS_PARAMETERS + 3].copy())[0] for row in own])
     return AdjustmentState(
         state.camera + parameters[:CAMERA_PARAMETERS],
-        state.intrinsics + own[:, :3],
+        state.intrinsics + own[:, :LENS_PARAMETERS],
         turns @ state.rotations,
-        state.centres + own[:, 6:9],
+        state.centres + own[:, LENS_PARAMETERS + 3 :],
         state.inverse_depth + inverse_depth,
     )
 
@@ -220,13 +229,13 @@ def _prior_jacobian(problem: AdjustmentProblem, state: AdjustmentState) -> Float
     """Of the prior terms, by the parameters."""
     projectors = len(state.intrinsics)
     size = CAMERA_PARAMETERS + PROJECTOR_PARAMETERS * projectors
-    jacobian = np.zeros((CAMERA_PARAMETERS + 3 * projectors + 1, size))
+    jacobian = np.zeros((CAMERA_PARAMETERS + LENS_PARAMETERS * projectors + 1, size))
     jacobian[np.arange(4), np.arange(4)] = 1.0 / problem.camera_sigma
     for n in range(projectors):
         start = CAMERA_PARAMETERS + PROJECTOR_PARAMETERS * n
-        rows = CAMERA_PARAMETERS + 3 * n + np.arange(3)
-        jacobian[rows, start + np.arange(3)] = 1.0 / problem.projector_sigma[n]
-        jacobian[-1, start + 6 : start + 9] = 2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
+        rows = CAMERA_PARAMETERS + LENS_PARAMETERS * n + np.arange(LENS_PARAMETERS)
+        jacobian[rows, start + np.arange(LENS_PARAMETERS)] = 1.0 / problem.projector_sigma[n]
+        jacobian[-1, start + LENS_PARAMETERS + 3 : start + PROJECTOR_PARAMETERS] = 2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
     return jacobian
 
 

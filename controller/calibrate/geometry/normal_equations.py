@@ -11,24 +11,38 @@ from controller.core.arrays import Float64, Mask
 from controller.core.jit import compiled
 
 CAMERA = 4
-PROJECTOR = 9
+PROJECTOR = 10
+LENS = 4
+"""Of the parameters of a camera or projector: log f, cx, cy, k1."""
 NEAREST = 1e-4
 """Along a projector's view axis, in baselines: anything nearer counts as behind the projector."""
 BEHIND_PX = 1e6
 
 
 @compiled()
-def undistort(camera: Float64, px: Float64) -> Float64:
-    """(points, 2) x, y at depth 1 of camera pixels (points, 2); ``camera``: log f, cx, cy, k1."""
-    focal, k1 = np.exp(camera[0]), camera[3]
+def straightening(k1: float, squared: float) -> float:
+    """The factor s that brings a place at depth 1, ``squared`` from the axis, to where no lens had bent it.
+
+    Newton's steps for s + k1 squared s^3 = 1; 1.5 is where the picture of the strongest barrel turns back.
+    """
+    bend, s = k1 * squared, 1.0
+    for _ in range(20):
+        step = (s + bend * s * s * s - 1.0) / max(1.0 + 3.0 * bend * s * s, 0.1)
+        s = min(s - step, 1.5)
+        if abs(step) < 1e-13:
+            break
+    return s
+
+
+@compiled()
+def undistort(lens: Float64, px: Float64) -> Float64:
+    """(points, 2) x, y at depth 1 of pixels (points, 2); ``lens``: log f, cx, cy, k1."""
+    focal, k1 = np.exp(lens[0]), lens[3]
     out = np.empty((len(px), 2))
     for p in range(len(px)):
-        distorted_x, distorted_y = (px[p, 0] - camera[1]) / focal, (px[p, 1] - camera[2]) / focal
-        x, y = distorted_x, distorted_y
-        for _ in range(8):
-            longer = 1.0 + k1 * (x * x + y * y)
-            x, y = distorted_x / longer, distorted_y / longer
-        out[p, 0], out[p, 1] = x, y
+        x, y = (px[p, 0] - lens[1]) / focal, (px[p, 1] - lens[2]) / focal
+        s = straightening(k1, x * x + y * y)
+        out[p, 0], out[p, 1] = s * x, s * y
     return out
 
 
@@ -46,8 +60,8 @@ def project(
 
     Parameters
     ----------
-    xy (points, 2) at depth 1, inverse_depth (points,), intrinsics (N, 3) log f, cx, cy, rotations (N, 3, 3),
-    turned (N, 3) rotated centres, projector_px (points, N, 2), seen (points, N)
+    xy (points, 2) at depth 1, inverse_depth (points,), intrinsics (N, 4) log f, cx, cy, k1,
+    rotations (N, 3, 3), turned (N, 3) rotated centres, projector_px (points, N, 2), seen (points, N)
     """
     points, projectors = seen.shape
     out, q = np.zeros((points, projectors, 2)), np.empty(3)
@@ -59,11 +73,13 @@ def project(
             for i in range(3):
                 q[i] = rotations[n, i, 0] * xy[p, 0] + rotations[n, i, 1] * xy[p, 1] + rotations[n, i, 2]
                 q[i] -= inverse_depth[p] * turned[n, i]
+            longer = 1.0 + intrinsics[n, 3] * (q[0] * q[0] + q[1] * q[1]) / (q[2] * q[2])
             for axis in range(2):
                 if q[2] < NEAREST:
                     out[p, n, axis] = BEHIND_PX
                 else:
-                    out[p, n, axis] = focal * q[axis] / q[2] + intrinsics[n, 1 + axis] - projector_px[p, n, axis]
+                    at = focal * longer * q[axis] / q[2] + intrinsics[n, 1 + axis]
+                    out[p, n, axis] = at - projector_px[p, n, axis]
     return out
 
 
@@ -77,7 +93,7 @@ def differentiate(
     turned: Float64,
     seen: Mask,
 ) -> tuple[Float64, Float64, Float64]:
-    """Derivatives of the projected pixels by camera (points, N, 2, 4), projector (points, N, 2, 9) and inverse depth.
+    """Derivatives of the projected pixels by camera (points, N, 2, 4), projector (points, N, 2, 10) and inverse depth.
 
     The last is (points, N, 2). All are 0 where not seen and behind a projector. Arguments as of ``project``;
     ``xy_by_camera`` (points, 2, 4).
@@ -87,28 +103,33 @@ def differentiate(
     by_projector, by_depth = np.zeros((points, projectors, 2, PROJECTOR)), np.zeros((points, projectors, 2))
     q, by_q, by_ray = np.empty(3), np.empty(3), np.empty(3)
     for n in range(projectors):
-        focal, turn = np.exp(intrinsics[n, 0]), rotations[n]
+        focal, k1, turn = np.exp(intrinsics[n, 0]), intrinsics[n, 3], rotations[n]
         for p in range(points):
             rho = inverse_depth[p]
             for i in range(3):
                 q[i] = turn[i, 0] * xy[p, 0] + turn[i, 1] * xy[p, 1] + turn[i, 2] - rho * turned[n, i]
             if not seen[p, n] or q[2] < NEAREST:
                 continue
+            x, y = q[0] / q[2], q[1] / q[2]
+            r2 = x * x + y * y
             for axis in range(2):
-                by_q[0], by_q[1], by_q[2] = 0.0, 0.0, -focal * q[axis] / (q[2] * q[2])
-                by_q[axis] = focal / q[2]
+                flat = q[axis] / q[2]
+                # of focal flat (1 + k1 r2), by x and y, and so by q
+                by_q[0], by_q[1] = 2.0 * focal * k1 * flat * x / q[2], 2.0 * focal * k1 * flat * y / q[2]
+                by_q[axis] += focal * (1.0 + k1 * r2) / q[2]
+                by_q[2] = -(by_q[0] * x + by_q[1] * y)
                 for j in range(3):
                     by_ray[j] = by_q[0] * turn[0, j] + by_q[1] * turn[1, j] + by_q[2] * turn[2, j]
                 for j in range(CAMERA):
                     by_camera[p, n, axis, j] = by_ray[0] * xy_by_camera[p, 0, j] + by_ray[1] * xy_by_camera[p, 1, j]
                 own = by_projector[p, n, axis]
-                own[0], own[1 + axis] = focal * q[axis] / q[2], 1.0
+                own[0], own[1 + axis], own[3] = focal * flat * (1.0 + k1 * r2), 1.0, focal * flat * r2
                 # d(exp(delta) q)/d(delta) = -[q]x, so a row g of by_q becomes q x g
-                own[3] = q[1] * by_q[2] - q[2] * by_q[1]
-                own[4] = q[2] * by_q[0] - q[0] * by_q[2]
-                own[5] = q[0] * by_q[1] - q[1] * by_q[0]
+                own[LENS] = q[1] * by_q[2] - q[2] * by_q[1]
+                own[LENS + 1] = q[2] * by_q[0] - q[0] * by_q[2]
+                own[LENS + 2] = q[0] * by_q[1] - q[1] * by_q[0]
                 for j in range(3):
-                    own[6 + j] = -rho * by_ray[j]
+                    own[LENS + 3 + j] = -rho * by_ray[j]
                     by_depth[p, n, axis] -= by_q[j] * turned[n, j]
     return by_camera, by_projector, by_depth
 
@@ -121,12 +142,12 @@ def accumulate(
 
     Parameters
     ----------
-    by_camera (points, N, 2, 4), by_projector (points, N, 2, 9), by_depth, residual (points, N, 2), weight (points, N)
+    by_camera (points, N, 2, 4), by_projector (points, N, 2, 10), by_depth, residual (points, N, 2), weight (points, N)
 
     Returns
     -------
     parameters (P, P), cross (points, P) between depth and parameters, depth (points,), the gradient by the parameters
-    (P,) and by the depths (points,), with P = 4 + 9 N
+    (P,) and by the depths (points,), with P = 4 + 10 N
     """
     points, projectors = weight.shape
     size = CAMERA + PROJECTOR * projectors

@@ -129,7 +129,7 @@ def triangulated(problem: ba.AdjustmentProblem, state: ba.AdjustmentState) -> Fl
     xy = ba.undistorted(state.camera, problem.camera_px)
     total, weight = np.zeros(len(xy)), np.zeros(len(xy))
     for n in range(problem.seen.shape[1]):
-        rays = (problem.projector_px[:, n] - state.intrinsics[n, 1:]) / np.exp(state.intrinsics[n, 0])
+        rays = ba.undistorted(state.intrinsics[n], problem.projector_px[:, n])
         own = epipolar.inverse_depths(xy, rays, state.rotations[n], state.centres[n])
         usable = np.where(problem.seen[:, n], np.sum(state.centres[n] ** 2), 0.0)
         total, weight = total + usable * own, weight + usable
@@ -137,7 +137,7 @@ def triangulated(problem: ba.AdjustmentProblem, state: ba.AdjustmentState) -> Fl
 
 
 def _from_start(problem: ba.AdjustmentProblem, start: epipolar.PairStart) -> ba.AdjustmentState:
-    intrinsics = np.array([[np.log(start.focal_px), *start.principal_px]])
+    intrinsics = np.array([[np.log(start.focal_px), *start.principal_px, 0.0]])
     empty = np.ones(len(problem.camera_px))
     state = ba.AdjustmentState(problem.camera_prior, intrinsics, start.rotation[None], start.centre[None], empty)
     return replace(state, inverse_depth=triangulated(problem, state))

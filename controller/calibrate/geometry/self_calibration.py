@@ -27,6 +27,8 @@ _TRIAL_POINTS = 600
 _FEWEST_POINTS = 200
 _LARGEST_SHAPE_SIGMA = 0.02
 _LARGEST_PRIOR_SIGMAS = 5.0
+_LENS_SIGMA = 0.03
+"""Of a projector's k1."""
 _CLEAR_MARGIN = 12.0  # of the halved chi-square between the best stage and any other, on _TRIAL_POINTS
 
 
@@ -150,8 +152,9 @@ def _problem(
     sigma = prior.principal_point_sigma_px or 0.005 * width
     sizes = np.array(projector_sizes, dtype=np.float64)
     # throw ratios of 0.9 to 3.5 within one sigma; no horizontal shift to speak of; any vertical one
-    shapes = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1]], axis=1)
-    widths = np.stack([np.full(len(sizes), 0.7), 0.02 * sizes[:, 0], 0.7 * sizes[:, 1]], axis=1)
+    none = np.zeros(len(sizes))
+    shapes = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1], none], axis=1)
+    widths = np.stack([np.full(len(sizes), 0.7), 0.02 * sizes[:, 0], 0.7 * sizes[:, 1], none + _LENS_SIGMA], axis=1)
     return ba.AdjustmentProblem(
         camera_px,
         projector_px,
@@ -318,5 +321,5 @@ def _refuse_if_uncertain(shape_sigma: float, margin: float, pairs: Sequence[pose
 def _in_metres(covariance: Float64, unit_m: float, projectors: int) -> Float64:
     scale = np.ones(len(covariance))
     own = scale[ba.CAMERA_PARAMETERS :].reshape(projectors, ba.PROJECTOR_PARAMETERS)
-    own[:, 6:] = unit_m
+    own[:, ba.LENS_PARAMETERS + 3 :] = unit_m
     return covariance * np.outer(scale, scale)

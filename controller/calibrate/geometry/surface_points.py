@@ -11,7 +11,7 @@ import numpy as np
 from controller.calibrate.geometry import bundle_adjustment as ba
 from controller.calibrate.geometry.metric_scale import metres_per_unit
 from controller.calibrate.geometry.surface_fit import fit_patches, whole_pixels
-from controller.calibrate.geometry.triangulation import fit_planes, inverse_depth_map
+from controller.calibrate.geometry.triangulation import fit_planes, inverse_depth_map, projector_rays
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.values import Correspondence, Geometry, Pinhole
 from controller.core import channels
@@ -55,11 +55,16 @@ def object_points(
     """
     rays = _ray_map(state.camera, camera_size)
     seen = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
-    observed = np.stack([c.projector_px for c in correspondences])
-    intrinsics = np.concatenate([np.exp(state.intrinsics[:, :1]), state.intrinsics[:, 1:]], axis=1)
+    slopes = projector_rays(np.stack([c.projector_px for c in correspondences]), np.ascontiguousarray(state.intrinsics))
     noise_px = max(noise_px, LEAST_NOISE_PX)
     raw, residual, leverage = inverse_depth_map(
-        rays, observed, seen, intrinsics, np.ascontiguousarray(state.rotations), state.centres, noise_px
+        rays,
+        slopes,
+        seen,
+        np.exp(state.intrinsics[:, 0]),
+        np.ascontiguousarray(state.rotations),
+        state.centres,
+        noise_px,
     )
     raw = np.where(raw > 0, raw, np.float32(np.nan))
     smooth, normals = _surface(raw, rays, float(np.exp(state.camera[0])), smoothing_px)
@@ -75,9 +80,9 @@ def object_points(
     unit_m, unit_rel_sigma = metres_per_unit(points, prior.distance_m, prior.distance_rel_sigma, prior.distances)
     relative = np.hypot(np.maximum(residual, noise_px) * leverage / smooth, np.float32(shape_rel_sigma))
     geometry = Geometry(
-        camera=_pinhole(state.camera[:3], float(state.camera[3]), np.eye(3), np.zeros(3), camera_size),
+        camera=_pinhole(state.camera, np.eye(3), np.zeros(3), camera_size),
         projectors=tuple(
-            _pinhole(state.intrinsics[n], 0.0, state.rotations[n], state.centres[n] * unit_m, size)
+            _pinhole(state.intrinsics[n], state.rotations[n], state.centres[n] * unit_m, size)
             for n, size in enumerate(projector_sizes)
         ),
         points_m=(points * unit_m).astype(np.float32),
@@ -110,7 +115,7 @@ def _ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
     return np.ascontiguousarray(xy, dtype=np.float32)
 
 
-def _pinhole(intrinsics: Float64, k1: float, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:
-    focal = float(np.exp(intrinsics[0]))
-    matrix = np.array([[focal, 0.0, intrinsics[1]], [0.0, focal, intrinsics[2]], [0.0, 0.0, 1.0]])
-    return Pinhole(matrix, np.array([k1, 0.0]), rotation.copy(), -rotation @ centre_m, size)
+def _pinhole(lens: Float64, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:
+    focal = float(np.exp(lens[0]))
+    matrix = np.array([[focal, 0.0, lens[1]], [0.0, focal, lens[2]], [0.0, 0.0, 1.0]])
+    return Pinhole(matrix, np.array([float(lens[3]), 0.0]), rotation.copy(), -rotation @ centre_m, size)

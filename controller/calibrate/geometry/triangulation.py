@@ -8,6 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from controller.calibrate.geometry.normal_equations import straightening
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 
@@ -15,11 +16,30 @@ _SHARPEST = 0.02  # relative depth step between neighbours beyond which they lie
 
 
 @compiled(parallel=True)
+def projector_rays(projector_px: FloatImage, lenses: Float64) -> FloatImage:
+    """(N, rows, columns, 2) float32 undistorted x, y at depth 1 of what each camera pixel sees; NaN where it is NaN.
+
+    ``projector_px`` (N, rows, columns, 2) float32; ``lenses`` (N, 4) float64: log f, cx, cy, k1
+    """
+    projectors, rows, columns, _ = projector_px.shape
+    out = np.empty(projector_px.shape, dtype=np.float32)
+    for n in range(projectors):
+        focal, k1 = np.exp(lenses[n, 0]), lenses[n, 3]
+        for row in numba.prange(rows):
+            for column in range(columns):
+                x = (projector_px[n, row, column, 0] - lenses[n, 1]) / focal
+                y = (projector_px[n, row, column, 1] - lenses[n, 2]) / focal
+                s = straightening(k1, x * x + y * y)
+                out[n, row, column, 0], out[n, row, column, 1] = s * x, s * y
+    return out
+
+
+@compiled(parallel=True)
 def inverse_depth_map(
     rays: FloatImage,
-    projector_px: FloatImage,
+    slopes: FloatImage,
     seen: Mask,
-    intrinsics: Float64,
+    focal_px: Float64,
     rotations: Float64,
     centres: Float64,
     noise_px: float,
@@ -29,8 +49,8 @@ def inverse_depth_map(
     Parameters
     ----------
     rays : (rows, columns, 2) float32, undistorted x, y at depth 1
-    projector_px : (N, rows, columns, 2) float32; ``seen`` (N, rows, columns)
-    intrinsics : (N, 3) f, cx, cy in pixels; ``rotations`` (N, 3, 3); ``centres`` (N, 3)
+    slopes : (N, rows, columns, 2) float32, undistorted x, y at depth 1 in each projector; ``seen`` (N, rows, columns)
+    focal_px : (N,), which make pixels of them; ``rotations`` (N, 3, 3); ``centres`` (N, 3)
     noise_px : projector coordinates farther than 2.4 times this from the model count less (Cauchy)
 
     Returns
@@ -57,9 +77,8 @@ def inverse_depth_map(
                     if not seen[n, row, column]:
                         continue
                     R = rotations[n]
-                    focal = intrinsics[n, 0]
-                    u = (projector_px[n, row, column, 0] - intrinsics[n, 1]) / focal
-                    v = (projector_px[n, row, column, 1] - intrinsics[n, 2]) / focal
+                    focal = focal_px[n]
+                    u, v = slopes[n, row, column, 0], slopes[n, row, column, 1]
                     qx = R[0, 0] * rx + R[0, 1] * ry + R[0, 2]
                     qy = R[1, 0] * rx + R[1, 1] * ry + R[1, 2]
                     qz = R[2, 0] * rx + R[2, 1] * ry + R[2, 2]

@@ -54,7 +54,7 @@ class CameraPrior:
 class Reconstruction:
     """The geometry, and how far to trust it.
 
-    ``covariance`` (4 + 9 N, 4 + 9 N) of ``parameter_names``, rotations in radians, centres in metres at a fixed scale
+    ``covariance`` (4 + 10 N, 4 + 10 N) of ``parameter_names``, rotations in radians, centres in metres at a fixed scale
     ``noise_px`` estimated standard deviation of one projector coordinate
     ``shape_rel_sigma`` expected rms error of the points by wrong parameters, as a share of their distance, scale apart
     ``scale_rel_sigma`` by the measured distances; infinite where none was given
@@ -79,6 +79,6 @@ class Reconstruction:
 
 def parameter_names(projectors: int) -> tuple[str, ...]:
     """Names of the covariance's rows, in order."""
-    own = ("log_focal", "cx_px", "cy_px", "turn_x", "turn_y", "turn_z", "centre_x_m", "centre_y_m", "centre_z_m")
+    own = ("log_focal", "cx_px", "cy_px", "k1", "turn_x", "turn_y", "turn_z", "centre_x_m", "centre_y_m", "centre_z_m")
     camera = ("camera.log_focal", "camera.cx_px", "camera.cy_px", "camera.k1")
     return camera + tuple(f"projector{n}.{name}" for n in range(projectors) for name in own)

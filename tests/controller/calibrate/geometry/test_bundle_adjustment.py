@@ -19,7 +19,7 @@ def tiny(seed: int, points: int = 14, noise_px: float = 0.1) -> tuple[ba.Adjustm
     rng = np.random.default_rng(seed)
     state = ba.AdjustmentState(
         np.array([np.log(600.0), 190.0, 130.0, -0.05]),
-        np.array([[np.log(500.0), 140.0, 220.0], [np.log(560.0), 138.0, 215.0]]),
+        np.array([[np.log(500.0), 140.0, 220.0, 0.05], [np.log(560.0), 138.0, 215.0, -0.04]]),
         np.stack([_rotation(rng.normal([0.2, tilt, 0.0], 0.05)) for tilt in (0.4, -0.4)]),
         np.array([[-0.9, -0.1, 0.2], [1.0, 0.2, 0.1]]) + rng.normal(0, 0.05, (2, 3)),
         rng.uniform(0.4, 0.6, points),
@@ -32,7 +32,7 @@ def tiny(seed: int, points: int = 14, noise_px: float = 0.1) -> tuple[ba.Adjustm
         camera_prior=state.camera.copy(),
         camera_sigma=np.array([0.01, 2.0, 2.0, 0.05]),
         projector_prior=state.intrinsics.copy(),
-        projector_sigma=np.tile([0.5, 4.0, 60.0], (2, 1)),
+        projector_sigma=np.tile([0.5, 4.0, 60.0, 0.03], (2, 1)),
         noise_px=noise_px,
     )
     perfect = ba.residuals(problem, state)
@@ -50,9 +50,9 @@ def _rotation(vector: Float64) -> Float64:
 def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
     problem, state = tiny(seed)
     linear = ba.linearise(problem, state)
-    for column in range(4 + 18):
-        step = np.zeros(22)
-        step[column] = h = 1e-6 if column not in (1, 2, 5, 6, 14, 15) else 1e-3
+    for column in range(4 + 20):
+        step = np.zeros(24)
+        step[column] = h = 1e-6 if column not in (1, 2, 5, 6, 15, 16) else 1e-3
         ahead = ba.residuals(problem, ba.stepped(state, step, np.zeros(len(state.inverse_depth))))
         behind = ba.residuals(problem, ba.stepped(state, -step, np.zeros(len(state.inverse_depth))))
         expected = (ahead - behind) / (2 * h)
@@ -60,10 +60,10 @@ def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
         if column < 4:
             ours = linear.by_camera[..., column]
         else:
-            n, own = divmod(column - 4, 9)
+            n, own = divmod(column - 4, 10)
             ours[:, n] = linear.by_projector[:, n, :, own]
         np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=2e-4 * max(1.0, float(np.abs(expected).max())))
-    nothing, every = np.zeros(22), np.full(len(state.inverse_depth), 1e-6)
+    nothing, every = np.zeros(24), np.full(len(state.inverse_depth), 1e-6)
     difference = ba.residuals(problem, ba.stepped(state, nothing, every)) - ba.residuals(
         problem, ba.stepped(state, nothing, -every)
     )
@@ -74,10 +74,10 @@ def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
 def test_it_ends_where_scipy_ends(seed: int) -> None:
     problem, truth = tiny(seed)
     rng = np.random.default_rng(seed + 100)
-    start = ba.normalised(ba.stepped(truth, rng.normal(0, 0.01, 22), rng.normal(0, 0.01, len(truth.inverse_depth))))
+    start = ba.normalised(ba.stepped(truth, rng.normal(0, 0.01, 24), rng.normal(0, 0.01, len(truth.inverse_depth))))
 
     def everything(x: Float64) -> Float64:
-        state = ba.stepped(start, x[:22], x[22:])
+        state = ba.stepped(start, x[:24], x[24:])
         r = np.linalg.norm(ba.residuals(problem, state), axis=2).ravel() / problem.noise_px
         robust = 2.4 * np.sqrt(np.log1p((r / 2.4) ** 2))
         camera = (state.camera - problem.camera_prior) / problem.camera_sigma
@@ -85,7 +85,7 @@ def test_it_ends_where_scipy_ends(seed: int) -> None:
         gauge = (np.mean(np.sum(state.centres**2, axis=1)) - 1) / 1e-3
         return np.concatenate([robust, camera, own.ravel(), [gauge]])
 
-    solved = least_squares(everything, np.zeros(22 + len(truth.inverse_depth)), x_scale="jac", max_nfev=300)
+    solved = least_squares(everything, np.zeros(24 + len(truth.inverse_depth)), x_scale="jac", max_nfev=300)
     ours = ba.adjust(problem, start, iterations=200)
     assert ours.cost < 0.2 * ba.cost_of(problem, start)
     assert ours.cost <= solved.cost * (1 + 1e-3)
@@ -96,23 +96,23 @@ def test_the_covariance_is_that_of_the_full_normal_equations() -> None:
     solved = ba.adjust(problem, state)
     linear = ba.linearise(problem, solved.state)
     points, projectors = problem.seen.shape
-    whole = np.zeros((points, projectors, 2, 22 + points))
+    whole = np.zeros((points, projectors, 2, 24 + points))
     whole[..., :4] = linear.by_camera
     for n in range(projectors):
-        whole[:, n, :, 4 + 9 * n : 13 + 9 * n] = linear.by_projector[:, n]
-    whole[np.arange(points), :, :, 22 + np.arange(points)] = linear.by_depth
+        whole[:, n, :, 4 + 10 * n : 14 + 10 * n] = linear.by_projector[:, n]
+    whole[np.arange(points), :, :, 24 + np.arange(points)] = linear.by_depth
     squared = np.sum(linear.residual_px**2, axis=2) / problem.noise_px**2
     whole *= (1 / np.sqrt(1 + squared / 2.4**2) / problem.noise_px)[..., None, None]
-    rows = whole.reshape(-1, 22 + points)
-    prior = np.zeros((11, 22 + points))
+    rows = whole.reshape(-1, 24 + points)
+    prior = np.zeros((13, 24 + points))
     prior[:4, :4] = np.diag(1 / problem.camera_sigma)
     for n in range(2):
-        prior[4 + 3 * n : 7 + 3 * n, 4 + 9 * n : 7 + 9 * n] = np.diag(1 / problem.projector_sigma[n])
-        prior[10, 10 + 9 * n : 13 + 9 * n] = solved.state.centres[n] / 1e-3
+        prior[4 + 4 * n : 8 + 4 * n, 4 + 10 * n : 8 + 10 * n] = np.diag(1 / problem.projector_sigma[n])
+        prior[12, 11 + 10 * n : 14 + 10 * n] = solved.state.centres[n] / 1e-3
     rows = np.concatenate([rows, prior])
     scale = 1 / np.linalg.norm(rows, axis=0)
     expected = np.linalg.inv((rows * scale).T @ (rows * scale)) * np.outer(scale, scale)
-    np.testing.assert_allclose(np.diag(solved.covariance), np.diag(expected)[:22], rtol=1e-2)
+    np.testing.assert_allclose(np.diag(solved.covariance), np.diag(expected)[:24], rtol=1e-2)
 
 
 def test_scale_is_free_and_points_behind_a_projector_count_as_far_off() -> None:

@@ -36,9 +36,9 @@ def stage(seed: int, points: int = 500) -> tuple[ba.AdjustmentProblem, ba.Adjust
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
         rotation = cv2.Rodrigues(rng.normal(0, 0.03, 3))[0] @ np.stack([x, np.cross(z, x), z])
-        lens = np.array([rng.uniform(480, 560), 140.0, 215.0])
+        lens = np.array([rng.uniform(480, 560), 140.0, 215.0, rng.uniform(-0.06, 0.06)])
         K = np.array([[lens[0], 0, lens[1]], [0, lens[0], lens[2]], [0, 0, 1]])
-        own, _ = cv2.projectPoints(world, cv2.Rodrigues(rotation)[0], -rotation @ centre, K, np.zeros(4))
+        own, _ = cv2.projectPoints(world, cv2.Rodrigues(rotation)[0], -rotation @ centre, K, np.array([lens[3], 0, 0, 0]))
         rotations.append(rotation)
         centres.append(centre)
         intrinsics.append([np.log(lens[0]), *lens[1:]])
@@ -51,7 +51,7 @@ def stage(seed: int, points: int = 500) -> tuple[ba.AdjustmentProblem, ba.Adjust
         camera_prior=camera,
         camera_sigma=np.array([1e-7, 1e-5, 1e-5, 1e-8]),
         projector_prior=np.array(intrinsics),
-        projector_sigma=np.tile([1e3, 1e6, 1e6], (3, 1)),
+        projector_sigma=np.tile([1e3, 1e6, 1e6, 1e3], (3, 1)),
         noise_px=NOISE_PX,
     )
     several = problem.seen.sum(axis=1) >= 2
@@ -63,9 +63,9 @@ def stage(seed: int, points: int = 500) -> tuple[ba.AdjustmentProblem, ba.Adjust
 
 def start_of(state: ba.AdjustmentState, seed: int) -> ba.AdjustmentState:
     rng = np.random.default_rng(seed)
-    step = np.zeros(31)
+    step = np.zeros(34)
     for n in range(3):
-        step[4 + 9 * n : 13 + 9 * n] = rng.normal(0, [0.02, 2, 4, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02])
+        step[4 + 10 * n : 14 + 10 * n] = rng.normal(0, [0.02, 2, 4, 0.02, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02])
     return ba.stepped(state, step, rng.normal(0, 0.01, len(state.inverse_depth)) * state.inverse_depth)
 
 
@@ -74,7 +74,7 @@ def by_colmap(problem: ba.AdjustmentProblem, start: ba.AdjustmentState) -> ba.Ad
     rays = np.concatenate([ba.undistorted(start.camera, problem.camera_px), np.ones((len(problem.seen), 1))], axis=1)
     whole = pycolmap.Reconstruction()
     lenses = [("SIMPLE_RADIAL", [STIFFNESS * focal, STIFFNESS * cx, STIFFNESS * cy, k1])]
-    lenses += [("SIMPLE_PINHOLE", [float(np.exp(f)), x, y]) for f, x, y in start.intrinsics]
+    lenses += [("SIMPLE_RADIAL", [float(np.exp(f)), x, y, bend]) for f, x, y, bend in start.intrinsics]
     poses = [(np.eye(3), np.zeros(3)), *zip(start.rotations, start.centres, strict=True)]
     everything = np.ones(len(problem.seen), dtype=np.bool_)
     pixels = [(STIFFNESS * problem.camera_px, everything)]
@@ -110,12 +110,12 @@ def by_colmap(problem: ba.AdjustmentProblem, start: ba.AdjustmentState) -> ba.Ad
     found = [whole.images[number].cam_from_world() for number in (2, 3, 4)]
     turns = np.array([pose.rotation.matrix() for pose in found])
     centres = np.array([whole.images[number].projection_center() for number in (2, 3, 4)])
-    intrinsics = [[np.log(p[0]), p[1], p[2]] for p in (whole.cameras[number].params for number in (2, 3, 4))]
+    intrinsics = [[np.log(p[0]), *p[1:]] for p in (whole.cameras[number].params for number in (2, 3, 4))]
     return ba.normalised(ba.AdjustmentState(start.camera, np.array(intrinsics), turns, centres, start.inverse_depth))
 
 
 def parameters(one: ba.AdjustmentState, other: ba.AdjustmentState) -> Float64:
-    """The projectors' parameters (27,) by which ``one`` differs from ``other``."""
+    """The projectors' parameters (30,) by which ``one`` differs from ``other``."""
     turns = [cv2.Rodrigues(a @ b.T)[0].ravel() for a, b in zip(one.rotations, other.rotations, strict=True)]
     return np.concatenate(
         [one.intrinsics - other.intrinsics, np.array(turns), one.centres - other.centres], axis=1

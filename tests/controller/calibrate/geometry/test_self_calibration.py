@@ -184,7 +184,7 @@ def test_normals_are_the_surfaces_and_point_to_the_camera(stage: Stage, found: R
 def test_the_covariance_names_its_rows_and_predicts_the_error(stage: Stage, found: Reconstruction) -> None:
     names = parameter_names(3)
     assert found.parameter_names == names
-    assert found.covariance.shape == (len(names), len(names)) == (31, 31)
+    assert found.covariance.shape == (len(names), len(names)) == (34, 34)
     sigma = dict(zip(names, np.sqrt(np.diag(found.covariance)), strict=True))
     assert sigma["camera.log_focal"] < 0.0101
     for n, (own, (K, _, _)) in enumerate(zip(found.geometry.projectors, stage.projectors, strict=True)):
