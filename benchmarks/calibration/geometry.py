@@ -38,6 +38,8 @@ STAGES = {"small": 20, "medium": 5, "paper": 1}
 NOISE_PX = (0.03, 0.05)
 OUTLIERS = 0.02
 GROSS_MM = 5.0
+LARGEST_K1 = 0.06
+"""Of a projector's lens, where pictures are bent: k1 up to this to either side, and k2 of -0.25 k1."""
 
 
 @dataclass(slots=True)
@@ -53,13 +55,13 @@ class Found:
 
 
 def measure(size: str) -> list[Row]:
-    """``STAGES`` random stages of a size with three projectors, and as many with the first two of them."""
+    """``STAGES`` random stages of a size with three projectors, their first two alone, and three with bent pictures."""
     rows: list[Row] = []
-    for projectors in (3, 2):
+    for projectors, bend in ((3, 0.0), (2, 0.0), (3, LARGEST_K1)):
         found = Found()
         for seed in range(FIRST_SEED, FIRST_SEED + STAGES[size]):
-            _one(size, seed, projectors, found)
-        rows += _rows(found, STAGES[size], projectors, paper=size == "paper")
+            _one(size, seed, projectors, found, bend)
+        rows += _rows(found, STAGES[size], projectors, paper=size == "paper", bent=bend > 0)
     rows.append(at_most("peak memory of the process", peak_bytes() / 1e9, None, unit="GB", how="rays included"))
     return rows
 
@@ -74,12 +76,17 @@ def geometry_seconds(size: str, seed: int) -> tuple[float, float]:
 
 
 def _posed(
-    size: str, seed: int, projectors: int
+    size: str, seed: int, projectors: int, bend: float = 0.0
 ) -> tuple[BenchTruth, StageObject, list[Correspondence], Float64, CameraPrior]:
     """A random stage, what is seen of it, its true points and what is known of the camera."""
     stage_object = default_object() if seed % 2 == 0 else _rock(seed)
     truth = random_truth(size, seed, stage_object, ObjectTruth("mesh", "object.npz", seed), (1, 2))
-    truth = replace(truth, subsamples=1, projectors=truth.projectors[:projectors])
+    rng = np.random.default_rng([seed, 9])
+    bent = []
+    for one in truth.projectors[:projectors]:
+        k1 = float(rng.uniform(-bend, bend))
+        bent.append(replace(one, lens=replace(one.lens, distortion=(k1, -0.25 * k1))))
+    truth = replace(truth, subsamples=1, projectors=tuple(bent))
     seen, points = _correspondences(truth, stage_object, seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "camera-intrinsics.toml"
@@ -90,8 +97,8 @@ def _posed(
     return truth, stage_object, seen, points, prior
 
 
-def _one(size: str, seed: int, projectors: int, found: Found) -> None:
-    truth, _, seen, points, prior = _posed(size, seed, projectors)
+def _one(size: str, seed: int, projectors: int, found: Found, bend: float) -> None:
+    truth, _, seen, points, prior = _posed(size, seed, projectors, bend)
     sizes = [p.lens.size_px for p in truth.projectors]
     began = time.perf_counter()
     try:
@@ -190,9 +197,9 @@ def _errors(truth: BenchTruth, true: Float64, result: Reconstruction) -> dict[st
     }
 
 
-def _rows(found: Found, stages: int, projectors: int, *, paper: bool) -> list[Row]:
+def _rows(found: Found, stages: int, projectors: int, *, paper: bool, bent: bool) -> list[Row]:
     goals = projectors == 3
-    name = f"N = {projectors}: "
+    name = f"N = {projectors}{', bent pictures' if bent else ''}: "
     done = len(found.values.get("seconds", ()))
     how = "; ".join(found.refused) or "every one"
     rows = [at_least(f"{name}stages converged", done, stages if goals else None, unit=f"of {stages}", how=how)]

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from controller.calibrate.geometry.self_calibration import CameraPrior, Reconstruction, parameter_names, reconstruct
+from controller.calibrate.metapixels.initial_estimate import project
 from controller.calibrate.values import Correspondence
 from controller.core.errors import CalibrationError, UsageError, WorkError
 
@@ -27,6 +28,7 @@ class Stage:
     points: Array
     projectors: list[tuple[Array, Array, Array]]
     correspondences: list[Correspondence]
+    projector_px: tuple[int, int] = PROJECTOR
 
 
 def turn(axis: int, angle: float) -> Array:
@@ -54,7 +56,10 @@ def make_stage(
     camera: tuple[int, int] = CAMERA,
     k1: float = -0.04,
     focal_error: float = 0.01,
+    lens: tuple[float, float] = (0.0, 0.0),
+    projector_px: tuple[int, int] = PROJECTOR,
 ) -> Stage:
+    """``lens``: k1 and k2 of every projector, about its principal point."""
     rng = np.random.default_rng(seed)
     width, height = camera
     focal = 1.55 * width
@@ -86,12 +91,15 @@ def make_stage(
         a, b = np.deg2rad(angle + rng.uniform(-4, 4)), np.deg2rad(lift + rng.uniform(-4, 4))
         reach = rng.uniform(1.05, 1.25)
         centre = target + reach * np.array([np.sin(a) * np.cos(b), -np.sin(b), -np.cos(a) * np.cos(b)])
-        w, h = PROJECTOR
+        w, h = projector_px
         f = rng.uniform(1.7, 2.1) * w
         K = np.array([[f, 0, (w - 1) / 2 + rng.normal(0, 0.005 * w)], [0, f, 1.05 * h + rng.normal(0, 2)], [0, 0, 1]])
         R = turn(0, np.arctan((K[1, 2] - h / 2) / f)) @ looking_at(centre, target, rng.normal(0, 0.05))
         seen = (points - centre) @ R.T
-        px = (seen / seen[..., 2:]) @ K.T
+        flat = seen / seen[..., 2:]
+        r2 = np.sum(flat[..., :2] ** 2, axis=2, keepdims=True)
+        flat[..., :2] *= 1 + lens[0] * r2 + lens[1] * r2**2
+        px = flat @ K.T
         px = px[..., :2] + rng.normal(0, noise_px, (height, width, 2))
         valid = inside & np.all((px > 0) & (px < np.array([w - 1, h - 1])), axis=2) & (seen[..., 2] > 0)
         wrong = rng.random((height, width)) < outliers
@@ -99,13 +107,13 @@ def make_stage(
         px[~valid] = np.nan
         found.append(Correspondence(px.astype(np.float32), valid.astype(np.float32), valid))
         true.append((K, R, centre))
-    return Stage(focal * (1 + rng.normal(0, focal_error)), points, true, found)
+    return Stage(focal * (1 + rng.normal(0, focal_error)), points, true, found, projector_px)
 
 
 def solve(stage: Stage, *, distance_m: float | None = None, focal_rel_sigma: float = 0.01) -> Reconstruction:
     rows, columns = stage.correspondences[0].valid.shape
     prior = CameraPrior(stage.focal_px, focal_rel_sigma, distance_m=distance_m)
-    return reconstruct(stage.correspondences, (columns, rows), [PROJECTOR] * len(stage.projectors), prior)
+    return reconstruct(stage.correspondences, (columns, rows), [stage.projector_px] * len(stage.projectors), prior)
 
 
 def fitted(ours: Array, truth: Array) -> tuple[Array, float, Array, Array]:
@@ -205,6 +213,56 @@ def test_projectors_in_another_order_give_the_same_stage(stage: Stage, found: Re
     for n, own in zip(order, again.geometry.projectors, strict=True):
         np.testing.assert_allclose(own.matrix, found.geometry.projectors[n].matrix, rtol=1e-3, atol=0.05)
         np.testing.assert_allclose(own.translation_m, found.geometry.projectors[n].translation_m, atol=1e-3)
+
+
+BENT = [(0.02, -0.005), (-0.04, 0.01), (0.06, 0.0), (-0.06, 0.0)]
+"""k1 and k2 of projectors; with the last two the corners lie 5 px of 280 off."""
+
+
+@pytest.mark.parametrize("lens", BENT)
+def test_bent_pictures_of_projectors_cost_neither_shape_nor_poses(lens: tuple[float, float]) -> None:
+    stage = make_stage(11, lens=lens)
+    found = solve(stage)
+    points = found.geometry.points_m.astype(np.float64)
+    known = np.isfinite(points[..., 2])
+    assert shape_error_m(stage, found) < 4e-4
+    assert found.geometry.reprojection_rms_px < 0.2
+    assert found.noise_px == pytest.approx(0.2, rel=0.1)
+    sigma = dict(zip(found.parameter_names, np.sqrt(np.diag(found.covariance)), strict=True))
+    _, scale, rotation, shift = fitted(points[known], stage.points[known])
+    for n, (own, (K, R, centre)) in enumerate(zip(found.geometry.projectors, stage.projectors, strict=True)):
+        ours = scale * rotation @ (-own.rotation.T @ own.translation_m) + shift
+        assert np.linalg.norm(ours - centre) < 0.01
+        assert np.degrees(np.arccos(0.5 * np.trace(own.rotation @ rotation.T @ R.T) - 0.5)) < 0.5
+        assert own.matrix[0, 0] == pytest.approx(K[0, 0], rel=0.015)
+        assert sigma[f"projector{n}.k1"] < 0.01
+        # one term stands for both: k1 + k2 r2, which is at most 0.3 with this lens shift
+        assert abs(own.distortion[0] - lens[0]) < 4 * sigma[f"projector{n}.k1"] + 0.3 * abs(lens[1])
+
+
+@pytest.mark.parametrize("projectors", [2, 3])
+@pytest.mark.parametrize("lens", [(0.06, 0.0), (-0.06, 0.0), (-0.06, 0.015)])
+def test_pictures_of_full_hd_are_bent_by_tens_of_pixels(lens: tuple[float, float], projectors: int) -> None:
+    stage = make_stage(12, lens=lens, projectors=projectors, projector_px=(1920, 1440), noise_px=0.3)
+    found = solve(stage)
+    assert found.inlier_share > 0.9
+    assert shape_error_m(stage, found) < 4e-4
+
+
+@pytest.mark.parametrize("lens", BENT)
+@pytest.mark.parametrize("projectors", [2, 3])
+def test_a_flat_scene_is_refused_whatever_the_projectors_lenses(lens: tuple[float, float], projectors: int) -> None:
+    with pytest.raises(CalibrationError) as refused:
+        solve(make_stage(1, relief_m=0.0, lens=lens, projectors=projectors))
+    assert refused.value.code in ("scene-flat", "geometry-uncertain", "geometry-ambiguous")
+
+
+def test_the_found_lenses_bend_the_found_points_to_where_they_were_seen() -> None:
+    stage = make_stage(11, lens=(-0.06, 0.0))
+    found = solve(stage)
+    for own, seen in zip(found.geometry.projectors, stage.correspondences, strict=True):
+        px, _ = project(own, found.geometry.points_m.astype(np.float64))
+        assert np.nanmedian(np.linalg.norm(px - seen.projector_px, axis=2)) < 0.3
 
 
 @pytest.mark.parametrize("seed", range(3))
