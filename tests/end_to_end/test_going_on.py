@@ -1,6 +1,7 @@
 """A calibration that is stopped, killed, unplugged and short of disk, and goes on each time, to its end.
 
-The object is a mesh from a file, and the bench's truth lies elsewhere from the moment at which its devices are there.
+The object is a mesh from a file, and the projectors' lenses bend their pictures. The bench's truth lies elsewhere from
+the moment at which its devices are there.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ QUICK = """
 settle_s = 0.05
 """
 """The bench shows a frame 0.033 s after it was presented."""
+STRAIGHT = "distortion = [0.0, 0.0]"
+"""The projectors' lenses, as the bench is prepared; here their pictures are bent, as real ones are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +118,9 @@ def story(tmp_path_factory: pytest.TempPathFactory, bumpy_ball: Path) -> Story:
     assert prepared.result == {"stage": str(out / "stage")}
     toml = out / "stage" / "stage.toml"
     toml.write_text(toml.read_text().replace("power_down_s = 10.0", "power_down_s = 3.0") + QUICK)
+    truth = out / "stage" / "bench.toml"
+    assert truth.read_text().count(STRAIGHT) == len(NAMES)
+    truth.write_text(truth.read_text().replace(STRAIGHT, "distortion = [0.02, -0.005]"))
     story = Story(out / "stage")
     with Bench(story.stage) as bench, truth_away(story.stage):
         story.stop("stopped while the lamps warm up", "Waiting for stable light")

@@ -235,7 +235,9 @@ def _prior_jacobian(problem: AdjustmentProblem, state: AdjustmentState) -> Float
         start = CAMERA_PARAMETERS + PROJECTOR_PARAMETERS * n
         rows = CAMERA_PARAMETERS + LENS_PARAMETERS * n + np.arange(LENS_PARAMETERS)
         jacobian[rows, start + np.arange(LENS_PARAMETERS)] = 1.0 / problem.projector_sigma[n]
-        jacobian[-1, start + LENS_PARAMETERS + 3 : start + PROJECTOR_PARAMETERS] = 2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
+        jacobian[-1, start + LENS_PARAMETERS + 3 : start + PROJECTOR_PARAMETERS] = (
+            2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
+        )
     return jacobian
 
 

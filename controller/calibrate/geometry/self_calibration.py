@@ -27,8 +27,7 @@ _TRIAL_POINTS = 600
 _FEWEST_POINTS = 200
 _LARGEST_SHAPE_SIGMA = 0.02
 _LARGEST_PRIOR_SIGMAS = 5.0
-_LENS_SIGMA = 0.03
-"""Of a projector's k1."""
+_LENS_SIGMA = 0.03  # of a projector's k1 about 0: lenses of 0.06 to either side within two
 _CLEAR_MARGIN = 12.0  # of the halved chi-square between the best stage and any other, on _TRIAL_POINTS
 
 
@@ -152,9 +151,9 @@ def _problem(
     sigma = prior.principal_point_sigma_px or 0.005 * width
     sizes = np.array(projector_sizes, dtype=np.float64)
     # throw ratios of 0.9 to 3.5 within one sigma; no horizontal shift to speak of; any vertical one
-    none = np.zeros(len(sizes))
-    shapes = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1], none], axis=1)
-    widths = np.stack([np.full(len(sizes), 0.7), 0.02 * sizes[:, 0], 0.7 * sizes[:, 1], none + _LENS_SIGMA], axis=1)
+    zero = np.zeros(len(sizes))
+    shapes = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1], zero], axis=1)
+    widths = np.stack([np.full(len(sizes), 0.7), 0.02 * sizes[:, 0], 0.7 * sizes[:, 1], zero + _LENS_SIGMA], axis=1)
     return ba.AdjustmentProblem(
         camera_px,
         projector_px,
