@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from scipy.signal import fftconvolve
 
 from controller.calibrate.photometry.glare import veiled, veiling_glare
 from controller.calibrate.values import Calibration, Geometry, Pinhole
 from controller.core.arrays import Float64
+from tests.controller.calibrate.photometry.spreading import by_angle
 from tests.controller.solve.conftest import plane_calibration
 
 Veil = Callable[[Float64], Float64]
@@ -24,14 +25,7 @@ def even_veil(light: Float64) -> Float64:
     return np.broadcast_to(light.mean(axis=(0, 1)), light.shape)
 
 
-def scattered(light: Float64) -> Float64:
-    """By a law of angles as that of stray light in lenses, which falls with their third power."""
-    y, x = np.mgrid[-SHAPE[0] : SHAPE[0] + 1, -SHAPE[1] : SHAPE[1] + 1]
-    spread = (1 + (x**2 + y**2) / 30.0**2) ** -1.5
-    spread /= spread.sum()
-    return np.stack([fftconvolve(light[..., c], spread, mode="same") for c in range(3)], axis=2)
-
-
+@cache
 def wall() -> tuple[Float64, Geometry]:
     """A wall 2 m before the camera, and two projectors: the light that falls on it, (projectors, rows, columns)."""
     y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
@@ -66,7 +60,7 @@ def stage(
     return replace(whole, projectors=tuple(made), object_mask=np.ones(SHAPE, np.bool_)), geometry
 
 
-@pytest.mark.parametrize("veil", [even_veil, scattered], ids=["even", "by angle"])
+@pytest.mark.parametrize("veil", [even_veil, by_angle], ids=["even", "by angle"])
 @pytest.mark.parametrize("glare", [0.02, 0.04])
 @pytest.mark.parametrize("bounced", [0.005, 0.08], ids=["dark room", "bright room"])
 def test_the_veil_is_measured(veil: Veil, glare: float, bounced: float) -> None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from scipy.signal import fftconvolve
 
 from controller.calibrate.photometry.glare import spread_by_lens
 from controller.calibrate.photometry.projector_glare import DarkPart, Glare, lens_veils, projector_glare
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage, Mask
+from tests.controller.calibrate.photometry.spreading import blurred, by_angle
 
 SHAPE = (320, 420)
 SIZE = (150, 200)
@@ -23,19 +24,17 @@ def even(picture: Float64) -> Float64:
     return np.full_like(picture, picture.mean())
 
 
-def scattered(picture: Float64) -> Float64:
-    """Falls with the third power of the angle, as stray light in lenses does."""
-    y, x = np.mgrid[-SIZE[0] : SIZE[0] + 1, -SIZE[1] : SIZE[1] + 1]
-    spread = (1 + (x**2 + y**2) / 30.0**2) ** -1.5
-    return fftconvolve(picture, spread / spread.sum(), mode="same")
-
-
-def stripes() -> list[Float64]:
+@cache
+def stripes() -> list[tuple[Float64, Float64, Mask, FloatImage]]:
+    """Pictures; where their light is wide around, where it is dark, and what a lens spreads of it, on the wall."""
     found = []
     for axis, bits in ((1, 3), (0, 3)):
         for bit in range(bits):
             lit = (np.arange(SIZE[axis]) * 2 ** (bit + 1) // SIZE[axis]) % 2 == 1
-            found.append(np.broadcast_to(lit if axis else lit[:, None], SIZE).astype(np.float64))
+            picture = np.broadcast_to(lit if axis else lit[:, None], SIZE).astype(np.float64)
+            dark = on_wall(np.asarray(cv2.dilate(picture, np.ones((13, 13))), np.float64)) < 0.01
+            spread = on_wall(spread_by_lens(picture.astype(np.float32)).astype(np.float64))
+            found.append((picture, on_wall(blurred(picture, 35.0)), dark, spread.astype(np.float32)))
     return found
 
 
@@ -61,15 +60,12 @@ def stage(
     around = paint * bounced * (1 + 0.5 * np.sin(x / 40) * np.cos(y / 30))[..., None]
     whites = [_noisy(paint * light[..., None] + around, rng) for light in falling]
     parts = []
-    for picture in stripes():
+    for picture, wide, dark, spread in stripes():
         stray = np.clip(veil(picture), 0, None)
-        wide = on_wall(np.asarray(cv2.GaussianBlur(picture, (0, 0), 35.0), np.float64))
         seen = paint * (falling[0] * on_wall((1 - glare) * picture + glare * stray))[..., None]
         seen = seen + around * wide[..., None]
-        seen = seen + lens * cv2.GaussianBlur(seen, (0, 0), 60.0)
-        dark = on_wall(np.asarray(cv2.dilate(picture, np.ones((13, 13))), np.float64)) < 0.01
-        spread = on_wall(spread_by_lens(picture.astype(np.float32)).astype(np.float64))
-        parts.append(DarkPart(_noisy(seen, rng), dark & (falling[0] > 0.3), spread.astype(np.float32)))
+        seen = seen + lens * blurred(seen, 60.0)
+        parts.append(DarkPart(_noisy(seen, rng), dark & (falling[0] > 0.3), spread))
     return whites, parts, np.full(SHAPE, 1.2, np.float32)
 
 
@@ -78,7 +74,7 @@ def _noisy(light: Float64, rng: np.random.Generator) -> FloatImage:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("veil", "least", "most"), [(even, 1.0, 3.0), (scattered, 0.6, 1.4)], ids=["even", "by angle"])
+@pytest.mark.parametrize(("veil", "least", "most"), [(even, 1.0, 3.0), (by_angle, 0.6, 1.4)], ids=["even", "by angle"])
 @pytest.mark.parametrize("glare", [0.02, 0.04])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_veil_is_measured(veil: Veil, least: float, most: float, glare: float, seed: int) -> None:
@@ -89,7 +85,7 @@ def test_the_veil_is_measured(veil: Veil, least: float, most: float, glare: floa
 
 
 def test_a_veil_is_named() -> None:
-    whites, parts, depth_m = stage(0.03, scattered)
+    whites, parts, depth_m = stage(0.03, by_angle)
     found = projector_glare(whites, 0, parts, depth_m)
     said = lens_veils("left", found.sure)
     assert said is not None
