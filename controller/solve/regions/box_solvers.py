@@ -74,6 +74,8 @@ def _by_clarabel(problem: BoxProblem) -> Float64:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
+    # By itself it takes the plain factorisation up to some thousand unknowns, which light that mixes makes dense.
+    settings.direct_solve_method = "faer"
     bounds = np.concatenate([np.ones(count), np.zeros(count)])
     cones = [clarabel.NonnegativeConeT(2 * count)]
     return np.array(clarabel.DefaultSolver(quadratic, linear, constraints, bounds, cones, settings).solve().x)

@@ -96,7 +96,7 @@ def test_the_equations_of_a_region_are_those_of_a_transport_by_camera_samples(mo
 
 
 def test_one_region_over_a_crop_by_camera_samples_gives_the_global_optimum() -> None:
-    calibration = crop_calibration(synthetic_calibration("small"), 200, 300, 64)
+    calibration = crop_calibration(synthetic_calibration("small"), 200, 300, 40)
     transport = build_transport(calibration)
     target = picture(transport)
     exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=128)
