@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
+import ssl
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import httpx
@@ -38,6 +40,12 @@ def accounts_in(folder: Path) -> Accounts:
     return accounts
 
 
+@cache
+def authorities() -> ssl.SSLContext:
+    """Read once: each client would read its file of them again, for longer than it asks for a page."""
+    return httpx.create_ssl_context(trust_env=False)
+
+
 @dataclass(slots=True)
 class Served:
     app: Starlette
@@ -46,7 +54,7 @@ class Served:
     address: str
 
     def client(self) -> httpx.Client:
-        return httpx.Client(base_url=self.address, timeout=20, trust_env=False)
+        return httpx.Client(base_url=self.address, timeout=20, trust_env=False, verify=authorities())
 
     @contextlib.contextmanager
     def entered(self, name: str, password: str = PASSWORD) -> Iterator[httpx.Client]:
