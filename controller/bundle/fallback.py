@@ -36,6 +36,13 @@ def chosen(folder: Path, count: Count | None = None) -> Path | None:
     return earlier if (starts.bundle, starts.given_up) == (earlier.name, name) else now
 
 
+def before_it(folder: Path, now: Path | None, starts: Starts) -> Path | None:
+    """The bundle that can be gone back to from ``now``: one that is there, can be read, and was not given up itself."""
+    earlier = previous(folder)
+    others = ("" if now is None else now.name, starts.given_up)
+    return earlier if earlier is not None and earlier.name not in others and _readable(earlier) else None
+
+
 class CountedStart:
     """One start of the player with the installed bundle; ``file`` is the bundle that it is to play.
 
@@ -51,9 +58,8 @@ class CountedStart:
         before, linked, now = Starts.read(folder), current(folder), chosen(folder)
         name = "" if now is None else now.name
         starts = before if before.bundle == name else Starts(name, 0, before.given_up)
-        earlier = previous(folder)
         failing = now is None or starts.failed >= MOST_FAILED_STARTS
-        if failing and earlier is not None and earlier.name not in (name, starts.given_up) and _readable(earlier):
+        if failing and (earlier := before_it(folder, now, starts)) is not None:
             why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else "The bundle is missing"
             tell(f"{why}; {earlier.name} plays again.")
             now, starts = earlier, Starts(earlier.name, 0, name or MISSING)

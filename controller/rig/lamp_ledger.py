@@ -76,9 +76,9 @@ _UNREADABLE: Final = (OSError, ValueError, TypeError, AttributeError, KeyError, 
 class LampFile:
     """A ledger in one JSON file of the stage folder, with a copy beside it.
 
-    Where the file is damaged, or gone and the copy is there, every lamp of the stage counts as hot; strikes and hours
-    are the copy's. Lamps that were not written since then count as hot after a restart, too: an entry without a
-    name marks this.
+    Where the file is damaged, or gone and the copy is there (damaged or not), every lamp of the stage counts as hot;
+    strikes and hours are the copy's. Lamps that were not written since then count as hot after a restart, too: an entry
+    without a name marks this.
     """
 
     NAME: Final = "lamps.json"
@@ -117,8 +117,8 @@ class LampFile:
             return records
         try:
             kept = _records(self._copy)
-        except _UNREADABLE:
-            self.damaged = not gone
+        except _UNREADABLE as error:
+            self.damaged = not (gone and isinstance(error, FileNotFoundError))
             return {}
         self.damaged = True
         return {name: replace(record, lit=True, boot="") for name, record in kept.items()}

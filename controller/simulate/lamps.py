@@ -20,7 +20,7 @@ class Lamp:
     """What the projector really is. ``dud``: it takes strikes and gives no light; ``fault``: a word that it reports;
     ``by_hand``: it burns because somebody switched it on;
     ``lasts_s``: after so long it goes out by itself, infinite for a good one; ``doubled``: strikes of ``strikes`` by
-    the second of one command.
+    the second of one command; ``late``: it burns because of a command that came late.
 
     ``sins``: what was done to it against the rules.
     """
@@ -32,6 +32,7 @@ class Lamp:
         self.dud, self.by_hand, self.fault = False, False, ""
         self.lasts_s = float("inf")
         self.strikes = self.doubled = 0
+        self.late = False
         self.sins: list[str] = []
 
     @property
@@ -65,7 +66,7 @@ class Lamp:
             self.sins.append(f"the lamp of {self.name} was struck {dark_s:.1f} s after it went off")
         self.strikes += 1
         self.lit_at_s = self.struck_at_s = self._scheduler.now_s
-        self.by_hand = False
+        self.by_hand = self.late = False
         if self.dud:
             self.go_dark()
 
@@ -77,7 +78,8 @@ class Lamp:
 class Line:
     """The control line of one projector. ``trouble``: one of ``LINE_TROUBLES``, or empty.
 
-    ``owner``: the opened device that has it; ``connection``: its number, another one once it broke.
+    ``owner``: the opened device that has it; ``connection``: its number, another one once it broke. ``lingers_s``: it
+    takes no new connection for so long after a program was killed that had one.
     """
 
     def __init__(self, lamp: Lamp, scheduler: Scheduler, chance: random.Random) -> None:
@@ -85,9 +87,26 @@ class Line:
         self.trouble = ""
         self.owner: SimulatedProjector | None = None
         self.connection = 0
+        self.lingers_s, self._taken_until_s = 0.0, 0.0
         self.turn = Lock(scheduler, again=False)
         self._late: list[tuple[float, bool, bool]] = []
         """When it arrives, whether it switches on, and whether it is the second of one command."""
+
+    def drop(self) -> None:
+        """The program that had it was killed."""
+        if self.owner is not None:
+            self._taken_until_s = self._scheduler.now_s + self.lingers_s
+        self.owner = None
+        self.turn = Lock(self._scheduler, again=False)
+
+    def let_go(self) -> None:
+        """The projector was without power: it knows of no connection."""
+        self._taken_until_s = 0.0
+
+    @property
+    def taken(self) -> bool:
+        """Whether the projector still waits for a program that is gone."""
+        return self._scheduler.now_s < self._taken_until_s
 
     @property
     def delayed(self) -> int:
@@ -105,8 +124,9 @@ class Line:
             elif now_s - self.lamp.off_at_s >= RULES.minimum_off_s:
                 before = self.lamp.strikes
                 self.lamp.strike()
-                if doubled:
-                    self.lamp.doubled += self.lamp.strikes - before
+                struck = self.lamp.strikes - before
+                self.lamp.late = self.lamp.late or struck > 0
+                self.lamp.doubled += struck * doubled
 
     def talk(self, deadline: Deadline) -> None:
         """The question's way there and back. Raises what a line may raise."""
@@ -155,6 +175,9 @@ class SimulatedProjector:
         if line.owner is not None:
             raise DeviceBusy("port-taken", what=f"The line of {line.lamp.name} is in use by another program.",
                              remedy="Stop that program.")  # fmt: skip
+        if line.taken:
+            raise DeviceGone("link-refused", what=f"The projector {line.lamp.name} takes no connection.",
+                             remedy="Wait.")  # fmt: skip
         line.owner = self
         try:
             line.talk(deadline)

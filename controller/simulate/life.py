@@ -35,7 +35,7 @@ from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.promises import Broken
 from controller.simulate.judge.witness import Witness
 from controller.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
-from controller.simulate.stage import make_stage
+from controller.simulate.stage import make_stage, write_log
 from controller.simulate.world import SimulatedWorld
 from hal.deadline import Stop
 from hal.errors import DeviceError
@@ -93,6 +93,8 @@ class Life:
         self.items = tuple(draw(seed, days) if items is None else items)
         self.place = setting(seed) if place is None else place
         self.world = SimulatedWorld(seed, self.place.begins_unix_s)
+        for line in self.world.lines.values():
+            line.lingers_s = self.place.lingers_s
         self.witness = Witness(self.world, Calendar(self.place.zone, self.place.rows))
         self.program: Program | None = None
         self.kiosk: StageKiosk | None = None
@@ -124,6 +126,7 @@ class Life:
             self.witness.log.here = f"{here}/"
             rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.place.rows)
             make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check), self.place.bundles)
+            self.witness.log.knows(write_log(STAGE, self.place.logged, self.place.begins_unix_s))
             self.world.scheduler.on_kill = self.news.set
             self.boot()
             try:
@@ -320,6 +323,8 @@ class Life:
         wrong = state in (State.DEGRADED, State.FAULT) or (not well and (settled or state is State.COOLING))
         waits = state in (State.OFF, State.CALIBRATING) and well
         limit = CALM[3] if settled and well and rests else CALM[2] if wrong else CALM[1] if waits else CALM[0]
+        # A picture has to come in time: a player that hangs is asked up to 16 times, and starts are half a minute apart.
+        limit = 1.0 if self.world.screen.hung else CALM[0] if self.witness.bundles.dark else limit
         scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 
     # -- people

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import sqlite3
 from collections.abc import Collection
 from pathlib import Path
 from typing import Final
@@ -15,8 +17,9 @@ from controller.bundle.install import install, revision_floor
 from controller.bundle.signing import Trust
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config.writer import toml_text
-from controller.kiosk.interface import Schedule
+from controller.kiosk.interface import EventRow, Schedule
 from controller.kiosk.store.bundle_store import slots_without
+from controller.kiosk.store.event_log import EventLog
 
 NAMES: Final = ("left", "right", "above")
 OUTPUTS: Final = {name: f"P{number}" for number, name in enumerate(NAMES, 1)}
@@ -34,6 +37,24 @@ def make_stage(folder: Path, schedule: Schedule, bundles: int) -> None:
     (folder / "stage.toml").write_text(_text(schedule), "utf-8")
     for number in range(bundles):
         publish(folder, 1_767_225_600 + number)
+
+
+def write_log(folder: Path, events: int, ends_unix_s: float) -> list[EventRow]:
+    """The log of a kiosk that has already run for a while, one of these events every quarter of an hour."""
+    if not events:
+        return []
+    rows = [
+        EventRow(number, ends_unix_s - (events - number) * 900.0, "info", f"The player shows {name}.", "playing")
+        for number, name in zip(range(1, events + 1), itertools.cycle(APPEARANCES))
+    ]
+    path = folder / EventLog.FILE
+    EventLog(path, durable=False).close()
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.executemany(
+            "INSERT INTO events (number, unix_s, level, code, text) VALUES (?, ?, ?, ?, ?)",
+            [(row.number, row.unix_s, row.level, row.code, row.text) for row in rows],
+        )
+    return rows
 
 
 def publish(folder: Path, created_unix_s: int, missing: Collection[str] = ()) -> Path:

@@ -165,8 +165,7 @@ class SimulatedWorld(World):
             path.write_bytes(content)
         self._connections.clear()
         for line in self.lines.values():
-            line.owner = None
-            line.turn = Lock(self.scheduler, again=False)
+            line.drop()
 
     @contextlib.contextmanager
     def as_program(self, program: Program) -> Iterator[None]:

@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from controller.bundle.fallback import chosen
+from controller.bundle.fallback import before_it, chosen
+from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision
@@ -100,7 +101,7 @@ class PlayerSupervisor:
         self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
         self._turns: tuple[Turn, ...] | None = None
         self._skipped = False
-        self._start_at_s, self._started_at_s = 0.0, 0.0
+        self._start_at_s, self._started_at_s, self._looked_back_s = 0.0, 0.0, 0.0
         self._identified = False
         self._noticed: tuple[int, tuple[str, ...]] | None = None
         self._hello: dict[str, Any] = {}
@@ -123,6 +124,8 @@ class PlayerSupervisor:
         try:
             self._follow(self._ask({"op": "status"}))
             self._patience.begins()
+            if self._waits_in_vain():
+                self._restart(_WITHOUT_BUNDLE)
         except TimeoutError:
             if self._ends_for_silence():
                 self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
@@ -176,6 +179,7 @@ class PlayerSupervisor:
             return
         self._patience.begins()
         self._started_at_s, self._reached, self._identified = self._monotonic(), None, False
+        self._looked_back_s = self._started_at_s
         self._noticed, self._hello = None, hello
         self._turns, self._skipped = None, False
         self._identities = {}
@@ -304,6 +308,20 @@ class PlayerSupervisor:
         what = f"{len(want.in_turn)} appearances in turn" if want.in_turn else want.appearance
         self._tell(Decision("playing", f"The player shows {what}."))
 
+    def _waits_in_vain(self) -> bool:
+        """Whether it runs without the installed bundle, which can't be read, and there is another one to go back to.
+
+        Its starts had another cause than the bundle, such as a display that came late, so none of them was counted.
+        """
+        want, now_s = self.want, self._monotonic()
+        unread = want is not None and want.bundle is not None and not want.appearance
+        if self._with_bundle or not self._dark or not unread or now_s - self._looked_back_s < AGAIN_S:
+            return False
+        self._looked_back_s = now_s
+        installed = self._settings(True).bundle
+        folder = None if installed is None else installed.parent
+        return folder is not None and before_it(folder, chosen(folder), Starts.read(folder)) is not None
+
     def _trouble(self, problem: Decision) -> None:
         if self._view.problem is None or self._view.problem.code != problem.code:
             self._tell(problem)
@@ -330,6 +348,10 @@ def _outputs_problem(status: dict[str, Any]) -> Decision | None:
     return Decision(OUTPUT_GONE, what, remedy, "error")
 
 
+_WITHOUT_BUNDLE: Final = Decision(
+    "bundle-tried-again", "The installed bundle can't be read, and the player runs without it.",
+    "It is started again, and goes back to the bundle before.", "warning",
+)  # fmt: skip
 _SKIPPED: Final = Decision(
     "appearance-skipped", "An appearance could not be read from the bundle, and was left out.",
     "Publish the appearances again.", "error",

@@ -65,6 +65,8 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
         witness.disturb(0.0, SETTLING_S)
         cancelled(life)
     elif item.who == "set-schedule":
+        # Nobody puts older hours back into the file.
+        life.sound.pop("schedule.toml", None)
         witness.wanted.use(Calendar(values["time_zone"], values["rows"]))
         life.news.set()
         witness.disturb(0.0)

@@ -8,9 +8,11 @@ from typing import Final
 
 from controller.bundle.install import current, previous
 from controller.bundle.starts import Starts
+from controller.rig.lamp_ledger import LampFile
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
-from controller.simulate.happen.script import STOPPED, Item
+from controller.simulate.happen.power import power_cut
+from controller.simulate.happen.script import POWER_CUT, STOPPED, Item
 from controller.simulate.judge.bundles import SHOWN_S, is_sound
 from controller.simulate.judge.log_file import readable
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
@@ -18,6 +20,7 @@ from controller.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
 MEND_FILE_S: Final = 600.0
+_TWINS: Final = {LampFile.NAME: LampFile.COPY, LampFile.COPY: LampFile.NAME}
 
 
 def file_damaged(life: Living, item: Item) -> None:
@@ -31,6 +34,10 @@ def file_damaged(life: Living, item: Item) -> None:
         life.end_of_program()
     path = STAGE / item.who
     before = path.read_bytes() if path.is_file() else None
+    twin = _TWINS.get(item.who)
+    if item.how == "removed" and twin is not None and not (STAGE / twin).is_file():
+        # Without both, it is a stage whose lamps were never lit.
+        before = None
     if before is not None:
         life.damaged.add(item.who)
         # A stage.toml that is gone is not replaced: it would most likely be the wrong folder.
@@ -72,7 +79,9 @@ def _damaged(content: bytes, item: Item) -> bytes:
 
 
 def _put_right(life: Living, path: Path) -> None:
-    path.write_bytes(life.sound.pop(path.name))
+    if (before := life.sound.pop(path.name, None)) is None:
+        return
+    path.write_bytes(before)
     life.unreadable.discard(path.name)
     life.repaired_s = life.world.scheduler.now_s
     if life.service is not None:
@@ -81,7 +90,7 @@ def _put_right(life: Living, path: Path) -> None:
 
 
 def bundle_damaged(life: Living, item: Item) -> None:
-    """The file of the installed bundle goes bad, or those of all, and the player dies.
+    """The file of the installed bundle goes bad, or those of all, and the player dies, or the power is cut.
 
     After a while the appearances are published again. Until then the bundle before plays, where there is a sound one.
     """
@@ -105,6 +114,8 @@ def bundle_damaged(life: Living, item: Item) -> None:
         witness.disturb(0.0, PLAYER_S)
 
     life.later(repaired_s, repair)
+    if item.arguments == POWER_CUT:
+        power_cut(life, 0.0)
 
 
 def bundles_unreadable(life: Living, item: Item) -> None:

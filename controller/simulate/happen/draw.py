@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 from zoneinfo import ZoneInfo
 
-from controller.simulate.happen.script import STOPPED, Item, Setting
+from controller.simulate.happen.script import POWER_CUT, STOPPED, Item, Setting
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -29,6 +29,12 @@ DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 WORK: Final = ("recalibrate", "compare", "test-shots")
 CANCELLED: Final = 0.5
 
+LOGGED: Final = (0, 1000, 1000)
+"""Events of the months before. In the log of a few days there is hardly a middle that could be damaged."""
+LINGERS_S: Final = (0.0, 0.0, 20.0, 90.0)
+"""Many projectors take one connection at a time, and notice late that a program was killed."""
+DISPLAY_AFTER_S: Final = (0.0, 15.0, 60.0)
+"""A computer starts its display and the service at the same time."""
 LEFT_OUT: Final = (0.3, 0.6, 0.8)
 """Share of the kinds of things, and of the ways in which each happens, that a life does not have."""
 LEANINGS: Final = (1.0, 1.0, 4.0)
@@ -51,12 +57,14 @@ LONGEST_S: Final = 40_000.0
 NOTICED_S: Final = 1800.0
 """It takes people so long at least to notice a damaged bundle, and to publish the appearances again."""
 
+PAST: Final = "past a change"
+
 _Weights = Mapping[str, float]
 KINDS: Final[_Weights] = {
     "line": 2, "lamp fails": 1, "lamp reports": 1, "lamp switched by hand": 1, "player": 2, "camera gone": 1,
-    "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 1, "killed": 1, "bundles unreadable": 1,
+    "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 2, "killed": 1, "bundles unreadable": 1,
     "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 1, "network gone": 0.5, "drift": 0.5,
-    "command": 6, "x server": 1, "cable out": 1, "published": 0.5,
+    "command": 6, "x server": 1, "cable out": 1, "published": 1,
 }  # fmt: skip
 MOMENTS: Final[_Weights] = {
     "work-begins": 2, "task-due": 1, "asked": 1, "service-started": 2, "player-started": 1, "disk-full": 1,
@@ -68,25 +76,28 @@ COMMANDS: Final[_Weights] = {
     "recalibrate": 4, "cancel": 3, "compare": 2, "set-schedule": 3, "seen": 1, "save-settings": 3, "test-shots": 1,
 }  # fmt: skip
 FILES: Final[_Weights] = {
-    "kiosk/events.sqlite": 2, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
-    "bundles/starts.json": 1, "lamps.json": 1, "kiosk/stage.toml.good": 1,
+    "kiosk/events.sqlite": 3, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
+    "bundles/starts.json": 1, "lamps.json": 3, "lamps-copy.json": 1, "kiosk/stage.toml.good": 1,
 }  # fmt: skip
-BEFORE: Final = ("", STOPPED)
-"""How the service ended before a file was damaged: killed, or as it should."""
+BEFORE: Final[Mapping[str, Sequence[str]]] = {"file damaged": ("", STOPPED), "bundle damaged": ("", POWER_CUT)}
+"""How the service or the player ended before something was damaged."""
 HOW: Final[Mapping[str, Sequence[str]]] = {
     "line": LINE_TROUBLES,
     "lamp fails": ("", "goes out"),
     "lamp reports": ("temperature", "cover", "lamp-failed", "fan"),
     "lamp switched by hand": ("off", "on"),
     "player": ("killed", "hung", "crashes", "crashes at a picture", *TROUBLES),
-    "file damaged": ("cut", "flipped", "empty", "removed"),
-    "bundle damaged": ("", "all"),
     "restarted": ("lamps stay lit", "lamps off"),
     "clock set": ("hours", "days", "lost"),
 }
-LASTS_S: Final[Mapping[str, tuple[float, float]]] = {
-    "seconds": (0.5, 30.0), "minutes": (30.0, 900.0), "hours": (900.0, LONGEST_S),
+DAMAGES: Final[Mapping[str, Sequence[str]]] = {
+    "file damaged": ("cut", "flipped", "flipped", "empty", "removed"), "bundle damaged": ("", "", "all"),
 }  # fmt: skip
+"""What is damaged, how and after what is drawn from all in each life: few would have the three at a time."""
+LASTS_S: Final[Mapping[str, tuple[float, float]]] = {
+    "seconds": (0.5, 30.0), "minutes": (30.0, 900.0), "hours": (900.0, LONGEST_S), PAST: (300.0, 7200.0),
+}  # fmt: skip
+"""``PAST`` is counted from the next opening or closing."""
 AFTER: Final = ("at once", "at once", "while it lasts", "while it lasts", "as it ends")
 """When another thing happens after the first of several."""
 MOST_TOGETHER: Final = 5
@@ -104,7 +115,9 @@ def setting(seed: str) -> Setting:
     zone = chance.choice(CHANGING if soon else ZONES)
     rows = hours(chance, chance.choice((0.1, 0.9, 0.9) if soon else (0.0, 0.1, 0.9)))
     drift_check = chance.choice(["03:30", "02:30", "23:00"])
-    return Setting(begins(chance, zone, soon=soon).timestamp(), zone, rows, drift_check, chance.choice((1, 2, 2)))
+    begins_s, bundles = begins(chance, zone, soon=soon).timestamp(), chance.choice((1, 2, 2))
+    return Setting(begins_s, zone, rows, drift_check, bundles, chance.choice(LOGGED),
+                   chance.choice(LINGERS_S), chance.choice(DISPLAY_AFTER_S))  # fmt: skip
 
 
 def hours(chance: random.Random, late: float) -> list[dict[str, str]]:
@@ -171,7 +184,7 @@ def draw(seed: str, days: float) -> list[Item]:
     """
     chance, leaning, place = random.Random(f"{seed} script"), Leaning(seed), setting(seed)
     calendar = Calendar(place.zone, place.rows)
-    drawing = _Drawing(chance, leaning, lambda at_s: calendar.open(place.begins_unix_s + at_s))
+    drawing = _Drawing(chance, leaning, calendar, place.begins_unix_s)
     items: list[Item] = []
     at_s = chance.expovariate(1 / min(leaning.pace_s, 5 * HOUR_S)) + 600.0
     while at_s < days * DAY_S:
@@ -209,10 +222,10 @@ def _after_s(chance: random.Random, first: Item) -> float:
 
 
 class _Drawing:
-    """Draws things. ``is_open``: whether the stage is to be open by its hours, so many seconds after the beginning."""
+    """Draws things. ``begins_s``: Unix seconds of the beginning."""
 
-    def __init__(self, chance: random.Random, leaning: Leaning, is_open: Callable[[float], bool]) -> None:
-        self._chance, self._leaning, self._is_open = chance, leaning, is_open
+    def __init__(self, chance: random.Random, leaning: Leaning, calendar: Calendar, begins_s: float) -> None:
+        self._chance, self._leaning, self._calendar, self._begins_s = chance, leaning, calendar, begins_s
 
     def together(self, at_s: float) -> list[Item]:
         """One thing, and what comes together with it."""
@@ -238,8 +251,8 @@ class _Drawing:
     def _one(self, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
         chance, leaning = self._chance, self._leaning
         at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
-        how = leaning.drawn(chance, what, HOW[what]) if what in HOW else ""
-        lasts_s = round(chance.uniform(*LASTS_S[leaning.drawn(chance, "lasts", list(LASTS_S))]), 1)
+        how = leaning.drawn(chance, what, HOW[what]) if what in HOW else chance.choice(DAMAGES.get(what, ("",)))
+        lasts_s = self._lasts_s(at_s)
         lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S[what]) if how in RESTLESS else lasts_s
         name = chance.choice(NAMES)
         match what:
@@ -249,10 +262,10 @@ class _Drawing:
                 times = chance.randint(1, 4) * how.startswith("crashes")
                 return Item(at_s, what, "", how, lasts_s if how in TROUBLES else 0.0, times)
             case "file damaged":
-                who, number = leaning.drawn(chance, "file", FILES), round(chance.random(), 3)
-                return Item(at_s, what, who, how, number=number, arguments=leaning.drawn(chance, "before", BEFORE))
+                who, number = chance.choices(list(FILES), list(FILES.values()))[0], round(chance.random(), 3)
+                return Item(at_s, what, who, how, number=number, arguments=chance.choice(BEFORE[what]))
             case "bundle damaged":
-                return Item(at_s, what, "", how, max(NOTICED_S, lasts_s))
+                return Item(at_s, what, "", how, max(NOTICED_S, lasts_s), arguments=chance.choice(BEFORE[what]))
             case "killed while writing":
                 return Item(at_s, what, number=round(chance.uniform(1.0, 8.0) ** 2))
             case "clock set":
@@ -263,13 +276,18 @@ class _Drawing:
             case _:
                 return Item(at_s, what, "", how, lasts_s)
 
+    def _lasts_s(self, at_s: float) -> float:
+        chance, how_long = self._chance, self._leaning.drawn(self._chance, "lasts", list(LASTS_S))
+        from_s = min(self._calendar.changes_s(self._begins_s + at_s) - self._begins_s - at_s, LONGEST_S)
+        return round(chance.uniform(*LASTS_S[how_long]) + from_s * (how_long == PAST), 1)
+
     def _command(self, at_s: float, who: str) -> Item:
         chance = self._chance
         values: dict[str, Any] = {}
         match who:
             case "start" | "stop":
                 if chance.random() < MIND:
-                    who = "stop" if self._is_open(at_s) else "start"
+                    who = "stop" if self._calendar.open(self._begins_s + at_s) else "start"
             case "play":
                 values = {"name": chance.choice(APPEARANCES), **({"fade_s": 2.0} if chance.random() < 0.5 else {})}
             case "black" | "pause" | "identify":

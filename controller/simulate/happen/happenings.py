@@ -10,6 +10,7 @@ from controller.kiosk.decide.planner import EARLIEST_S
 from controller.simulate.disk import STAGE, TOTAL_BYTES
 from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
 from controller.simulate.happen.living import Living
+from controller.simulate.happen.power import display_away, power_cut
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.lamps import RULES, Lamp
@@ -121,17 +122,7 @@ def _player(life: Living, item: Item) -> None:
 
 
 def _x_server(life: Living, item: Item) -> None:
-    """It restarts, crashes again and again, or its computer's graphics are gone for hours."""
-    screen = life.world.screen
-    screen.lose_server()
-    life.witness.disturb_picture(item.for_s)
-
-    def repair() -> None:
-        screen.no_server = False
-        # Without a server a player neither starts nor shows: crashes that are still to come, come now.
-        life.witness.disturb_picture(PLAYER_S * (screen.dies_at_start + screen.dies_at_play))
-
-    life.later(item.for_s, repair)
+    display_away(life, item.for_s)
 
 
 def _cable(life: Living, item: Item) -> None:
@@ -193,17 +184,7 @@ def _killed_writing(life: Living, item: Item) -> None:
 
 
 def _power_cut(life: Living, item: Item) -> None:
-    world = life.world
-    life.end_of_program()
-    if world.screen.process is not None:
-        world.screen.process.kill()
-    for lamp in world.lamps.values():
-        lamp.go_dark()
-    world.scheduler.sleep(item.for_s + 1.0)
-    world.reboot()
-    life.witness.disturb(0.0)
-    life.witness.lamps.forgive()
-    life.boot()
+    power_cut(life, item.for_s)
 
 
 def _restarted(life: Living, item: Item) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from controller.kiosk.service import Service
-from controller.simulate.happen.script import Item
+from controller.simulate.happen.script import Item, Setting
 from controller.simulate.judge.witness import Witness
 from controller.simulate.scheduler import Event
 from controller.simulate.world import SimulatedWorld
@@ -15,6 +15,7 @@ from controller.simulate.world import SimulatedWorld
 class Living(Protocol):
     """A life, as far as it is needed here; see ``life.Life``."""
 
+    place: Setting
     world: SimulatedWorld
     witness: Witness
     service: Service | None

@@ -10,6 +10,8 @@ from controller.simulate.scheduler import DAY_S
 
 STOPPED = "stopped"
 """As the arguments of a damaged file: the service ended as it should before; without it, it was killed."""
+POWER_CUT = "power cut"
+"""As the arguments of a damaged bundle: with the computer's power; without it, only the player died."""
 
 
 def moment_of(code: str, text: str) -> str:
@@ -50,7 +52,10 @@ class Item:
 class Setting:
     """Where and when a life takes place: ``begins_unix_s``, time ``zone``, opening ``rows``, ``drift_check``.
 
-    ``bundles``: so many were published before: with the second, there is an older one to go back to.
+    ``bundles``: so many were published before: with the second, there is an older one to go back to. ``logged``: so
+    many events are in the log of the months before. ``lingers_s``: a projector takes no new connection for so long
+    after the end of a program that did not close its own. ``display_after_s``: so long after its power, the computer's
+    display is there.
     """
 
     begins_unix_s: float
@@ -58,6 +63,9 @@ class Setting:
     rows: list[dict[str, str]]
     drift_check: str
     bundles: int = 1
+    logged: int = 0
+    lingers_s: float = 0.0
+    display_after_s: float = 0.0
 
 
 def to_json(place: Setting, items: Sequence[Item]) -> str:

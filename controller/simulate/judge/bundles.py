@@ -27,11 +27,14 @@ _FOLDER: Final = STAGE / "bundles"
 
 
 class BundleWitness:
-    """``spoilt``: the names of the files that can't be read any more, and when each went bad."""
+    """``spoilt``: the names of the files that can't be read any more, and when each went bad; ``dark``: whether a
+    picture is wanted and could be shown, and is not.
+    """
 
     def __init__(self, world: SimulatedWorld) -> None:
         self._world = world
         self.spoilt: dict[str, float] = {}
+        self.dark = False
         self._began_s = 0.0
         self._found = Found(world)
 
@@ -50,7 +53,8 @@ class BundleWitness:
         unnamed_s = self._found.for_s("unnamed", bool(self.spoilt) and self._is_unnamed(kiosk, service))
         if unnamed_s > NAMED_S:
             raise Broken("bundle named", f"for {unnamed_s:.0f} s: {kiosk.snapshot().warnings}")
-        dark_s = self._found.for_s("dark", self._is_dark(service))
+        self.dark = self._is_dark(service)
+        dark_s = self._found.for_s("dark", self.dark)
         if dark_s > SHOWN_S:
             raise Broken("bundle shown", f"it is black for {dark_s:.0f} s")
 

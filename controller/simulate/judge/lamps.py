@@ -49,6 +49,7 @@ class LampWitness:
             if lamp.sins:
                 raise Broken("lamp rules", lamp.sins[0])
         self._strikes(service)
+        self._may_burn(service)
         self._stay_lit(due=open_surely and serving_s <= STAYS_S)
 
     def off(self, row: EventRow) -> None:
@@ -58,6 +59,16 @@ class LampWitness:
             seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
             if line.lamp.lit and seen and not line.lamp.by_hand and row.text.startswith("The stage is off: every lamp"):
                 raise Broken("off is off", f"the lamp of {name} burns")
+
+    def _may_burn(self, service: Service) -> None:
+        """Whether each lamp that burns behind a broken line counts as one that may."""
+        for supervisor in service.devices.projectors:
+            lamp, view = self._world.lamps[supervisor.name], supervisor.view
+            dark = view.condition is Condition.LOST and view.looked and not view.maybe_lit
+            # Nobody can know of one that somebody else switched on, or a command that was taken for lost.
+            known = lamp.lit and not lamp.by_hand and not lamp.late
+            if dark and known and self._world.scheduler.now_s - lamp.struck_at_s > BACK_S:
+                raise Broken("may burn", f"the lamp of {supervisor.name} burns, and counts as dark")
 
     def _strikes(self, service: Service) -> None:
         for supervisor in service.devices.projectors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.interface import EventRow
@@ -31,7 +31,7 @@ class LogWitness:
 
     ``digested``: all lines in the order in which they were read, without ``here``, the folder of this life.
     ``state``: the stage's, as it says, and ``fault``: what was wrong when that was "fault" last.
-    ``moment`` hears of each line.
+    ``unlit_s``: when it said last that a lamp gave no light. ``moment`` hears of each line.
     """
 
     def __init__(self, world: SimulatedWorld) -> None:
@@ -41,6 +41,7 @@ class LogWitness:
         self.digested: list[str] = []
         self.here = "\0"
         self.state = self.fault = ""
+        self.unlit_s = -1e9
         self.begun_checks: set[str] = set()
         self.moment: Callable[[str], None] = lambda _: None
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
@@ -49,6 +50,11 @@ class LogWitness:
         self._recent: deque[tuple[float, str]] = deque()
         self._often: Counter[str] = Counter()
         self._ends_s: deque[float] = deque(maxlen=MOST_ENDS)
+
+    def knows(self, rows: Sequence[EventRow]) -> None:
+        """These are in the log before the life begins."""
+        self.rows = {row.number: row for row in rows[-SHOWN:]}
+        self.read = len(rows)
 
     # -- the service
 
@@ -138,6 +144,8 @@ class LogWitness:
 
     def _said(self, row: EventRow) -> None:
         now_s, recent, often = self._world.scheduler.now_s, self._recent, self._often
+        if row.code == "lamp-not-lit":
+            self.unlit_s = now_s
         if row.code in ENDED:
             self._ends_s.append(now_s)
             if len(self._ends_s) == MOST_ENDS and now_s - self._ends_s[0] < WORDS_S:

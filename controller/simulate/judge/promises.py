@@ -18,6 +18,7 @@ PROMISES: Final = {
     "serves": "A started service runs, also on a full disk or with a damaged stage.toml if the last good one is there.",
     "settings kept": "A kiosk that runs has a copy of its stage.toml, soon after the disk has room for one.",
     "off is off": "When a stage says that every lamp is off, none burns that it struck.",
+    "may burn": "A lamp that burns behind a broken line counts as one that may burn, whatever was damaged.",
     "plays while open": "With every fault repaired, an open stage plays, with all its lamps.",
     "says why it is dark": "While an open stage shows nothing, it says why.",
     "outputs named": "Outputs without a picture, and no others, are named while the player answers.",

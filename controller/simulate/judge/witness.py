@@ -280,6 +280,9 @@ class Witness:
             return player.reason in snapshot.reason
         if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
             return True
+        if state is State.POWERING and self._world.scheduler.now_s - self.log.unlit_s < DARK_S:
+            # Lamps that are struck again and again: the log says of each attempt that it gave no light.
+            return True
         before = snapshot.reason.partition("Before: ")[2].rstrip(".")
         if state in (State.POWERING, State.WARMING) and before and before in self.log.fault:
             return True

@@ -136,6 +136,15 @@ def test_a_lost_ledger_makes_the_lamps_hot_and_keeps_their_counts(tmp_path: Path
     assert not lamp.sins
 
 
+@pytest.mark.parametrize("content", [b"", b"{"], ids=["empty", "cut"])
+def test_lamps_are_hot_when_the_ledger_is_gone_and_its_copy_damaged(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / LampFile.COPY).write_bytes(content)
+    guard, lamp = a_guard(World(), ledger=LampFile(tmp_path / LampFile.NAME))
+    assert guard.may_be_lit
+    assert refusal(lambda: guard.switch_on(deadline=soon())) == "lamp-resting"
+    assert lamp.strikes == 0
+
+
 def test_a_damaged_ledger_keeps_a_lamp_hot_of_which_nothing_was_written_before_a_kill(tmp_path: Path) -> None:
     (tmp_path / LampFile.NAME).write_bytes(b"{")
     ledger, world = LampFile(tmp_path / LampFile.NAME), World()
