@@ -323,7 +323,7 @@ class Life:
         wrong = state in (State.DEGRADED, State.FAULT) or (not well and (settled or state is State.COOLING))
         waits = state in (State.OFF, State.CALIBRATING) and well
         limit = CALM[3] if settled and well and rests else CALM[2] if wrong else CALM[1] if waits else CALM[0]
-        # A picture has to come in time: a player that hangs is asked up to 16 times, and starts are half a minute apart.
+        # A picture has to come in time: who hangs is asked up to 16 times, and starts are half a minute apart.
         limit = 1.0 if self.world.screen.hung else CALM[0] if self.witness.bundles.dark else limit
         scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 
