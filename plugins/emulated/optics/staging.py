@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
+from plugins.emulated.optics.effects.levels import OPAQUE
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import project
 from plugins.emulated.optics.stands import DEFAULT, Stands
@@ -110,6 +111,12 @@ QUICK_PX: Final = 1_000_000
 """Larger pictures take the bench longer than a camera."""
 
 
+def _slow(truth: BenchTruth) -> bool:
+    """Whether the bench works some seconds on a picture, and longer on a computer with other work."""
+    width, height = truth.camera.lens.size_px
+    return width * height > QUICK_PX or truth.camera.spectral or truth.object.subsurface != OPAQUE
+
+
 def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any]:
     """The device tables for stage.toml: what a technician reads off the devices, or measures with a tape.
 
@@ -129,8 +136,7 @@ def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any
             "iso": 100,
             "intrinsics": INTRINSICS,
             "distance_m": round(distance * (1.0 + 0.01 * rng.uniform(-1.0, 1.0)), 3),
-            # The bench works some seconds on a picture of this size, and longer on a computer with other work.
-            **({"picture_s": SLOW_PICTURE_S} if camera.lens.size_px[0] * camera.lens.size_px[1] > QUICK_PX else {}),
+            **({"picture_s": SLOW_PICTURE_S} if _slow(truth) else {}),
         },
         "display": {
             "driver": "player",

@@ -150,8 +150,16 @@ def test_rooms_differ_in_what_bench_toml_says_and_dark_says_nothing(tmp_path: Pa
     assert all(p.panels.aligned for p in room.projectors)
     assert hard.camera.sensor.shutter_spread > 0.0
     assert all(not p.panels.aligned and p.light.glare > 0.0 and p.light.white_segment for p in hard.projectors)
-    same = [(p.pose, p.lens, p.focus) for p in dark.projectors]
-    assert all([(p.pose, p.lens, p.focus) for p in other.projectors] == same for other in (room, hard))
+    assert hard.camera.spectral
+    assert hard.camera.focus_m > 0.0
+    assert hard.object.subsurface.share > 0.0
+    assert all(p.dithering.levels > 1 for p in hard.projectors)
+    assert all(any(p.lens.distortion) for p in hard.projectors)
+    straight = [dataclasses.replace(p.lens, distortion=(0.0, 0.0)) for p in hard.projectors]
+    assert straight == [p.lens for p in dark.projectors]
+    same = [(p.pose, p.focus) for p in dark.projectors]
+    assert all([(p.pose, p.focus) for p in other.projectors] == same for other in (room, hard))
+    assert [p.lens for p in room.projectors] == [p.lens for p in dark.projectors]
 
 
 def test_a_surface_of_no_use_is_refused() -> None:
