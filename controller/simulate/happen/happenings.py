@@ -19,6 +19,8 @@ from controller.simulate.stage import OUTPUTS, publish
 
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
+RETURNS_S: Final = 60.0
+"""Somebody who finds no kiosk at the panel comes back after so long."""
 HOLD_S: Final = 7200.0
 """For so long a kiosk's time may stand still after its clock was set back."""
 
@@ -44,6 +46,7 @@ def _line(life: Living, item: Item) -> None:
 def _open_if_given_up(life: Living, name: str) -> None:
     """Who repaired a line looks at the panel, and does what it says of a lamp that stays off after three attempts."""
     if life.service is None:
+        life.later(RETURNS_S, partial(_open_if_given_up, life, name))
         return
     for supervisor in life.service.devices.projectors:
         problem = supervisor.view.problem
@@ -67,9 +70,16 @@ def _new_lamp(life: Living, lamp: Lamp) -> None:
     """A technician puts in a new one, and opens the stage if it is to be open."""
     lamp.dud, lamp.fault, lamp.lasts_s = False, "", float("inf")
     life.witness.disturb_lamps(0.0)
-    if life.service is not None:
-        for supervisor in life.service.devices.projectors:
-            supervisor.forgive()
+    _press_open(life)
+
+
+def _press_open(life: Living) -> None:
+    """Where the kiosk does not run, they come back when it does."""
+    if life.service is None:
+        life.later(RETURNS_S, partial(_press_open, life))
+        return
+    for supervisor in life.service.devices.projectors:
+        supervisor.forgive()
     life.witness.lamps.forgive()
 
 
