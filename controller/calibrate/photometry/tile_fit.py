@@ -40,7 +40,10 @@ FEWEST_FULL = 8
 STIFFNESS = 1e-3
 WORST_FALL = 0.03
 MOST_SEGMENT = 0.7
-PAINT_ROUNDS = 4
+PAINT_ROUNDS = 2
+"""A third changes the scatter by less than a hundredth."""
+PROMISING = 0.95
+"""Scatter with paint over that without, before responses are fitted again; above it, that is not worth its time."""
 BETTER_BY_PAINT = 0.85
 """Scatter of the tiles with paint over that without, from which on paint makes a difference."""
 
@@ -63,7 +66,7 @@ class RadiometryFit:
 
     @property
     def scatter(self) -> float:
-        return float(1.4826 * np.median(np.abs(self.residual)))
+        return _scatter(self.residual)
 
     @property
     def good(self) -> bool:
@@ -85,12 +88,13 @@ def with_paint(tiles: TileMeasurements, alone: RadiometryFit) -> tuple[TileMeasu
         own = dataclasses.replace(steady, ratio=(steady.ratio - around) / (1 - fit.stray))
         paint = fit_paint_mixing(own, shown, tiles.weight * _kept(residual), fit.mixing)
         residual = own.ratio - paint_light(own, shown, paint)
+        if _scatter(residual) > PROMISING * alone.scatter:
+            return tiles, alone, None
         more = (1 - fit.stray) * (own.ratio - residual - shown @ fit.mixing.T)
         left = dataclasses.replace(tiles, ratio=tiles.ratio - more * fit.strength[tiles.photograph][:, None])
         fit = fit_tiles(left, with_segment=alone.segment > 0)
     if fit.scatter >= BETTER_BY_PAINT * alone.scatter:
         return tiles, alone, None
-    fit.additivity = alone.additivity
     return left, fit, paint
 
 
@@ -281,6 +285,11 @@ def _gamma_of(response: Float64) -> Float64:
         if middle.any():
             found[channel] = np.clip(np.median(np.log(curve[middle]) / np.log(x[middle])), 0.5, 4)
     return found
+
+
+def _scatter(residual: Float64) -> float:
+    """Its standard deviation, of what is not far off."""
+    return float(1.4826 * np.median(np.abs(residual)))
 
 
 def _kept(residual: Float64) -> Float64:
