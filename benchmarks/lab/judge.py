@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.lab.alignment import similarity
 from benchmarks.lab.stage import CalibratedStage
 from benchmarks.lab.truth import Truth, developed, footprints, moments, window_around
 from controller.artefacts.calibrated import Calibrated
@@ -178,7 +179,7 @@ def geometry_errors(stage: CalibratedStage, truth: Truth) -> dict[str, float]:
     a, b = measured[both], true[both]
     near = np.ones(len(a), np.bool_)
     for _ in range(4):
-        scale, turn, move = _similarity(a[near], b[near])
+        scale, turn, move = similarity(a[near], b[near])
         off_mm = 1000 * np.linalg.norm(scale * a @ turn.T + move - b, axis=1)
         near = off_mm <= GROSS_MM
     turned, displaced = [], []
@@ -197,13 +198,3 @@ def geometry_errors(stage: CalibratedStage, truth: Truth) -> dict[str, float]:
         "pose mm": max(displaced),
         "scale": abs(scale - 1),
     }
-
-
-def _similarity(a: Float64, b: Float64) -> tuple[float, Float64, Float64]:
-    """Scale, rotation and translation that take points ``a`` (n, 3) to ``b`` with least squares (Umeyama 1991)."""
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    left, values, right = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    turn = left @ sign @ right
-    scale = float(np.trace(np.diag(values) @ sign) / np.mean(np.sum((a - mean_a) ** 2, axis=1)))
-    return scale, turn, mean_b - scale * turn @ mean_a

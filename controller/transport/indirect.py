@@ -59,12 +59,14 @@ class IndirectLight:
 
         ``beside`` like ``direct``: light on surfaces of the room, which the transport does not know
         """
-        surfaces = self._of_surfaces(direct, beside)
-        return surfaces if self.paint is None else surfaces + _times(self.paint, direct)
+        if self.paint is None:
+            return self.scale * self.falling(direct, beside)
+        more = _times(self.paint, direct)
+        return self.scale * self.falling(direct + more, beside) + more
 
-    def _of_surfaces(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
+    def _of_surfaces(self, direct: FloatImage) -> FloatImage:
         painted = direct if self.paint is None else direct + _times(self.paint, direct)
-        return self.scale * self.falling(painted, beside)
+        return self.scale * self.falling(painted)
 
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""

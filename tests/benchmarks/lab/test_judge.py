@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.lab.judge import _similarity, relative, rms
+from benchmarks.lab.alignment import similarity
+from benchmarks.lab.judge import relative, rms
 from benchmarks.lab.truth import developed, moments, window_around
 
 
@@ -45,7 +46,7 @@ def test_a_similarity_is_undone_exactly() -> None:
     rng = np.random.default_rng(3)
     points = rng.normal(size=(50, 3))
     turn = np.asarray(Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix())
-    scale, found, move = _similarity(points, 1.7 * points @ turn.T + [4.0, 5.0, -6.0])
+    scale, found, move = similarity(points, 1.7 * points @ turn.T + [4.0, 5.0, -6.0])
     assert scale == pytest.approx(1.7)
     np.testing.assert_allclose(found, turn, atol=1e-12)
     np.testing.assert_allclose(move, [4.0, 5.0, -6.0], atol=1e-12)
@@ -53,7 +54,7 @@ def test_a_similarity_is_undone_exactly() -> None:
 
 def test_a_mirror_image_is_not_taken_for_a_rotation() -> None:
     points = np.random.default_rng(4).normal(size=(50, 3))
-    _, found, _ = _similarity(points, points * [1.0, 1.0, -1.0])
+    _, found, _ = similarity(points, points * [1.0, 1.0, -1.0])
     assert np.linalg.det(found) == pytest.approx(1.0)
 
 
