@@ -99,8 +99,8 @@ class ProjectorSupervisor:
     @want_lit.setter
     def want_lit(self, wanted: bool | None) -> None:
         if wanted and self._want_lit is False:
-            # A lamp that stays off after failed attempts gets one more attempt at every opening. A service that begins
-            # while the stage is open is no opening.
+            # A lamp that stays off after failed attempts gets one more attempt at every opening, and for work on a dark
+            # stage. A service that begins while the stage is open is no opening.
             self._failed_strikes, self._remembered = min(self._failed_strikes, MOST_STRIKES - 1), True
         if wanted and not self._want_lit:
             self._faulty_since_s = float("-inf")
@@ -364,6 +364,6 @@ def _unlit(name: str) -> Decision:
     return Decision(
         "lamp-given-up",
         f"The lamp of projector {name} gave no light in {MOST_STRIKES} attempts and stays off.",
-        "Replace the lamp, then press Open. Otherwise it is tried again at the next opening.",
+        "Replace the lamp, then press Open. Otherwise it is tried once more at the next opening or work.",
         "error",
     )

@@ -72,10 +72,13 @@ def believe(life: Living, item: Item, values: Mapping[str, Any]) -> None:
         witness.disturb(0.0)
     elif item.who == "test-shots":
         witness.light_until_s = now_s + 900.0 + SETTLING_S
+        witness.light_needed()
     elif item.who in ("save-settings", "recalibrate", "compare", "cancel"):
         witness.disturb(0.0)
         if item.who == "cancel":
             cancelled(life)
+        elif item.who in ("recalibrate", "compare"):
+            witness.light_needed()
     else:
         witness.disturb(0.0, 60.0)
     if life.world.disk.full:

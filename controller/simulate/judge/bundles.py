@@ -50,20 +50,22 @@ class BundleWitness:
 
     def judge(self, kiosk: StageKiosk, service: Service) -> None:
         """After a step. Raises Broken."""
-        unnamed_s = self._found.for_s("unnamed", bool(self.spoilt) and self._is_unnamed(kiosk, service))
+        unnamed = self._unnamed(kiosk, service) if self.spoilt else ""
+        unnamed_s = self._found.for_s("unnamed", bool(unnamed))
         if unnamed_s > NAMED_S:
-            raise Broken("bundle named", f"for {unnamed_s:.0f} s: {kiosk.snapshot().warnings}")
+            said = " ".join(kiosk.snapshot().warnings) or "nothing"
+            raise Broken("bundle named", f"{unnamed} can't be read, for {unnamed_s:.0f} s it says: {said}")
         self.dark = self._is_dark(service)
         dark_s = self._found.for_s("dark", self.dark)
         if dark_s > SHOWN_S:
             raise Broken("bundle shown", f"it is black for {dark_s:.0f} s")
 
-    def _is_unnamed(self, kiosk: StageKiosk, service: Service) -> bool:
-        """Whether the service began with a bundle that can't be read, and does not say so."""
+    def _unnamed(self, kiosk: StageKiosk, service: Service) -> str:
+        """The bundle that can't be read with which the service began, if it does not say so; else nothing."""
         bundle = service.bundles.bundle()
         if bundle is None or self.spoilt.get(bundle.name, self._began_s) >= self._began_s:
-            return False
-        return not any("bundle" in text for text in kiosk.snapshot().warnings)
+            return ""
+        return "" if any("bundle" in text for text in kiosk.snapshot().warnings) else bundle.name
 
     def _is_dark(self, service: Service) -> bool:
         """Whether a picture is wanted and could be shown, and is not."""

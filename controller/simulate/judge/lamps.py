@@ -34,6 +34,13 @@ class LampWitness:
         """Lamps may be tried again."""
         self._strikes_since = {name: lamp.strikes for name, lamp in self._world.lamps.items()}
 
+    def needed(self) -> None:
+        """Work, or a person, needs light of a dark stage: one strike more of each lamp, and no more than that."""
+        since = self._strikes_since
+        self._strikes_since = {
+            name: min(lamp.strikes, since.get(name, 0) + 1) for name, lamp in self._world.lamps.items()
+        }
+
     def ledger_lost(self) -> None:
         """The counts of strikes start again."""
         self.forgive()

@@ -140,6 +140,8 @@ class Witness:
         news = self.log.listen(service, self._check_may_begin)
         for row in news:
             self.lamps.off(row)
+            if row.code == "task-due":
+                self.light_needed()
         wanted = self.wanted.open()
         if wanted is not self._was_open:
             self._was_open, self.changed_s = wanted, now_s
@@ -164,6 +166,11 @@ class Witness:
     def _check_may_begin(self) -> bool:
         open_s = self._world.scheduler.now_s - self.changed_s
         return not (self._was_open and self.wanted.open() and open_s > BLACK_S and self.wanted.sure)
+
+    def light_needed(self) -> None:
+        """Work is asked for that needs light, which an open stage has."""
+        if not (self.wanted.open() and self.wanted.sure):
+            self.lamps.needed()
 
     def work_cancelled(self, service: Service) -> None:
         """A person cancelled what runs."""
