@@ -73,8 +73,8 @@ class EventLog:
         self._recent: deque[EventRow] = deque(self._load(), SHOWN)
         self._number = self._last_number()
         self._waiting: deque[EventRow] = deque(maxlen=SHOWN)
-        self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number"))
-        self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept"))
+        self._done: dict[str, str] = dict(self._query("SELECT key, how FROM done ORDER BY number", str, str))
+        self._kept: dict[str, str] = dict(self._query("SELECT name, value FROM kept", str, str))
         self._failures = self._read_failures()
         self._unwritten: dict[tuple[str, str], None] = {}
         if self._torn:
@@ -254,23 +254,31 @@ class EventLog:
         return database
 
     def _load(self) -> list[EventRow]:
-        rows = self._query("SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC LIMIT 2000")
+        newest = "SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC LIMIT 2000"
+        rows = self._query(newest, int, float, str, str, str)
         return [EventRow(n, s, _LEVELS.get(level, "info"), text, code) for n, s, level, text, code in reversed(rows)]
 
     def _last_number(self) -> int:
-        rows = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+        rows = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'", int)
         if rows:
             return int(rows[0][0])
         # After a damaged or unreadable log, numbers continue far above all that it can have had.
         lost = self._unavailable or self._torn or list(self.path.parent.glob("*.damaged-*"))
         return int(self._wall()) if lost else 0
 
-    def _query(self, statement: str) -> list[tuple]:  # type: ignore[type-arg]
-        """Its rows; of a damaged file those before the damage, which are the newest where they come first."""
+    def _query(self, statement: str, *kinds: type) -> list[tuple]:  # type: ignore[type-arg]
+        """Its rows with values of these kinds; of a damaged file those before the damage: where the newest come first,
+        these are the newest.
+        """
         rows: list[tuple] = []  # type: ignore[type-arg]
         try:
             for row in self._database.execute(statement):
-                rows.append(row)
+                if all(map(isinstance, row, kinds)):
+                    rows.append(row)
+                else:
+                    # A page that is gone is read as zeros: its rows have nothing in columns that must have something,
+                    # and could not be written into a new file.
+                    self._torn = True
         except sqlite3.Error as error:
             self.problem, self._torn = str(error), self._torn or _is_corrupt(error)
         return rows

@@ -155,3 +155,28 @@ def test_a_log_that_is_a_device_is_not_read_without_an_end(tmp_path: Path) -> No
     assert [one.text for one in log.after(0)] == [row.text]
     log.close()
     assert path.is_symlink()
+
+
+def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_file(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    path.parent.mkdir()
+    with sqlite3.connect(path) as file:
+        # As SQLite reads zeros where a page is gone: columns that must have something have nothing.
+        file.executescript(
+            "CREATE TABLE events (number INTEGER PRIMARY KEY, unix_s REAL, level TEXT, code TEXT, text TEXT);"
+            "CREATE TABLE done (number INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT UNIQUE, how TEXT);"
+            "INSERT INTO events (number) VALUES (1);"
+            "INSERT INTO events VALUES (2, 5.0, 'info', 'second', 'Two.');"
+            "INSERT INTO done (key, how) VALUES (NULL, NULL), ('drift-check 2026-01-01', 'begun');"
+        )
+    file.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["second"]
+    log.add(Decision("third", "Three."))
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["second", "third"]
+    assert log.done() == {"drift-check 2026-01-01"}
+    assert list(path.parent.glob("*.damaged-*"))
+    log.close()
