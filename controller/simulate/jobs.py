@@ -10,6 +10,7 @@ from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.jobs.job_handlers import PUBLISH, QUICK, VARIANTS, JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.store.event_log import Decision
+from controller.rig.rig import Rig
 from controller.simulate.disk import STAGE
 from controller.simulate.stage import NAMES, publish
 from controller.simulate.world import SimulatedWorld
@@ -17,7 +18,7 @@ from hal.deadline import Cancelled
 from hal.errors import DeviceRefused
 from hal.values import Power
 
-SECONDS: Final = {"drift": 25.0, "quick": 90.0, "projector": 60.0, "full": 200.0, "compare": 30.0, "aim": 20.0}
+SECONDS: Final = {"drift": 25.0, "quick": 90.0, "projector": 60.0, "full": 300.0, "compare": 30.0, "aim": 20.0}
 _OTHER_S: Final = 40.0
 _EVERY_S: Final = 5.0
 
@@ -33,18 +34,13 @@ class SimulatedJobs:
         own.calibrated = lambda: True
 
         def do(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-            if request.light:
-                with own.lend() as rig:
+            with self._world.busy():
+                if request.light:
+                    with own.lend() as rig:
+                        self._photograph(rig, self._seconds(request, cancel))
+                else:
                     for _ in self._seconds(request, cancel):
-                        rig.display.show({}, deadline=self._world.deadline(10.0))
-                        rig.camera.capture(STAGE, deadline=self._world.deadline(10.0))
-                        for projector in rig.projectors:
-                            self._look(
-                                projector.name, projector.guard.status(deadline=self._world.deadline(10.0)).power
-                            )
-            else:
-                for _ in self._seconds(request, cancel):
-                    pass
+                        pass
             return self._end(request)
 
         return {kind: JobHandler(do, handler.refusal) for kind, handler in own.table().items()}
@@ -61,6 +57,14 @@ class SimulatedJobs:
                     yield step
 
         return Steps()  # type: ignore[return-value]
+
+    def _photograph(self, rig: Rig, steps: range) -> None:
+        deadline = self._world.deadline
+        for _ in steps:
+            rig.display.show({}, deadline=deadline(10.0))
+            rig.camera.capture(STAGE, deadline=deadline(10.0))
+            for projector in rig.projectors:
+                self._look(projector.name, projector.guard.status(deadline=deadline(10.0)).power)
 
     def _look(self, name: str, power: Power) -> None:
         if power is not Power.ON:

@@ -27,7 +27,8 @@ from controller.run.state_machine import State
 from controller.simulate.disk import STAGE, watched
 from controller.simulate.happen import happenings
 from controller.simulate.happen.commands import arguments_of, believe, whole
-from controller.simulate.happen.draw import draw, setting
+from controller.simulate.happen.draw import draw
+from controller.simulate.happen.places import setting
 from controller.simulate.happen.script import Item, Setting
 from controller.simulate.jobs import SimulatedJobs
 from controller.simulate.judge.after_the_end import after_the_end
@@ -93,6 +94,7 @@ class Life:
         self.items = tuple(draw(seed, days) if items is None else items)
         self.place = setting(seed) if place is None else place
         self.world = SimulatedWorld(seed, self.place.begins_unix_s)
+        self.world.is_small = self.place.is_small
         for line in self.world.lines.values():
             line.lingers_s = self.place.lingers_s
         self.witness = Witness(self.world, Calendar(self.place.zone, self.place.rows))

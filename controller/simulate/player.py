@@ -13,6 +13,7 @@ from controller.bundle.format import Index
 from controller.bundle.install import CURRENT
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, load_public_key
+from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError, WorkError
 from controller.play.control import protocol
 from controller.play.control.launch import PlayerSettings
@@ -32,6 +33,8 @@ class Screen:
         self.scheduler, self.disk, self.chance = scheduler, disk, chance
         self.process: SimulatedPlayer | None = None
         self.trouble, self.hung = "", False
+        self.late = False
+        """Whether the computer is so busy with work that some answers come late."""
         self.no_server = False
         """Whether the X server is away."""
         self.unplugged: set[str] = set()
@@ -40,7 +43,8 @@ class Screen:
         self.number = 0
         self.vain_starts: dict[str, int] = {}
         """Starts in a row with a bundle that were asked for a picture, or never got so far, and showed none."""
-        self.sins: list[str] = []
+        self.sins: list[tuple[str, str]] = []
+        """What it did against a promise of the kiosk: its name, and how."""
 
     @property
     def appearance(self) -> str:
@@ -53,7 +57,12 @@ class Screen:
     def serves(self) -> bool:
         """Whether the player runs, and answers as it should."""
         process = self.process
-        return process is not None and process.alive and process.is_ready and not self.hung and not self.trouble
+        fails = self.hung or self.late or bool(self.trouble)
+        return process is not None and process.alive and process.is_ready and not fails
+
+    def heed(self) -> None:
+        """Asked seldom, it would leave two questions in a row unanswered only once in hours."""
+        self.scheduler.brisk = "player" if self.late or self.trouble in UNHEARD else ""
 
     def lose_server(self) -> None:
         """The X server ends, and its clients with it. One that hangs does not notice, but its window is gone, too."""
@@ -173,10 +182,10 @@ class SimulatedPlayer:
         try:
             with self._screen.disk.untouched():
                 if link.name == CURRENT and link.is_symlink():
-                    before = link.resolve()
+                    before, known = link.resolve(), Starts.read(link.parent).bundle
                     self._start = CountedStart(link.parent, lambda _: None)
                     self._bundle = self._start.file.resolve().name
-                    self._given_up(before)
+                    self._given_up(before, now=known != self._bundle)
                     self.load(self._start.file)
                 elif link.exists():
                     self.load(link)
@@ -184,11 +193,22 @@ class SimulatedPlayer:
             return error.what
         return ""
 
-    def _given_up(self, before: Path) -> None:
-        """Whether that was right, as far as it was."""
+    def _given_up(self, before: Path, *, now: bool) -> None:
+        """Whether that was right, as far as it was. ``now``: by this start, if at all."""
+        if now and self._bundle != before.name and not self._opens(self._bundle, before.parent):
+            self._screen.sins.append(("bundle back", f"{self._bundle} plays again, and can't be read"))
         vain = self._screen.vain_starts.get(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
         if vain < MOST_FAILED_STARTS and before.is_file():
-            self._screen.sins.append(f"the bundle {before.name} was given up after {vain} starts without a picture")
+            how = f"the bundle {before.name} was given up after {vain} starts without a picture"
+            self._screen.sins.append(("bundle kept", how))
+
+    def _opens(self, name: str, folder: Path) -> bool:
+        """Whether this bundle can be read, as far as the disk can be."""
+        try:
+            Bundle.open_trusted(folder / name, self._trust).close()
+        except VelaturaError:
+            return self._screen.disk.blind
+        return True
 
     def load(self, path: Path) -> None:
         """Use this bundle from now on. Raises VelaturaError."""
@@ -294,7 +314,7 @@ class Connection:
         self._send(line, screen.scheduler.now_s + after_s + screen.chance.uniform(0.001, 0.02))
 
     def _send(self, line: bytes, at_s: float) -> None:
-        chance, trouble = self._screen.chance, self._screen.trouble
+        chance, trouble = self._screen.chance, self._screen.trouble or "slow" * self._screen.late
         troubled = trouble and chance.random() < 0.4
         pieces: list[tuple[float, bytes]] = [(at_s, line)]
         if troubled:

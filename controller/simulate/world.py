@@ -132,7 +132,8 @@ class SimulatedWorld(World):
         self.no_network = False
         self.begins_unix_s, self.clock_off_s = begins_unix_s, 0.0
         self.is_synchronised = True
-        self.drifted = False
+        self.drifted = self.is_small = False
+        """Whether something has moved; and whether the computer can't do work and answer in time."""
         self.program: Program | None = None
         self._connections: list[sqlite3.Connection] = []
         self._booted_s, self._boots = 0.0, 0
@@ -175,6 +176,17 @@ class SimulatedWorld(World):
             yield
         finally:
             self.program = before
+
+    @contextlib.contextmanager
+    def busy(self) -> Iterator[None]:
+        """The computer works: on a small one, some answers of the player are late meanwhile."""
+        self.screen.late = self.is_small
+        self.screen.heed()
+        try:
+            yield
+        finally:
+            self.screen.late = False
+            self.screen.heed()
 
     # -- as World
 

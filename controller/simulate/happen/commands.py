@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.judge.wanted import SETTLING_S
 from controller.simulate.scheduler import Killed
+
+CHANGES: Final = ("comment", "projector", "display")
+"""What people change in stage.toml."""
 
 
 @contextlib.contextmanager
@@ -44,6 +48,19 @@ def _changed(text: str, what: str) -> str:
         if "power_down_s = 20.0" in text
         else text.replace("power_down_s = 21.0", "power_down_s = 20.0")
     )
+
+
+def settings_edited(life: Living, item: Item) -> None:
+    """An administrator changes stage.toml in an editor and restarts the service, also on a full disk: many file systems
+    keep some room for them.
+    """
+    path = STAGE / "stage.toml"
+    if "stage.toml" in life.unreadable or not path.is_file():
+        return
+    path.write_text(_changed(path.read_text("utf-8"), item.how), "utf-8")
+    if life.service is not None:
+        life.restart(lit=True)
+    life.witness.disturb(0.0)
 
 
 def cancelled(life: Living) -> None:

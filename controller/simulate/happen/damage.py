@@ -12,7 +12,7 @@ from controller.rig.lamp_ledger import LampFile
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.power import power_cut
-from controller.simulate.happen.script import POWER_CUT, STOPPED, Item
+from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, Item
 from controller.simulate.judge.bundles import SHOWN_S, is_sound
 from controller.simulate.judge.log_file import readable
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
@@ -119,9 +119,14 @@ def bundle_damaged(life: Living, item: Item) -> None:
 
 
 def bundles_unreadable(life: Living, item: Item) -> None:
-    """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left."""
+    """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left.
+
+    With the arguments "the player died" it could not read its own program any more either.
+    """
     disk, witness = life.world.disk, life.witness
     disk.blind = True
+    if item.arguments == DIED and life.world.screen.process is not None:
+        life.world.screen.process.kill()
     witness.disturb(item.for_s, PLAYER_S)
     witness.disturb_player(item.for_s)
 

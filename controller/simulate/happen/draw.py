@@ -1,4 +1,4 @@
-"""How a life is drawn from its seed: where it takes place, and what happens in it.
+"""What happens in a life, drawn from its seed.
 
 As in swarm testing (Groce and others, 2012) each life has only some kinds of things, and those more often. What a few
 kinds do together is hardly ever seen in lives that all have a little of everything.
@@ -10,11 +10,11 @@ import json
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from typing import Any, Final
-from zoneinfo import ZoneInfo
 
-from controller.simulate.happen.script import POWER_CUT, STOPPED, Item, Setting
+from controller.simulate.happen.commands import CHANGES
+from controller.simulate.happen.places import ZONES, hours, setting
+from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, Item
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -22,19 +22,9 @@ from controller.simulate.scheduler import DAY_S
 from controller.simulate.stage import APPEARANCES, NAMES
 
 HOUR_S: Final = 3600.0
-CHANGING: Final = ("Europe/Vienna", "America/New_York", "Australia/Lord_Howe")
-"""Zones whose clocks change twice a year."""
-ZONES: Final = (*CHANGING, "Asia/Kolkata", "UTC")
-DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 WORK: Final = ("recalibrate", "compare", "test-shots")
 CANCELLED: Final = 0.5
 
-LOGGED: Final = (0, 1000, 1000)
-"""Events of the months before. In the log of a few days there is hardly a middle that could be damaged."""
-LINGERS_S: Final = (0.0, 0.0, 20.0, 90.0)
-"""Many projectors take one connection at a time, and notice late that a program was killed."""
-DISPLAY_AFTER_S: Final = (0.0, 15.0, 60.0)
-"""A computer starts its display and the service at the same time."""
 LEFT_OUT: Final = (0.3, 0.6, 0.8)
 """Share of the kinds of things, and of the ways in which each happens, that a life does not have."""
 LEANINGS: Final = (1.0, 1.0, 4.0)
@@ -55,16 +45,18 @@ RESTLESS_S: Final = {"line": 900.0, "player": 450.0}
 """Trouble that comes and goes every second is not drawn for longer: it would take most of the time of a life."""
 LONGEST_S: Final = 40_000.0
 NOTICED_S: Final = 1800.0
-"""It takes people so long at least to notice a damaged bundle, and to publish the appearances again."""
+"""It takes people so long at least to notice a damaged bundle or a cable that is out, and to do something about it."""
+UNNOTICED: Final = "until somebody comes"
 
 PAST: Final = "past a change"
 
 _Weights = Mapping[str, float]
 KINDS: Final[_Weights] = {
     "line": 2, "lamp fails": 1, "lamp reports": 1, "lamp switched by hand": 1, "player": 2, "camera gone": 1,
-    "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 2, "killed": 1, "bundles unreadable": 1,
+    "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 2, "killed": 1, "bundles unreadable": 1.5,
     "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 1, "network gone": 0.5, "drift": 0.5,
-    "command": 6, "x server": 1, "cable out": 1, "published": 1,
+    "command": 6, "x server": 1, "cable out": 2, "published": 1,
+    "settings edited": 1,
 }  # fmt: skip
 MOMENTS: Final[_Weights] = {
     "work-begins": 2, "task-due": 1, "asked": 1, "service-started": 2, "player-started": 1, "disk-full": 1,
@@ -79,8 +71,10 @@ FILES: Final[_Weights] = {
     "kiosk/events.sqlite": 3, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
     "bundles/starts.json": 1, "lamps.json": 3, "lamps-copy.json": 1, "kiosk/stage.toml.good": 1,
 }  # fmt: skip
-BEFORE: Final[Mapping[str, Sequence[str]]] = {"file damaged": ("", STOPPED), "bundle damaged": ("", POWER_CUT)}
-"""How the service or the player ended before something was damaged."""
+BEFORE: Final[Mapping[str, Sequence[str]]] = {
+    "file damaged": ("", STOPPED), "bundle damaged": ("", POWER_CUT), "bundles unreadable": ("", DIED, DIED),
+}  # fmt: skip
+"""How the service or the player ended before something was damaged, or with it."""
 HOW: Final[Mapping[str, Sequence[str]]] = {
     "line": LINE_TROUBLES,
     "lamp fails": ("", "goes out"),
@@ -89,6 +83,8 @@ HOW: Final[Mapping[str, Sequence[str]]] = {
     "player": ("killed", "hung", "crashes", "crashes at a picture", *TROUBLES),
     "restarted": ("lamps stay lit", "lamps off"),
     "clock set": ("hours", "days", "lost"),
+    "cable out": ("", UNNOTICED),
+    "settings edited": CHANGES,
 }
 DAMAGES: Final[Mapping[str, Sequence[str]]] = {
     "file damaged": ("cut", "flipped", "flipped", "empty", "removed"), "bundle damaged": ("", "", "all"),
@@ -103,51 +99,10 @@ AFTER: Final = ("at once", "at once", "while it lasts", "while it lasts", "as it
 MOST_TOGETHER: Final = 5
 ENDLESS: Final = (
     "killed", "drift", "restarted", "killed while writing", "command", "lamp switched by hand", "published",
+    "settings edited",
 )  # fmt: skip
 MIND: Final = 0.7
 """Share of the commands "start" and "stop" that ask for what the hours do not."""
-
-
-def setting(seed: str) -> Setting:
-    """As drawn from the seed. Where the clocks change soon, hours over midnight are usual: they meet the change."""
-    chance = random.Random(f"{seed} life")
-    soon = chance.random() < 0.5
-    zone = chance.choice(CHANGING if soon else ZONES)
-    rows = hours(chance, chance.choice((0.1, 0.9, 0.9) if soon else (0.0, 0.1, 0.9)))
-    drift_check = chance.choice(["03:30", "02:30", "23:00"])
-    begins_s, bundles = begins(chance, zone, soon=soon).timestamp(), chance.choice((1, 2, 2))
-    return Setting(begins_s, zone, rows, drift_check, bundles, chance.choice(LOGGED),
-                   chance.choice(LINGERS_S), chance.choice(DISPLAY_AFTER_S))  # fmt: skip
-
-
-def hours(chance: random.Random, late: float) -> list[dict[str, str]]:
-    """Rows of opening hours, never two at a time; this share of them over midnight."""
-    rows = []
-    for day in DAYS:
-        if chance.random() < 0.15:
-            continue
-        opens = chance.randrange(8 * 60, 18 * 60)
-        # Not in the hour that summer time leaves out: what its times mean is not worked out a second time here.
-        closes = min(opens + chance.randrange(60, 10 * 60), 25 * 60 + 55)
-        if chance.random() < late:
-            closes = chance.randrange(27 * 60 + 5, 31 * 60)
-        rows.append({"day": day, "opens": _clock(opens), "closes": _clock(closes)})
-    return rows or [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
-
-
-def _clock(minutes: int) -> str:
-    return f"{minutes // 60 % 24:02}:{minutes % 60:02}"
-
-
-def begins(chance: random.Random, zone: str, *, soon: bool) -> datetime:
-    """When a life begins; with ``soon`` some two days before the clocks of the zone change."""
-    day = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=chance.randrange(0, 1000))
-    if soon:
-        later = [day + timedelta(days=number) for number in range(200)]
-        offsets = [one.astimezone(ZoneInfo(zone)).utcoffset() for one in later]
-        changes = [number for number in range(1, 200) if offsets[number] != offsets[number - 1]]
-        day += timedelta(days=max(0, changes[0] - 3)) if changes else timedelta()
-    return day + timedelta(minutes=chance.randrange(1440))
 
 
 class Leaning:
@@ -256,7 +211,9 @@ class _Drawing:
         lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S[what]) if how in RESTLESS else lasts_s
         name = chance.choice(NAMES)
         match what:
-            case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand" | "cable out":
+            case "cable out":
+                return Item(at_s, what, name, how, max(NOTICED_S * (how == UNNOTICED), lasts_s))
+            case "line" | "lamp fails" | "lamp reports" | "lamp switched by hand":
                 return Item(at_s, what, name, how, lasts_s)
             case "player":
                 times = chance.randint(1, 4) * how.startswith("crashes")
@@ -266,6 +223,8 @@ class _Drawing:
                 return Item(at_s, what, who, how, number=number, arguments=chance.choice(BEFORE[what]))
             case "bundle damaged":
                 return Item(at_s, what, "", how, max(NOTICED_S, lasts_s), arguments=chance.choice(BEFORE[what]))
+            case "bundles unreadable":
+                return Item(at_s, what, "", how, lasts_s, arguments=chance.choice(BEFORE[what]))
             case "killed while writing":
                 return Item(at_s, what, number=round(chance.uniform(1.0, 8.0) ** 2))
             case "clock set":
@@ -300,5 +259,5 @@ class _Drawing:
                 values = {"time_zone": chance.choice(ZONES), "drift_check": chance.choice(["03:30", "02:30", ""]),
                           "rows": hours(chance, chance.choice((0.0, 0.1, 0.9)))}  # fmt: skip
             case "save-settings":
-                values = {"text": chance.choice(["comment", "projector", "display"])}
+                values = {"text": chance.choice(CHANGES)}
         return Item(at_s, "command", who, arguments=json.dumps(values, sort_keys=True) if values else "")

@@ -8,13 +8,13 @@ from typing import Final
 
 from controller.kiosk.decide.planner import EARLIEST_S
 from controller.simulate.disk import STAGE, TOTAL_BYTES
+from controller.simulate.happen.commands import settings_edited
 from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.power import display_away, power_cut
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.lamps import RULES, Lamp
-from controller.simulate.player import UNHEARD
 from controller.simulate.stage import OUTPUTS, publish
 
 GOES_OUT_S: Final = 35.0
@@ -119,11 +119,11 @@ def _player(life: Living, item: Item) -> None:
         screen.hung = True
     else:
         screen.trouble = item.how
-        # Asked seldom, it would leave two questions in a row unanswered only once in hours.
-        life.world.scheduler.brisk = "player" if item.how in UNHEARD else ""
+        screen.heed()
 
         def repair() -> None:
-            screen.trouble = life.world.scheduler.brisk = ""
+            screen.trouble = ""
+            screen.heed()
 
         life.later(item.for_s, repair)
     witness.disturb_picture(item.for_s + again_s)
@@ -211,7 +211,7 @@ def _clock(life: Living, item: Item) -> None:
     if world.wall() < EARLIEST_S and wanted.sure:
         wanted.lose_time()
     else:
-        wanted.wrong(item.for_s + HOLD_S + REPAIR_S)
+        wanted.wrong(item.for_s + HOLD_S + REPAIR_S, has_time=world.wall() >= EARLIEST_S)
 
     def repair() -> None:
         if world.is_synchronised:
@@ -256,5 +256,5 @@ _DEEDS: Final[Mapping[str, Callable[[Living, Item], None]]] = {
     "file damaged": file_damaged, "bundle damaged": bundle_damaged, "bundles unreadable": bundles_unreadable,
     "killed": _killed, "killed while writing": _killed_writing, "power cut": _power_cut, "restarted": _restarted,
     "clock set": _clock, "network gone": _no_network, "drift": _drift, "published": _published,
-    "command": _command,
+    "command": _command, "settings edited": settings_edited,
 }  # fmt: skip

@@ -13,6 +13,9 @@ STOPPED = "stopped"
 POWER_CUT = "power cut"
 """As the arguments of a damaged bundle: with the computer's power; without it, only the player died."""
 
+DIED = "the player died"
+"""As the arguments of bundles that can't be read: a disk with errors takes programs with it."""
+
 
 def moment_of(code: str, text: str) -> str:
     """What an item may wait for: the code of an event, or the state that the stage comes to."""
@@ -55,7 +58,7 @@ class Setting:
     ``bundles``: so many were published before: with the second, there is an older one to go back to. ``logged``: so
     many events are in the log of the months before. ``lingers_s``: a projector takes no new connection for so long
     after the end of a program that did not close its own. ``display_after_s``: so long after its power, the computer's
-    display is there.
+    display is there. ``is_small``: the computer's player answers late while it works.
     """
 
     begins_unix_s: float
@@ -66,6 +69,7 @@ class Setting:
     logged: int = 0
     lingers_s: float = 0.0
     display_after_s: float = 0.0
+    is_small: bool = False
 
 
 def to_json(place: Setting, items: Sequence[Item]) -> str:

@@ -64,7 +64,8 @@ class LampWitness:
         for name, line in self._world.lines.items():
             # A look is some seconds old; a command that was under way may have struck it since.
             seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
-            if line.lamp.lit and seen and not line.lamp.by_hand and row.text.startswith("The stage is off: every lamp"):
+            known = line.lamp.lit and not line.lamp.by_hand and not line.lamp.late
+            if known and seen and row.text.startswith("The stage is off: every lamp"):
                 raise Broken("off is off", f"the lamp of {name} burns")
 
     def _may_burn(self, service: Service) -> None:

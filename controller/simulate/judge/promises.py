@@ -32,6 +32,7 @@ PROMISES: Final = {
     "alerts": "Each alert is sent once, in its order, unless the service was killed while it was sent.",
     "as usual again": "What people changed of the picture ends when the stage closes.",
     "bundle kept": "A bundle that can be read is given up only after three starts that were to show it, and did not.",
+    "bundle back": "The player goes back only to a bundle that can be read.",
     "bundle shown": "A wanted picture comes, if a bundle can be read and the display is there, whatever else is wrong.",
     "bundle named": "A bundle that can't be read is named by each service that begins with it, open or closed.",
     "few ends": "A player that answers now and then is not ended again and again.",

@@ -83,11 +83,11 @@ class Wanted:
         elif self._said is not None and self._said[1] is None:
             self.say(self._said[0])
 
-    def wrong(self, for_s: float) -> None:
-        """For so long its time or its hours may be wrong."""
+    def wrong(self, for_s: float, *, has_time: bool = False) -> None:
+        """For so long its time or its hours may be wrong. ``has_time``: it has a time now, if it had none."""
         truth_s = self._truth()
         doubtful = self.unknown or self._said is not None or truth_s <= self._unsure_until_s
-        self.unknown = False
+        self.unknown = self.unknown and not has_time
         self._wrong_until_s = max(self._wrong_until_s, truth_s + for_s)
         if doubtful:
             self.unsure_until_hours()

@@ -130,7 +130,7 @@ class Witness:
         if world.camera.sins:
             raise Broken("one owner", world.camera.sins[0])
         if world.screen.sins:
-            raise Broken("bundle kept", world.screen.sins[0])
+            raise Broken(*world.screen.sins[0])
         if scheduler.crashes:
             name, error = scheduler.crashes[0]
             raise Broken("no crash", f"{name}: {type(error).__name__}: {error}")

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from controller.simulate.happen.draw import draw, setting
+from controller.simulate.happen.draw import draw
+from controller.simulate.happen.places import setting
 from controller.simulate.happen.script import Item, Setting, from_json, to_json
 from controller.simulate.judge.promises import PROMISES
-from controller.simulate.life import Life
+from controller.simulate.life import Life, Outcome
 
 FOUND = Path(__file__).parent / "found"
 ROOT = Path(__file__).parents[3]
@@ -78,6 +79,29 @@ def test_what_waits_for_a_moment_happens_when_the_log_says_that() -> None:
     ]
     assert 5.0 <= again - began < 9.0
     assert outcome.how == ""
+
+
+def a_life(items: list[Item], days: float, *, is_small: bool = False) -> Outcome:
+    """From Monday, 00:00 on: open from 10:00 to 18:00."""
+    rows = [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
+    return Life("script", days, items, Setting(1_767_571_200.0, "UTC", rows, "03:30", is_small=is_small)).live()
+
+
+def test_the_player_of_a_small_computer_answers_late_while_it_works() -> None:
+    work = [Item(600.0, "command", "recalibrate", arguments='{"kind": "full"}')]
+    small, large = a_life(work, 0.05, is_small=True), a_life(work, 0.05)
+    assert [outcome.how for outcome in (small, large)] == ["", ""]
+    assert any(" player-hung " in line for line in small.last)
+    assert not any(" player-hung " in line for line in large.last)
+
+
+def test_an_administrator_edits_the_settings_on_a_full_disk_too() -> None:
+    edited = Item(900.0, "settings edited", how="comment")
+    damaged = Item(9000.0, "file damaged", "stage.toml", "empty")
+    outcome = a_life([Item(600.0, "disk full", for_s=1200.0), edited, damaged], 0.12)
+    assert outcome.how == ""
+    assert sum(" service-started " in line for line in outcome.last) == 4
+    assert any("runs with the last good settings" in line for line in outcome.last)
 
 
 def test_every_promise_is_on_the_page() -> None:
