@@ -75,12 +75,12 @@ BEFORE: Final[Mapping[str, Sequence[str]]] = {
     "file damaged": ("", STOPPED), "bundle damaged": ("", POWER_CUT), "bundles unreadable": ("", DIED, DIED),
 }  # fmt: skip
 """How the service or the player ended before something was damaged, or with it."""
-HOW: Final[Mapping[str, Sequence[str]]] = {
+HOW: Final[Mapping[str, _Weights | Sequence[str]]] = {
     "line": LINE_TROUBLES,
     "lamp fails": ("", "goes out"),
     "lamp reports": ("temperature", "cover", "lamp-failed", "fan"),
     "lamp switched by hand": ("off", "on"),
-    "player": ("killed", "hung", "crashes", "crashes at a picture", *TROUBLES),
+    "player": {"killed": 3, "hung": 2, **dict.fromkeys(("crashes", "crashes at a picture", *TROUBLES), 1)},
     "restarted": ("lamps stay lit", "lamps off"),
     "clock set": ("hours", "days", "lost"),
     "cable out": ("", UNNOTICED),
