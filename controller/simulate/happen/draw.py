@@ -76,7 +76,7 @@ BEFORE: Final[Mapping[str, Sequence[str]]] = {
 }  # fmt: skip
 """How the service or the player ended before something was damaged, or with it."""
 HOW: Final[Mapping[str, _Weights | Sequence[str]]] = {
-    "line": LINE_TROUBLES,
+    "line": {**dict.fromkeys(LINE_TROUBLES, 1), "silent": 3, "gone": 3},
     "lamp fails": ("", "goes out"),
     "lamp reports": ("temperature", "cover", "lamp-failed", "fan"),
     "lamp switched by hand": ("off", "on"),
