@@ -40,7 +40,7 @@ class LogWitness:
         self.rows: dict[int, EventRow] = {}
         self.digested: list[str] = []
         self.here = "\0"
-        self.state = self.fault = ""
+        self.state = self.fault = self._before = ""
         self.unlit_s = -1e9
         self.begun_checks: set[str] = set()
         self.moment: Callable[[str], None] = lambda _: None
@@ -150,11 +150,15 @@ class LogWitness:
             self._ends_s.append(now_s)
             if len(self._ends_s) == MOST_ENDS and now_s - self._ends_s[0] < WORDS_S:
                 raise Broken("few ends", f"the player was ended {MOST_ENDS} times in {now_s - self._ends_s[0]:.0f} s")
-        recent.append((now_s, row.text))
-        often[row.text] += 1
+        # Who asks often gets as many answers: a request, and the line after it, are words of their own.
+        asked = "done-by" in (row.code, self._before)
+        self._before = row.code
+        text = f"{row.text} ({row.number})" if asked else row.text
+        recent.append((now_s, text))
+        often[text] += 1
         while now_s - recent[0][0] >= WORDS_S:
             often[recent.popleft()[1]] -= 1
         if len(recent) >= MOST_WORDS:
             raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
-        if often[row.text] >= MOST_AGAIN:
+        if often[text] >= MOST_AGAIN:
             raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
