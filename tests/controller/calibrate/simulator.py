@@ -123,6 +123,20 @@ def _lookup(
     return found
 
 
+@functools.cache
+def _enlarged(pixels: int, lit: int, blur_px: float) -> FloatImage:
+    """(enlarged, pixels): a row of ``pixels`` with square pixels, ``lit`` parts of each lit, blurred."""
+    low = (ENLARGED - lit) // 2
+    each = np.zeros((pixels, ENLARGED, pixels), np.float32)
+    each[range(pixels), low : low + lit, range(pixels)] = 1
+    large = each.reshape(pixels * ENLARGED, pixels)
+    if blur_px > 0:
+        sigma = blur_px * ENLARGED
+        large = np.asarray(cv2.GaussianBlur(large, (1, round(8 * sigma + 1) | 1), 0, sigmaY=sigma), np.float32)
+    large.setflags(write=False)
+    return large
+
+
 class Stage:
     """Takes photographs of device frames; values in full scale, clipped at 1."""
 
@@ -162,15 +176,12 @@ class Stage:
 
     def _seen(self, light: FloatImage, apart_px: tuple[float, float]) -> FloatImage:
         """What falls where the camera's points look, of pixels of light that lie so far to the right and down."""
-        scene = self.scene
-        u, lit = ENLARGED, scene.lit_share_of_pixel
-        low = (u - lit) // 2
-        rows, columns = light.shape[:2]
-        pixels = np.zeros((rows, u, columns, u, 3), np.float32)
-        pixels[:, low : low + lit, :, low : low + lit] = light[:, None, :, None]
-        large: cv2.typing.MatLike = pixels.reshape(rows * u, columns * u, 3)
-        if scene.projector_blur_px > 0:
-            large = cv2.GaussianBlur(large, (0, 0), scene.projector_blur_px * u)
+        scene, (rows, columns) = self.scene, light.shape[:2]
+        of_rows, of_columns = (_enlarged(n, scene.lit_share_of_pixel, scene.projector_blur_px) for n in (rows, columns))
+        # Both keep rows and columns apart, so they are two products, whatever the blur: first the one with less to do.
+        wide = (of_columns @ light).reshape(rows, -1)
+        large: cv2.typing.MatLike = (of_rows @ wide).reshape(len(of_rows), len(of_columns), 3)
+        u = ENLARGED
         at = self._lookup - np.float32(u) * np.array(apart_px, np.float32) if any(apart_px) else self._lookup
         seen = cv2.remap(large, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(seen, np.float32)
