@@ -12,18 +12,20 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 
 from controller.panel.app import STATIC
-from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
+from tests.controller.panel.browser import SHELL, chromium, enter, tab
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf
 from tests.controller.panel.test_in_browser import violations
 
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+pytestmark = pytest.mark.skipif(
+    not SHELL.exists(), reason="needs Debian's chromium-headless-shell (a package of the test set-up)"
+)
 FIRST_PAGE_BYTES = 250_000
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with chromium() as started:
+    with chromium(program=SHELL) as started:
         yield started
 
 

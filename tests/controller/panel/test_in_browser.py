@@ -16,12 +16,14 @@ from playwright.sync_api import Browser, Page, expect
 from controller.kiosk.interface import BundleIdentity, Finding, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.pages.routes import NAVIGATION
-from tests.controller.panel.browser import CHROMIUM, chromium, enter, picture, tab
+from tests.controller.panel.browser import SHELL, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import TOML, MemoryKiosk
 from tests.controller.panel.served import QUICK_HASH, Served, served
 from tests.ports import kept_port
 
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
+pytestmark = pytest.mark.skipif(
+    not SHELL.exists(), reason="needs Debian's chromium-headless-shell (a package of the test set-up)"
+)
 
 PAGES = (
     "/",
@@ -45,7 +47,7 @@ PAGES = (
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with chromium() as started:
+    with chromium(program=SHELL) as started:
         yield started
 
 
