@@ -12,6 +12,7 @@ import functools
 import inspect
 import time
 from collections.abc import Callable, Mapping
+from types import SimpleNamespace
 from typing import Any, Final, get_type_hints
 
 from hal.annotations import mismatch
@@ -170,7 +171,10 @@ def _checked_class(*interfaces: type) -> type[CheckedDevice]:
 
 def _forwarded(name: str, member: Any) -> Any:
     is_property = isinstance(member, property)
-    returns = get_type_hints(member.fget if is_property else member)["return"]
+    function = member.fget if is_property else member
+    # Its parameters may have types that only a type checker has loaded, so they are left out.
+    returned = SimpleNamespace(__annotations__={"return": function.__annotations__["return"]})
+    returns = get_type_hints(returned, globalns=function.__globals__)["return"]
 
     def method(self: CheckedDevice, *args: Any, **kwargs: Any) -> Any:
         def looked_up(*given: Any, **named: Any) -> Any:

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from controller.calibrate.camera.intrinsics import read_intrinsics
-from controller.calibrate.geometry.metric_scale import MeasuredDistance
-from controller.calibrate.geometry.values import CameraPrior
 from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenConfigTable
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
 from hal.errors import DeviceError, DriverFault, PluginError
 from hal.registry import Driver, Drivers, OpenContext, check_device, load_drivers
+
+if TYPE_CHECKING:
+    from controller.calibrate.geometry.values import CameraPrior
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,10 @@ class Checked:
 
         Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
         """
+        from controller.calibrate.camera.intrinsics import read_intrinsics
+        from controller.calibrate.geometry.metric_scale import MeasuredDistance
+        from controller.calibrate.geometry.values import CameraPrior
+
         table: CameraTable = self.stage.tables.camera
         measured = self.stage.tables.object.distances
         distances = tuple(MeasuredDistance(d.from_px, d.to_px, d.distance_m, d.sigma_m) for d in measured)

@@ -31,7 +31,6 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
@@ -46,6 +45,8 @@ from plugins.emulated.optics.truth import (
     SurfaceTruth,
     Three,
     Two,
+    matrix_of,
+    rotation_vector_of,
 )
 from plugins.emulated.tables import Between, dump, load
 
@@ -197,7 +198,7 @@ def _projector(projector: ProjectorTruth, bump: Bump) -> ProjectorTruth:
 
 def _device(pose: Pose, lens: Lens, bump: Bump) -> Pose:
     """Its new pose: x_new = turn (R (x - position) ...), the position moved along its own axes."""
-    turn = Rotation.from_rotvec(np.deg2rad(bump.turn_deg)).as_matrix()
+    turn = matrix_of(np.deg2rad(bump.turn_deg))
     if any(bump.shift_px):
         width, height = lens.size_px
         middle = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
@@ -206,7 +207,7 @@ def _device(pose: Pose, lens: Lens, bump: Bump) -> Pose:
         turn = _shortest_turn(here, there) @ turn
     rotation = pose.rotation
     position = np.asarray(pose.position_m) + rotation.T @ (1e-3 * np.asarray(bump.move_mm))
-    return Pose(_three(position), _three(Rotation.from_matrix(turn @ rotation).as_rotvec()))
+    return Pose(_three(position), _three(rotation_vector_of(turn @ rotation)))
 
 
 def _shortest_turn(here: Floats, there: Floats) -> Floats:
@@ -214,17 +215,17 @@ def _shortest_turn(here: Floats, there: Floats) -> Floats:
     axis = np.cross(here, there)
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, float(here @ there))
-    return np.asarray(Rotation.from_rotvec(axis / max(sine, 1e-15) * angle).as_matrix())
+    return matrix_of(axis / max(sine, 1e-15) * angle)
 
 
 def _object_moved(truth: BenchTruth, bump: Bump) -> BenchTruth:
     """An object that moves among still devices looks as devices and room that move the other way round it."""
-    turn = Rotation.from_rotvec(np.deg2rad(bump.turn_deg)).as_matrix()
+    turn = matrix_of(np.deg2rad(bump.turn_deg))
     move = 1e-3 * np.asarray(bump.move_mm)
 
     def other_way(pose: Pose) -> Pose:
         position = turn.T @ (np.asarray(pose.position_m) - move)
-        return Pose(_three(position), _three(Rotation.from_matrix(pose.rotation @ turn).as_rotvec()))
+        return Pose(_three(position), _three(rotation_vector_of(pose.rotation @ turn)))
 
     def surface(one: SurfaceTruth) -> SurfaceTruth:
         across, along = (_three(turn.T @ np.asarray(side)) for side in (one.across_m, one.along_m))

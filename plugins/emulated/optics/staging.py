@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from plugins.emulated.optics.effects.levels import OPAQUE
@@ -28,6 +27,7 @@ from plugins.emulated.optics.truth import (
     ProjectorTruth,
     Sensor,
     Three,
+    rotation_vector_of,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -281,12 +281,13 @@ def _aimed(
 
 
 def _looking(position: Floats, target: Floats, roll: float) -> Three:
+    from scipy.spatial.transform import Rotation
+
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross((0.0, 1.0, 0.0), forward)
     right /= np.linalg.norm(right)
     matrix = np.stack((right, np.cross(forward, right), forward))
-    tilted = Rotation.from_euler("z", roll).as_matrix() @ matrix
-    return _three(Rotation.from_matrix(tilted).as_rotvec())
+    return _three(rotation_vector_of(Rotation.from_euler("z", roll).as_matrix() @ matrix))
 
 
 def _three(values: Floats) -> Three:

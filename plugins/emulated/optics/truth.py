@@ -12,7 +12,6 @@ from typing import Annotated, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
@@ -37,6 +36,20 @@ ENGINES: Final = ("direct", "radiosity", "mitsuba")
 """Of light between surfaces."""
 
 
+def matrix_of(rotation_vector: Three | npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(3, 3) rotation by a Rodrigues vector (3,) in radians."""
+    from scipy.spatial.transform import Rotation  # many that start the emulated devices turn nothing
+
+    return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix(), dtype=np.float64)
+
+
+def rotation_vector_of(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(3,) Rodrigues vector in radians of a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
+
+
 @dataclass(frozen=True, slots=True)
 class Pose:
     """Where a device stands: x_device = R(rotation_vector) (x_world - position_m), Rodrigues vector in radians."""
@@ -47,7 +60,7 @@ class Pose:
     @property
     def rotation(self) -> npt.NDArray[np.float64]:
         """(3, 3) world to device."""
-        return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix(), dtype=np.float64)
+        return matrix_of(self.rotation_vector)
 
 
 @dataclass(frozen=True, slots=True)
