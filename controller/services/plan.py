@@ -60,9 +60,10 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
     surface = sampled(target_object, tables.goal.points, audience, SEED)
     tracker.end()
     tracker.begin(1)
+    places = tables.mounting_points()
     candidates = candidates_of(
         tables.models(),
-        tables.mounting_points(),
+        places,
         surface,
         target_object,
         goal,
@@ -77,7 +78,7 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
     tracker.begin(3)
     figures = figures_of(best, surface, goal)
     out.mkdir(parents=True, exist_ok=True)
-    page = _page(tables, target_object, best, surface, audience, figures)
+    page = _page(tables, len(places), target_object, best, surface, audience, figures)
     write_atomically(out / MACHINE, (json.dumps(figures, indent=2, allow_nan=False) + "\n").encode())
     write_atomically(out / HTML, render(page).encode())
     tracker.end()
@@ -86,6 +87,7 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
 
 def _page(
     tables: PlanTables,
+    places: int,
     target_object: TargetObject,
     best: PlacementPlan,
     surface: Surface,
@@ -103,7 +105,7 @@ def _page(
         )
     return Page(
         title=f"Plan for {Path(tables.object.mesh).stem}",
-        summary=f"{len(placements)} projectors in {len(tables.mounting_points())} places; {best.tried} sets compared. "
+        summary=f"{len(placements)} projectors in {places} places; {best.tried} sets compared. "
         "Predicted from data sheets: vignetting, lamp age and paint are not included.",
         goals=tuple(_goals(figures, goal)),
         rows=(),
