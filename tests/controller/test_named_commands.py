@@ -57,9 +57,9 @@ def root() -> Any:
 
 
 def test_every_named_command_exists(root: Any) -> None:
-    seen = [where for where, text in texts() if NAMED.search(text)]
-    assert len(seen) > 20, "the search itself must work"
-    assert [f"{where}: {problem}" for where, text in texts() for problem in wrong(text, root)] == []
+    named = [(where, text) for where, text in texts() if NAMED.search(text)]
+    assert len(named) > 20, "the search itself must work"
+    assert [f"{where}: {problem}" for where, text in named for problem in wrong(text, root)] == []
 
 
 @pytest.mark.parametrize(

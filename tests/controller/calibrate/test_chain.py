@@ -24,12 +24,12 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, VelaturaError
 from controller.transport import LightTransport, build_transport
 from tests.controller.calibrate.geometry.test_self_calibration import CAMERA, PROJECTOR, fitted, make_stage
+from tests.controller.calibrate.geometry.test_self_calibration import Stage as TrueStage
 from tests.controller.calibrate.simulator import Scene, Stage, positions
 
 pytestmark = pytest.mark.slow
 
 PLAN = plan_patterns(PROJECTOR)
-TRUTH = make_stage(11, noise_px=0.0, outliers=0.0)
 LINEAR = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
 NAMES = ("left", "right", "above")
 SMALL = Scene((132, 100), (64, 48), 1.9, 3.0, seed=3)
@@ -37,10 +37,15 @@ REACH_PX = 8
 SMALL_NAMES = [pattern.name for pattern in plan_patterns(SMALL.projector_px)]
 
 
+@functools.cache
+def truth() -> TrueStage:
+    return make_stage(11, noise_px=0.0, outliers=0.0)
+
+
 def photograph(n: int, light: FloatImage, seed: int) -> FloatImage:
-    """What the camera of ``TRUTH`` sees of projector ``n`` showing linear light: square pixels, blurred, and paint."""
+    """What the camera of ``truth`` sees of projector ``n`` showing linear light: square pixels, blurred, and paint."""
     large = cv2.GaussianBlur(cv2.resize(light, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST), (0, 0), 1.6)
-    at = np.nan_to_num(4 * (TRUTH.correspondences[n].projector_px + 0.5) - 0.5, nan=-99.0)
+    at = np.nan_to_num(4 * (truth().correspondences[n].projector_px + 0.5) - 0.5, nan=-99.0)
     seen = cv2.remap(large, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     y, x = np.mgrid[0 : CAMERA[1], 0 : CAMERA[0]]
     paint = 0.6 + 0.2 * (np.sin(x / 17) * np.cos(y / 19))[..., None]
@@ -80,7 +85,7 @@ def calibrated(order: Sequence[int], dead: int | None = None) -> Calibrated:
 
 
 def solved(found: Sequence[Correspondence]) -> Reconstruction:
-    prior = CameraPrior(TRUTH.focal_px, 0.01, distance_m=1.3)
+    prior = CameraPrior(truth().focal_px, 0.01, distance_m=1.3)
     return reconstruct(found, CAMERA, [PROJECTOR] * len(found), prior)
 
 
@@ -97,8 +102,8 @@ def geometry(whole: Calibrated) -> Reconstruction:
 def test_photographs_become_a_shape_and_a_transport_that_predicts(whole: Calibrated, geometry: Reconstruction) -> None:
     points = geometry.geometry.points_m.astype(np.float64)
     known = np.isfinite(points[..., 2])
-    moved, *_ = fitted(points[known], TRUTH.points[known])
-    assert np.sqrt(np.mean(np.sum((moved - TRUTH.points[known]) ** 2, axis=1))) < 5e-4
+    moved, *_ = fitted(points[known], truth().points[known])
+    assert np.sqrt(np.mean(np.sum((moved - truth().points[known]) ** 2, axis=1))) < 5e-4
     pattern = frame(PLAN.of_kind(PatternKind.RANDOM)[0], PROJECTOR)
     for n in range(3):
         seen = photographs(n)["random-0"] - photographs(n)["black"]
