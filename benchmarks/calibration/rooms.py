@@ -9,6 +9,7 @@ measures kept ones again.
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 import threading
@@ -17,18 +18,21 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks import Row, at_least, at_most
-from controller.artefacts.grade import Trouble
+from controller.core.troubles import TroubleCode
 from controller.demo.job import demo
 from controller.demo.stage import APPEARANCES, prepare
 from controller.run.progress import Silent
-from plugins.emulated.optics.truth import BenchTruth, read_truth
+from plugins.emulated.optics.effects.levels import NO_BANDS
+from plugins.emulated.optics.truth import BenchTruth, ProjectorTruth, read_truth
 
 ROOMS: Final = "room hard"
 SEEDS: Final = "1 7 23"
 GOALS: Final = {"room": ((1.2, 6.0), (0.9, 5.0)), "hard": (None, (2.0, 8.0))}
 """CIEDE2000, median and 95 %, without and with one photograph."""
-Named = tuple[str, str | None]
-"""A part of the sentence that names a trouble, and the projector that has it."""
+Named = tuple[TroubleCode, str | None]
+"""A trouble, and the projector that has it."""
+BENT_PX: Final = 0.5
+"""A lens that displaces no corner of the picture by more counts as straight."""
 
 
 def measure(size: str) -> list[Row]:
@@ -77,11 +81,10 @@ def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> 
     """Every trouble counts once for each projector that has it; the worst demo counts."""
     named, false = [], []
     for truth, figures in found:
-        told = [Trouble(**one) for one in figures["troubles"]]
-        said = {one for one in _possible(truth) if any(one[0] in t.sentence and one[1] == t.projector for t in told)}
+        said = {(TroubleCode(one["code"]), one["projector"]) for one in figures["troubles"]}
         there = {one for one, level in _possible(truth).items() if level}
-        named.append((len(said & there), len(there), sorted(f"{text} ({whose})" for text, whose in there - said)))
-        false.append((len(said - there), sorted(f"{text} ({whose})" for text, whose in said - there)))
+        named.append((len(said & there), len(there), sorted(f"{code} ({whose})" for code, whose in there - said)))
+        false.append((len(said - there), sorted(f"{code} ({whose})" for code, whose in said - there)))
     worst = min(named, key=lambda one: one[0] - one[1])
     wrong = max(false)
     missing = "; ".join(worst[2]) or "nothing missing"
@@ -95,22 +98,33 @@ def _possible(truth: BenchTruth) -> dict[Named, float]:
     """All troubles that may be told, with their levels; 0 where there is none."""
     sensor = truth.camera.sensor
     found: dict[Named, float] = {
-        ("glare in the camera's lens", None): truth.camera.glare,
-        ("exposure times differ", None): sensor.shutter_spread,
-        ("pixels are hot", None): sensor.hot_pixels,
-        ("the response of its pixels differs", None): sensor.response_spread,
-        ("The object is glossy", None): truth.object.gloss,
+        (TroubleCode.CAMERA_GLARE, None): truth.camera.glare,
+        (TroubleCode.EXPOSURE_TIMES, None): sensor.shutter_spread,
+        (TroubleCode.HOT_PIXELS, None): sensor.hot_pixels,
+        (TroubleCode.PIXEL_RESPONSE, None): sensor.response_spread,
+        (TroubleCode.GLOSS, None): truth.object.gloss,
+        (TroubleCode.SURFACE_SPREAD, None): truth.object.subsurface.share,
     }
     for one in truth.projectors:
         shifts = [abs(px) for shift in one.panels.shift_px for px in shift]
         found |= {
-            ("is not steady", one.name): one.lamp.flicker,
-            ("do not lie on each other", one.name): max(shifts),
-            ("lie apart towards the edges", one.name): max(abs(size) for size in one.panels.magnified),
-            ("adds white light of its own", one.name): one.light.white_segment,
-            ("as a veil over its whole picture", one.name): one.light.glare,
+            (TroubleCode.UNSTEADY_LAMP, one.name): one.lamp.flicker,
+            (TroubleCode.PANEL_ALIGNMENT, one.name): max(shifts),
+            (TroubleCode.COLOUR_FRINGES, one.name): max(abs(size) for size in one.panels.magnified),
+            (TroubleCode.WHITE_SEGMENT, one.name): one.light.white_segment,
+            (TroubleCode.PROJECTOR_GLARE, one.name): one.light.glare,
+            (TroubleCode.PAINT_COLOURS, one.name): float(one.light.bands_nm != NO_BANDS),
+            (TroubleCode.LENS_DISTORTION, one.name): float(_bend_px(one) >= BENT_PX),
         }
     return found
+
+
+def _bend_px(projector: ProjectorTruth) -> float:
+    """By which its lens displaces the corner that it displaces most."""
+    lens = projector.lens
+    (width, height), (x, y) = lens.size_px, lens.centre_px
+    away = math.hypot(max(x, width - x), max(y, height - y)) / lens.focal_px
+    return abs(lens.distortion[0]) * away**3 * lens.focal_px
 
 
 __all__: Sequence[str] = ("measure",)

@@ -149,21 +149,26 @@ def _calibrated(
             what=f"No pixel of projector {name} was found on the object.",
             remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
-    fitted = fit_pixels(captures.pictures, plan, correspondence, colours)
+    fitted = fit_pixels(captures.pictures, plan, correspondence, colours, white)
     white = np.nan_to_num(white, copy=False)
+    plain = ProjectorCalibration(
+        name, fitted.metapixels, radiometry, white, fitted.phase_map, spread=fitted.spread
+    )  # fmt: skip
     if not indirect:
-        return ProjectorCalibration(name, fitted.metapixels, radiometry, white, fitted.phase_map), fitted.mosaic
+        return plain, fitted.mosaic
     encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
     white = np.nan_to_num(seen.white)
     for _ in range(PASSES):
         linearity = shown_contrast(radiometry, encoded_with)
-        share = indirect_share(seen, white, correspondence.projector_px, linearity=linearity)
+        share = indirect_share(
+            seen, white, correspondence.projector_px, linearity=linearity, spread=fitted.spread
+        )  # fmt: skip
         known = KnownIndirect(share * white, radiometry)
         radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
     thrown = share * white
     stripes = dark_light(captures.pictures, plan, fitted.phase_map.projector_px)
-    part = ProjectorCalibration(name, fitted.metapixels, radiometry, white - thrown, fitted.phase_map, thrown, stripes)
+    part = replace(plain, radiometry=radiometry, white=white - thrown, indirect=thrown, stripes=stripes)
     return part, fitted.mosaic
 
 

@@ -79,7 +79,8 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
             white, indirect = _parted(white, found[number].share, folder)
             stripes = found[number].stripes
         metapixels = read_metapixels(folder, name)
-        parts.append(ProjectorCalibration(name, metapixels, radiometry, white, phase_map, indirect, stripes))
+        spread = None if phase_map is None else Pixels.read(folder, name).surface_spread
+        parts.append(ProjectorCalibration(name, metapixels, radiometry, white, phase_map, indirect, stripes, spread))
     black = np.nan_to_num(light.black, copy=False)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)

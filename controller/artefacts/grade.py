@@ -14,6 +14,7 @@ import numpy.typing as npt
 from controller.artefacts.names import json_path, read_json, write_json
 from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
+from controller.core.troubles import Trouble
 from controller.run.step_id import StepId
 
 PICTURE: Final = "verification.png"
@@ -116,14 +117,6 @@ def passes(run: Path, worst_grade: float) -> bool:
     """Whether a run's calibration may be used: good enough, accepted by a person, or not graded yet."""
     worst = worst_of(run)
     return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()
-
-
-@dataclass(frozen=True, slots=True)
-class Trouble:
-    """``sentence``: what it is, and what to do; ``projector``: whose, None for camera, object or several."""
-
-    sentence: str
-    projector: str | None = None
 
 
 def write_troubles(run: Path, step: StepId, found: Iterable[Trouble]) -> Path:

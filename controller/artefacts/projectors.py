@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from controller.artefacts.kinds import StepKind
 from controller.artefacts.names import json_path, npz_path, read_json, write_json
-from controller.calibrate.values import Correspondence, Metapixels, PhaseMap, Radiometry
+from controller.calibrate.values import Correspondence, Metapixels, PhaseMap, Radiometry, SurfaceSpread
 from controller.core.arrays import Float64, FloatImage, Mask, load_arrays, save_arrays
 
 
@@ -65,6 +65,7 @@ class Pixels:
     ``shown_px``, ``spread_px2``: see ``PhaseMap``; None in runs from before there was one
     ``mosaic`` (2, 2) int: see ``Calibration``; of size 0 where each camera pixel has its own three colours
     ``colours_px`` (3, 2): see ``PhaseMap``; None where the colours lie on each other
+    ``spread`` (3,): share, camera and projector pixels of ``SurfaceSpread``; None where none was seen
     """
 
     projector_px: FloatImage
@@ -77,6 +78,7 @@ class Pixels:
     spread_px2: FloatImage | None
     mosaic: npt.NDArray[np.int64] | None
     colours_px: Float64 | None = None
+    spread: Float64 | None = None
 
     @property
     def correspondence(self) -> Correspondence:
@@ -97,6 +99,10 @@ class Pixels:
         """The camera's mosaic, None if it is unknown or there is none."""
         return self.mosaic if self.mosaic is not None and self.mosaic.size else None
 
+    @property
+    def surface_spread(self) -> SurfaceSpread | None:
+        return None if self.spread is None else SurfaceSpread(*(float(number) for number in self.spread))
+
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The existing ones, by name."""
         return {name: array for name in _names(Pixels) if (array := getattr(self, name)) is not None}
@@ -115,7 +121,7 @@ class Pixels:
         return cls(**{name: arrays[name] for name in _names(cls) if name not in later}, **later)
 
 
-_LATER = ("shown_px", "spread_px2", "mosaic", "colours_px")
+_LATER = ("shown_px", "spread_px2", "mosaic", "colours_px", "spread")
 """Arrays that older runs do not have, or aligned projectors."""
 
 

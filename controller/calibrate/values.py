@@ -96,6 +96,18 @@ class Radiometry:
 
 
 @dataclass(frozen=True, slots=True)
+class SurfaceSpread:
+    """Light that enters a surface and leaves it beside (``calibrate.photometry.surface_spread``).
+
+    ``share`` of the light that falls on it, 0 to 1; it diffuses by the distance d, ``camera_px`` or ``projector_px``
+    """
+
+    share: float
+    camera_px: float
+    projector_px: float
+
+
+@dataclass(frozen=True, slots=True)
 class ProjectorCalibration:
     """All that the transport needs of one projector.
 
@@ -105,6 +117,7 @@ class ProjectorCalibration:
     ``indirect`` like ``white``: what reached the camera by way of other surfaces, and is not in ``white``; None where
     there is none to speak of
     ``stripes`` (patterns, blocks, 3): of ``transport.indirect_stripes.dark_light``; None where not measured
+    ``spread``: of light under the surface; None where none was seen
     """
 
     name: str
@@ -114,6 +127,7 @@ class ProjectorCalibration:
     phase_map: PhaseMap | None = None
     indirect: FloatImage | None = None
     stripes: FloatImage | None = None
+    spread: SurfaceSpread | None = None
 
 
 @dataclass(frozen=True, slots=True)

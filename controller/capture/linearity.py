@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from controller.capture.demosaic import SensorLevels
 from controller.core.arrays import Float64, Mask
+from controller.core.troubles import TroubleCode
 
 WELL_LIT = (0.2, 0.7)
 """Shares of full scale between which a ratio of exposures is taken: above noise, below every limit."""
@@ -33,6 +34,10 @@ NAMED_SPREAD = 0.003
 """Standard deviation of the pixels' response, relative, from which it is named; even sensors have 0.001 at most."""
 NAMED_HOT = 5e-5
 """Share of all samples: a sound sensor has fewer hot ones."""
+_KNOWN = (
+    "Calibration takes that into account; nothing has to be done. If it grows from one calibration to the next, let "
+    "the camera cool down, or replace it."
+)
 WORST_BLACK_STEPS = 64.0
 """A black level farther from the file's value than this is not the camera's; the light changed in between."""
 
@@ -153,25 +158,22 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
     return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
 
 
-def camera_faults(exposures: Float64, hot: int, samples: int, spread: float = 0.0) -> str | None:
-    """What a technician should know of ``true_exposures``, of ``hot`` of all samples, and of ``response_spread``.
-
-    None if there is nothing.
-    """
-    parts = []
+def camera_faults(exposures: Float64, hot: int, samples: int, spread: float = 0.0) -> Mapping[TroubleCode, str]:
+    """What a technician should know of ``true_exposures``, of ``hot`` of all samples, and of ``response_spread``."""
+    found = {}
     if len(exposures):
         off = float(np.ptp(np.log(exposures[:, 1] / exposures[:, 0])))
-        parts.append(f"its exposure times differ from what it reports, by {100 * off:.1f} % between two of them")
+        found[TroubleCode.EXPOSURE_TIMES] = (
+            "Exposure times of the camera differ from what it reports, "
+            f"by {100 * off:.1f} % between two of them. {_KNOWN}"
+        )
     if hot > NAMED_HOT * samples:
-        parts.append(f"{hot} of its pixels are hot")
+        found[TroubleCode.HOT_PIXELS] = f"{hot} pixels of the camera are hot. {_KNOWN}"
     if spread > NAMED_SPREAD:
-        parts.append(f"the response of its pixels differs by {100 * spread:.1f} % (standard deviation)")
-    if not parts:
-        return None
-    return (
-        f"The camera has faults that calibration takes into account: {', and '.join(parts)}. Nothing has to be done. "
-        "If they grow from one calibration to the next, let the camera cool down, or replace it."
-    )
+        found[TroubleCode.PIXEL_RESPONSE] = (
+            f"The response of the camera's pixels differs by {100 * spread:.1f} % (standard deviation). {_KNOWN}"
+        )
+    return found
 
 
 def _limits(shorter: RawExposure, longer: RawExposure, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from controller.artefacts.grade import Trouble, write_troubles
+from controller.artefacts.grade import write_troubles
+from controller.core.troubles import Trouble, TroubleCode
 from controller.run.progress import Level
 from controller.run.runner import Context
 from controller.run.step_id import StepId
 
 
-def tell(context: Context, step: StepId, sentences: Sequence[str | None]) -> Path:
+def tell(context: Context, step: StepId, sentences: Mapping[TroubleCode, str | None]) -> Path:
     """Say what was found of the step's projector, if it has one, as warnings; None is nothing.
 
     Returns the file that keeps it, an artefact of the step.
     """
-    return tell_all(context, step, [Trouble(one, step.projector) for one in sentences if one is not None])
+    found = [Trouble(text, step.projector, code) for code, text in sentences.items() if text is not None]
+    return tell_all(context, step, found)
 
 
 def tell_all(context: Context, step: StepId, found: Sequence[Trouble]) -> Path:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
-from controller.transport.indirect import down
+from controller.transport.surfaces.blocks import down
 
 ACROSS: Final = 3
 """Patches along the side of a block; four are no better, and take three times as long."""

@@ -5,21 +5,22 @@ from. So G acts on the direct camera image d = L p: (G d)(x) = S(x) up(F down(d)
 other light by F; S is what a camera pixel makes of the light that falls on it, and holds the paint
 (docs/decisions/0045).
 
-Where colours depend on the paint, what L says of them is corrected first: G = D + S up F down (I + D), with D a matrix
-of each camera pixel's three channels (docs/decisions/0099).
+Where colours depend on the paint, what L says of them is corrected first, by D, a matrix of each camera pixel's three
+channels (docs/decisions/0099). Then N spreads it under the surface (docs/decisions/0107): with
+y = (I + N)(I + D) d, the camera sees y + S up F down y.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask
+from controller.transport.surfaces.blocks import down, down_adjoint, up, up_adjoint
+from controller.transport.surfaces.surface_light import SurfaceLight
 
 ROUNDS: Final = 30
 ROWS_AT_ONCE: Final = 128
@@ -44,6 +45,7 @@ class IndirectLight:
     ``grid``: (rows, columns) of the blocks; ``side``: camera pixels along a block
     ``room`` like ``factors``: of light on surfaces that are none of the object; None: as of the object
     ``paint`` (3, 3, rows, columns): D, what is added to a camera channel (first axis) of each of them; None: nothing
+    ``surface``: N; None where light leaves where it falls
     """
 
     factors: FloatImage
@@ -53,20 +55,23 @@ class IndirectLight:
     side: int
     room: FloatImage | None = None
     paint: Colours | None = None
+    surface: SurfaceLight | None = None
 
     def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """G d: (rows, columns, 3) light of a direct camera image of that shape, as L says, that is not in it.
 
         ``beside`` like ``direct``: light on surfaces of the room, which the transport does not know
         """
-        if self.paint is None:
+        if self.paint is None and self.surface is None:
             return self.scale * self.falling(direct, beside)
-        more = _times(self.paint, direct)
-        return self.scale * self.falling(direct + more, beside) + more
+        painted, spread = self._own(direct)
+        own = painted + spread
+        return self.scale * self.falling(own, beside) + (own - direct)
 
-    def _of_surfaces(self, direct: FloatImage) -> FloatImage:
+    def _own(self, direct: FloatImage) -> tuple[FloatImage, FloatImage | np.float32]:
+        """(I + D) d, and N of it."""
         painted = direct if self.paint is None else direct + _times(self.paint, direct)
-        return self.scale * self.falling(painted)
+        return painted, np.float32(0) if self.surface is None else self.surface.forward(painted)
 
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
@@ -78,8 +83,10 @@ class IndirectLight:
     def adjoint(self, image: FloatImage) -> FloatImage:
         """G' r of a camera image (rows, columns, 3)."""
         blocks = self.factors.T @ up_adjoint(self.scale * image, self.grid, self.side)
-        direct = down_adjoint(blocks, self.grid, self.side, self.lit.shape)
-        return direct if self.paint is None else direct + _times(self.paint.swapaxes(0, 1), direct + image)
+        found = down_adjoint(blocks, self.grid, self.side, self.lit.shape)
+        if self.surface is not None:
+            found = found + self.surface.adjoint(found + image)
+        return found if self.paint is None else found + _times(self.paint.swapaxes(0, 1), found + image)
 
     def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage:
         """The direct light d on lit pixels with d + G d = ``total`` (rows, columns, 3) there; 0 elsewhere.
@@ -93,7 +100,8 @@ class IndirectLight:
         direct = wanted if unpainted is None else wanted + _times(unpainted, wanted)
         size = max(float(np.abs(wanted).max(initial=0)), 1e-30)
         for _ in range(ROUNDS):
-            after = np.where(lit, wanted - self._of_surfaces(displayable(direct, reach)), 0)
+            painted, spread = self._own(displayable(direct, reach))
+            after = np.where(lit, wanted - self.scale * self.falling(painted + spread) - spread, 0)
             after = after if unpainted is None else after + _times(unpainted, after)
             change = float(np.abs(after - direct).max(initial=0))
             direct = after.astype(np.float32, copy=False)
@@ -105,7 +113,8 @@ class IndirectLight:
         """All that the products depend on, by name."""
         shape = np.array([*self.grid, self.side])
         paint = {} if self.paint is None else {"paint": self.paint}
-        return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape} | paint
+        surface = {} if self.surface is None else self.surface.arrays()
+        return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape} | paint | surface
 
 
 def _times(matrices: Colours, image: FloatImage) -> FloatImage:
@@ -133,51 +142,3 @@ def _inverse(deviation: Colours) -> Colours:
 def displayable(direct: FloatImage, reach: FloatImage | None = None) -> FloatImage:
     """What can be shown of a direct image: no less than none, and no more than ``reach``."""
     return np.maximum(direct, 0) if reach is None else np.clip(direct, 0, reach)
-
-
-def down(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
-    """(blocks, 3): mean of each block of ``side`` x ``side`` pixels; what lies beyond the picture is 0."""
-    first = np.add.reduceat(image, np.arange(0, image.shape[0], side), axis=0)
-    sums = np.add.reduceat(first, np.arange(0, image.shape[1], side), axis=1)
-    return np.asarray(sums.reshape(grid[0] * grid[1], -1) / np.float32(side * side), np.float32)
-
-
-def down_adjoint(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
-    """The transpose of ``down``: (rows, columns, 3)."""
-    whole = np.repeat(np.repeat(blocks.reshape(*grid, -1), side, axis=0), side, axis=1)
-    return np.asarray(whole[: shape[0], : shape[1]] / np.float32(side * side), np.float32)
-
-
-def up(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:
-    """(rows, columns, 3): values of blocks, interpolated between their middles."""
-    # OpenCV's linear enlargement is that of ``_between``, and takes a tenth of the time of its products.
-    size_px = (grid[1] * side, grid[0] * side)
-    whole = cv2.resize(np.ascontiguousarray(blocks.reshape(*grid, -1)), size_px, interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(whole[: shape[0], : shape[1]], np.float32).reshape(*shape[:2], -1)
-
-
-def down_up(grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> Callable[[FloatImage], FloatImage]:
-    """down(up(blocks)), without the picture of ``shape`` between them; blocks (blocks, 3)."""
-    rows, columns = (
-        np.add.reduceat(_between(shape[n], grid[n], side), np.arange(0, shape[n], side), axis=0) / np.float32(side)
-        for n in (0, 1)
-    )
-
-    def across(blocks: FloatImage) -> FloatImage:
-        planes = np.moveaxis(blocks.reshape(*grid, -1), 2, 0)
-        return np.asarray(np.moveaxis(rows @ planes @ columns.T, 0, 2).reshape(len(blocks), -1), np.float32)
-
-    return across
-
-
-def up_adjoint(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
-    """The transpose of ``up``: (blocks, 3)."""
-    down_, across = _between(image.shape[0], grid[0], side), _between(image.shape[1], grid[1], side)
-    parts = [down_.T @ image[..., c] @ across for c in range(image.shape[2])]
-    return np.asarray(np.stack(parts, axis=2).reshape(grid[0] * grid[1], -1), np.float32)
-
-
-def _between(pixels: int, blocks: int, side: int) -> FloatImage:
-    """(pixels, blocks): linear interpolation, constant beyond the outermost middles."""
-    at = np.clip((np.arange(pixels) - (side - 1) / 2) / side, 0, blocks - 1)
-    return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(blocks)), 0), np.float32)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import cv2
 import numpy as np
 
+from controller.calibrate.photometry.surface_spread import typical_spread
 from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import FloatImage, Mask
 from controller.transport.form_factors import form_factors
-from controller.transport.indirect import Colours, IndirectLight, down, up
+from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_shape import shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
 from controller.transport.indirect_weights import BlockLight, Part, Term, block_light, fit_weights
-from controller.transport.paint_colours import paint_colours
+from controller.transport.surfaces.blocks import down, up
+from controller.transport.surfaces.paint_colours import paint_colours
+from controller.transport.surfaces.surface_light import SurfaceLight
 
 NEAR_BLOCKS: Final = (1.0, 3.0)
 """Standard deviations of near light, in blocks: what spreads under the surface, or between neighbours."""
@@ -26,7 +30,7 @@ FAINTEST: Final = 1e-4
 def fit_indirect(
     calibration: Calibration, lit: Mask, points_m: FloatImage | None, normals: FloatImage | None
 ) -> IndirectLight | None:
-    """G of a stage; None where no indirect light was measured, and no colour depends on the paint.
+    """G of a stage; None where none was measured, no colour depends on the paint, and none spreads under the surface.
 
     Parameters
     ----------
@@ -36,9 +40,9 @@ def fit_indirect(
     points_m, normals : (rows, columns, 3) of the surface in the camera's frame, NaN where unknown; None: not known
     """
     indirect = [part.indirect for part in calibration.projectors if part.indirect is not None]
-    paint = paint_colours(calibration, lit)
+    paint, surface = paint_colours(calibration, lit), _surface(calibration, lit)
     if len(indirect) < len(calibration.projectors) or not indirect:
-        return None if paint is None else _of_paint_alone(paint, lit)
+        return None if paint is None and surface is None else replace(_nothing(lit), paint=paint, surface=surface)
     shape = calibration.black.shape
     grid, side = blocks_of(shape)
     kinds = [_even(grid), *(_near(grid, deviation) for deviation in NEAR_BLOCKS)]
@@ -64,13 +68,20 @@ def fit_indirect(
     falling = up(np.asarray(arriving, np.float32), grid, side, shape)
     faint = FAINTEST * falling.max(initial=0)
     scale = np.divide(whole, falling, out=np.zeros_like(whole), where=falling > faint)
-    return IndirectLight(own, scale.astype(np.float32), lit, grid, side, room, paint)
+    return IndirectLight(own, scale.astype(np.float32), lit, grid, side, room, paint, surface)
 
 
-def _of_paint_alone(paint: Colours, lit: Mask) -> IndirectLight:
+def _nothing(lit: Mask) -> IndirectLight:
     """G where no surface lights another."""
     nothing = np.zeros((1, 1), np.float32)
-    return IndirectLight(nothing, np.zeros((*lit.shape, 3), np.float32), lit, (1, 1), max(lit.shape), paint=paint)
+    return IndirectLight(nothing, np.zeros((*lit.shape, 3), np.float32), lit, (1, 1), max(lit.shape))
+
+
+def _surface(calibration: Calibration, lit: Mask) -> SurfaceLight | None:
+    spread = typical_spread([part.spread for part in calibration.projectors])
+    if spread is None:
+        return None
+    return SurfaceLight.of(spread, np.sum([part.white for part in calibration.projectors], axis=0), lit)
 
 
 def _striped(

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage
-from controller.transport.indirect import down_up
 from controller.transport.indirect_weights import FAINTEST, BlockLight, measured_part
+from controller.transport.surfaces.blocks import down_up
 
 UNSURE: Final = 1.0
 """Standard deviation of a factor: how much of a source's light arrives, over what the terms say."""

@@ -16,7 +16,7 @@ from controller.capture.pattern_frames import frame
 from controller.capture.patterns import Pattern, PatternPlan
 from controller.core.arrays import FloatImage, Mask
 from controller.core.channels import finite
-from controller.transport.indirect import down
+from controller.transport.surfaces.blocks import down
 
 BLOCKS: Final = 1200
 """About so many in the whole picture."""

@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.transport.indirect import down, down_up
+from controller.transport.surfaces.blocks import down, down_up
 
 Part = Literal["all", "object", "room"]
 LEAST_DARK: Final = 0.3

@@ -3,7 +3,8 @@
 A sinusoid of f cycles per projector pixel, blurred by a Gaussian of covariance S, keeps the modulation
 M = (1 - i) exp(-2 pi^2 f' S f), with the share i of light that reaches the camera by way of other surfaces and has no
 modulation. So M is taken relative to that of the coarse phase patterns, which lose the same share and hardly any more.
-Three directions give the three numbers of S. The pixel's own square is part of S.
+Three directions give the three numbers of S. The pixel's own square is part of S. What spreads under the surface is
+not: the contrast that it takes is given back first (``photometry.surface_spread``).
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, grey
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.inverse_map import cells_of
-from controller.calibrate.values import Correspondence
+from controller.calibrate.photometry.surface_spread import contrast_left
+from controller.calibrate.values import Correspondence, SurfaceSpread
 from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PatternPlan
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
@@ -30,7 +32,11 @@ MOST_VARIANCE_PX2 = 16.0
 
 
 def measure_blur(
-    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+    captures: Captures,
+    plan: PatternPlan,
+    correspondence: Correspondence,
+    colours: ColourPlaces | None = None,
+    spread: SurfaceSpread | None = None,
 ) -> tuple[FloatImage, Mask]:
     """Blur covariance S of each projector pixel.
 
@@ -39,6 +45,7 @@ def measure_blur(
     captures : needs ``black``, ``phase-*`` and ``blur-*``, ``completed``; linear, in one unit
     correspondence : of the same projector
     colours : where the projector's colours lie apart; S is then the blur of one colour
+    spread : how light spreads under the surface, where it does
 
     Returns
     -------
@@ -51,7 +58,8 @@ def measure_blur(
 
     def contrast(prefix: str, frequency: tuple[float, float]) -> FloatImage:
         left = np.empty((0, 0), np.float32) if colours is None else colours.contrast(frequency)
-        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
+        found = _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
+        return found / np.float32(contrast_left(spread, float(np.hypot(*frequency))))
 
     fine = np.stack([contrast(f"blur-{name}", frequency) for name, frequency in BLUR_FREQUENCIES.items()])
     coarse_x, coarse_y = contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))

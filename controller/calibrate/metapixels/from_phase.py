@@ -16,7 +16,8 @@ from controller.calibrate.correspondence.inverse_map import invert_map
 from controller.calibrate.correspondence.phase_map import make_phase_map
 from controller.calibrate.metapixels.blur import measure_blur
 from controller.calibrate.metapixels.footprints import measure_footprints
-from controller.calibrate.values import Correspondence, Metapixels, PhaseMap
+from controller.calibrate.photometry.surface_spread import measure_spread
+from controller.calibrate.values import Correspondence, Metapixels, PhaseMap, SurfaceSpread
 from controller.capture.patterns import PatternPlan
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
@@ -40,22 +41,35 @@ class FittedPixels:
     """One projector's metapixels, and its phase map for the light transport.
 
     ``mosaic`` (2, 2): the colours of the camera's samples, as ``Calibration.mosaic``; None where they are not known
+    ``spread``: of light under the surface; None where none was seen
     """
 
     metapixels: Metapixels
     phase_map: PhaseMap
     mosaic: npt.NDArray[np.int64] | None
+    spread: SurfaceSpread | None = None
 
 
 def fit_pixels(
-    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+    captures: Captures,
+    plan: PatternPlan,
+    correspondence: Correspondence,
+    colours: ColourPlaces | None = None,
+    white: FloatImage | None = None,
 ) -> FittedPixels:
     """Metapixels and phase map from the same measurements; parameters and errors as ``fit_metapixels``.
 
     ``colours``: what ``decode`` was given; metapixels are then green's, and the phase map says where the others lie
+    ``white`` (rows, columns, 3) less the black image: with it, light that spreads under the surface is found
     """
     inverse = invert_map(correspondence, plan.size_px)
     blur, blur_valid = measure_blur(captures, plan, correspondence, colours)
+    spread = None
+    if white is not None:
+        variance = float(np.nanmedian(blur[blur_valid][:, [0, 2]])) if blur_valid.any() else 0.0
+        spread = measure_spread(captures, plan, correspondence.projector_px, white, blur_px=variance**0.5)
+    if spread is not None:
+        blur, blur_valid = measure_blur(captures, plan, correspondence, colours, spread)
     valid = inverse.valid & blur_valid
     flat = carry_covariance(inverse.jacobian, blur)
     centre, covariance = measure_footprints(correspondence, inverse, blur, flat, valid)
@@ -75,7 +89,7 @@ def fit_pixels(
     )
     if colours is not None:
         phase_map = dataclasses.replace(phase_map, colours_px=colours.shifts_px)
-    return FittedPixels(metapixels, phase_map, mosaic)
+    return FittedPixels(metapixels, phase_map, mosaic, spread)
 
 
 def _white(captures: Captures, plan: PatternPlan) -> FloatImage:

@@ -118,8 +118,20 @@ def measure_radiometry(
     return Radiometry(fit.response, fit.mixing, fit.segment, paint), report
 
 
-def white_segment(name: str, share: float) -> str:
-    """What a technician should know of a projector with a white segment."""
+def painted(name: str, change: float) -> str | None:
+    """What a technician should know of ``RadiometryReport.paint``; None where one mixing holds for all paints."""
+    if not change:
+        return None
+    return (
+        f"Colours of projector {name} depend on the paint that they fall on, by {100 * change:.1f} % of white (colour "
+        "tiles, standard deviation). Velatura calculates with it. Nothing has to be done."
+    )
+
+
+def white_segment(name: str, share: float) -> str | None:
+    """What a technician should know of a projector with a white segment; None without one."""
+    if not share:
+        return None
     return (
         f"Projector {name} adds white light of its own: {100 * share:.0f} % of its white is not the sum of red, green "
         f"and blue. {REMEDY} If it can't be switched off, Velatura calculates with it; bright colours are then darker."

@@ -19,8 +19,9 @@ from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.decode import FINE_TO_COARSE
 from controller.calibrate.correspondence.opposites import step_variance
 from controller.calibrate.photometry.averaged_white import WhiteSums
-from controller.calibrate.values import Radiometry
-from controller.capture.patterns import PHASE_STEPS, Pattern, PatternPlan
+from controller.calibrate.photometry.surface_spread import contrast_left
+from controller.calibrate.values import Radiometry, SurfaceSpread
+from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PHASE_STEPS, Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
@@ -29,6 +30,7 @@ from controller.core.jit import compiled
 
 COARSE: Final = ("phase-x", "phase-y")
 FINE: Final = ("blur-x", "blur-y")
+FINE_FREQUENCY: Final = BLUR_FREQUENCIES["x"][0]
 FAINTEST: Final = 1e-3
 """Of the 99th percentile of white: below it nothing is said from the pixel itself."""
 LEAST_FINE_CONTRAST: Final = 0.003
@@ -103,7 +105,12 @@ def sinusoid_contrast(
 
 
 def indirect_share(
-    seen: SinusoidContrast, white: FloatImage, position_px: FloatImage, *, linearity: Float64 | None = None
+    seen: SinusoidContrast,
+    white: FloatImage,
+    position_px: FloatImage,
+    *,
+    linearity: Float64 | None = None,
+    spread: SurfaceSpread | None = None,
 ) -> FloatImage:
     """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1.
 
@@ -112,11 +119,13 @@ def indirect_share(
     white : as for ``sinusoid_contrast``
     position_px : (rows, columns, 2) where the camera pixels look in the projector's image, NaN where not known
     linearity : (3,) contrast that sinusoids truly had, see ``shown_contrast``; 1 if omitted
+    spread : of light under the surface, which is none of the share
     """
     full = np.ones(3) if linearity is None else linearity
+    coarse_left, fine_left = (contrast_left(spread, frequency) for frequency in (1 / PERIOD_PX, FINE_FREQUENCY))
     with np.errstate(invalid="ignore", divide="ignore"):
-        s = seen.coarse.contrast / full.astype(np.float32)
-        f = _fine_contrast(seen, float(full.mean()))
+        s = seen.coarse.contrast / (full * coarse_left).astype(np.float32)
+        f = _fine_contrast(seen, float(full.mean()) * fine_left)
         share = 1 - np.exp((np.log(np.maximum(s, 1e-6)) - FINE_TO_COARSE * np.log(f)) / (1 - FINE_TO_COARSE))
     sigma = np.hypot(seen.coarse.sigma, FLOOR).astype(np.float32)
     known = channels.finite(share) & (channels.largest(sigma) < WORST_SIGMA)

@@ -17,11 +17,11 @@ from typing import Any, Final
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from controller.core.digests import digest_of
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
+from controller.kiosk.store.digests import digest_of
 
 SHORTEST_PASSWORD: Final = 10
 FOLDER: Final = "kiosk/panel"

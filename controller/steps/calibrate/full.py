@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,14 @@ from controller.calibrate.correspondence.colour_alignment import colour_shifts, 
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.correspondence.opposites import completed
+from controller.calibrate.geometry.lens import bent
 from controller.calibrate.geometry.self_calibration import reconstruct
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.metapixels.from_phase import fit_pixels
-from controller.calibrate.photometry.radiometry import measure_radiometry, white_segment
+from controller.calibrate.photometry.radiometry import measure_radiometry, painted, white_segment
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.errors import CalibrationError
+from controller.core.troubles import Trouble, TroubleCode
 from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -96,7 +98,10 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         known_px=used.known_px(context.folder, projector.name),
         noise=noise_of(bracket[0]),
     )
-    segment = white_segment(projector.name, radiometry.segment) if radiometry.segment else None
+    said = {
+        TroubleCode.WHITE_SEGMENT: white_segment(projector.name, radiometry.segment),
+        TroubleCode.PAINT_COLOURS: painted(projector.name, report.paint),
+    }
     matrix = bracket[0].read().camera_to_xyz
     light = Light(
         response=radiometry.response,
@@ -108,8 +113,8 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         paint=radiometry.paint,
     )
     figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
-    said = tell(context, StepId(StepKind.RADIOMETRY, projector.name), [segment])
-    return [light.write(context.folder, projector.name), figures, said]
+    told = tell(context, StepId(StepKind.RADIOMETRY, projector.name), said)
+    return [light.write(context.folder, projector.name), figures, told]
 
 
 _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -144,8 +149,11 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         )
     context.advance(0.4, "correspondences")
     sizes = colour_sizes(captures, plan, light.white, light.mixing, correspondence.projector_px)
-    apart_said = [misaligned(projector.name, shifts), fringed(projector.name, sizes, projector.size_px)]
-    fitted = fit_pixels(captures, plan, correspondence, colours)
+    apart_said = {
+        TroubleCode.PANEL_ALIGNMENT: misaligned(projector.name, shifts),
+        TroubleCode.COLOUR_FRINGES: fringed(projector.name, sizes, projector.size_px),
+    }
+    fitted = fit_pixels(captures, plan, correspondence, colours, light.white)
     metapixels = fitted.metapixels
     pixels = Pixels(
         projector_px=correspondence.projector_px,
@@ -158,6 +166,7 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         spread_px2=fitted.phase_map.spread_px2,
         mosaic=fitted.mosaic,
         colours_px=apart_px,
+        spread=None if fitted.spread is None else np.array(astuple(fitted.spread)),
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
     apart = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
@@ -177,5 +186,9 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
         progress=lambda fraction: context.advance(fraction, "geometry"),
     )
     names = [projector.name for projector in rig.projectors]
-    said = tell_all(context, StepId(StepKind.GEOMETRY), lens_troubles(context, rig.projectors, found.geometry))
+    troubles = lens_troubles(context, rig.projectors, found.geometry)
+    for name, lens in zip(names, found.geometry.projectors, strict=True):
+        if (text := bent(name, lens)) is not None:
+            troubles.append(Trouble(text, name, TroubleCode.LENS_DISTORTION))
+    said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
     return [*write_geometry(context.folder, names, found), said]

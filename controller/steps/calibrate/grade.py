@@ -20,12 +20,14 @@ from controller.artefacts.projectors import IndirectFigures, Light
 from controller.bundle.export import png
 from controller.calibrate.photometry.glare import veiled, veiling_glare
 from controller.calibrate.photometry.gloss import gloss_strength, glossy
+from controller.calibrate.photometry.surface_spread import spreading, typical_spread
 from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
 from controller.capture.pattern_frames import device_frame, frame
 from controller.capture.patterns import Pattern
 from controller.core.arrays import ByteImage, FloatImage
+from controller.core.troubles import TroubleCode
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -101,8 +103,12 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         maps[part.name] = ErrorMaps(found.error_map, why.labels)
         pictures.append(attribution_picture(why, calibration, part.name))
     geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
-    sentences = glossy(gloss_strength(calibration, geometry)), veiled(veiling_glare(calibration, geometry))
-    said = tell(context, StepId(StepKind.VERIFY), sentences)
+    troubles = {
+        TroubleCode.GLOSS: glossy(gloss_strength(calibration, geometry)),
+        TroubleCode.CAMERA_GLARE: veiled(veiling_glare(calibration, geometry)),
+        TroubleCode.SURFACE_SPREAD: spreading(typical_spread([part.spread for part in calibration.projectors])),
+    }
+    said = tell(context, StepId(StepKind.VERIFY), troubles)
     return [*write_grade(context.folder, figures, maps, png(in_rows(pictures))), said]
 
 

@@ -24,6 +24,7 @@ from controller.calibrate.photometry.separation import (
     sinusoid_contrast,
 )
 from controller.core.arrays import FloatImage
+from controller.core.troubles import TroubleCode
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -67,7 +68,9 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
-        share = indirect_share(seen, white, pixels.projector_px, linearity=linearity)
+        share = indirect_share(
+            seen, white, pixels.projector_px, linearity=linearity, spread=pixels.surface_spread
+        )  # fmt: skip
         radiometry, _ = measure_radiometry(
             captures,
             plan,
@@ -84,7 +87,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
     unsteadiness = unsteady(name, lamp_flicker(seen.strengths))
-    said = tell(context, StepId(StepKind.INDIRECT, name), [unsteadiness])
+    said = tell(context, StepId(StepKind.INDIRECT, name), {TroubleCode.UNSTEADY_LAMP: unsteadiness})
     return [found.write(folder, name), figures.write(folder, name), said]
 
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from controller.artefacts.calibration import read_captures
-from controller.artefacts.grade import Trouble
 from controller.artefacts.pattern_plans import PlanUsed
 from controller.artefacts.photographs import Developed
 from controller.artefacts.projectors import Light, Pixels
@@ -18,6 +17,7 @@ from controller.calibrate.photometry.projector_glare import DarkPart, lens_veils
 from controller.calibrate.values import Geometry
 from controller.capture.pattern_frames import frame
 from controller.core.arrays import FloatImage
+from controller.core.troubles import Trouble, TroubleCode
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context
 from controller.transport.indirect_stripes import stride_of, stripe_parts, thinned
@@ -37,7 +37,7 @@ def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry
         parts = list(_dark_parts(context, projector, thinned(lights[n].black, stride), stride))
         glare = projector_glare(whites, n, parts, depth_m)
         if (said := lens_veils(projector.name, glare.sure)) is not None:
-            found.append(Trouble(said, projector.name))
+            found.append(Trouble(said, projector.name, TroubleCode.PROJECTOR_GLARE))
     return found
 
 

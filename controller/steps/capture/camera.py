@@ -32,6 +32,7 @@ from controller.capture.pixel_response import response_spread, some_rows
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
 from controller.core.arrays import ByteImage, FloatImage
+from controller.core.troubles import TroubleCode
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -155,7 +156,7 @@ def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
 def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Path]:
     black = BLACK.read(context.folder)
     series = [white_bracket(light_of(name).read(context.folder)) for name in projectors]
-    faults = None
+    faults: Mapping[TroubleCode, str] = {}
     if is_jpeg(black[0].path):
         profile, figures = _of_colours("jpeg", black, series)
     elif is_linear(black[0].path):
@@ -163,12 +164,12 @@ def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Pat
     else:
         profile, figures, faults = _of_raw(black, series, context)
     path = write_camera_figures(context.folder, figures)
-    return [profile.save(context.folder), path, tell(context, StepId(StepKind.CAMERA), [faults])]
+    return [profile.save(context.folder), path, tell(context, StepId(StepKind.CAMERA), faults)]
 
 
 def _of_raw(
     black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
-) -> tuple[CameraProfile, dict[str, object], str | None]:
+) -> tuple[CameraProfile, dict[str, object], Mapping[TroubleCode, str]]:
     dark = [_exposed(one) for one in black]
     levels = dark[0][0].levels
     offset = black_offset([one for _, one in dark], levels)

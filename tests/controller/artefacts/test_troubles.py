@@ -7,8 +7,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
-from controller.artefacts.grade import Trouble, read_troubles, write_troubles
+from controller.artefacts.grade import read_troubles, write_troubles
 from controller.artefacts.kinds import StepKind
+from controller.core.troubles import Trouble, TroubleCode
 from controller.run.progress import Level
 from controller.run.step_id import StepId
 from controller.steps.troubles import tell
@@ -33,18 +34,20 @@ def context(folder: Path) -> tuple[Context, Said]:
 def test_troubles_of_all_steps_are_read_back(tmp_path: Path) -> None:
     camera, left = StepId(StepKind.CAMERA), StepId(StepKind.PIXELS, "left")
     now, said = context(tmp_path)
-    paths = {tell(now, camera, ["Hot."]), tell(now, left, [None, "Bent.", "Blue."])}
+    hot, panels, fringes = TroubleCode.HOT_PIXELS, TroubleCode.PANEL_ALIGNMENT, TroubleCode.COLOUR_FRINGES
+    found = {TroubleCode.PAINT_COLOURS: None, panels: "Bent.", fringes: "Blue."}
+    paths = {tell(now, camera, {hot: "Hot."}), tell(now, left, found)}
     assert all(path.parent == tmp_path for path in paths)
     assert len(paths) == 2
     assert said.all == [("Hot.", Level.WARNING), ("Bent.", Level.WARNING), ("Blue.", Level.WARNING)]
-    wanted = [Trouble("Hot."), Trouble("Bent.", "left"), Trouble("Blue.", "left")]
+    wanted = [Trouble("Hot.", None, hot), Trouble("Bent.", "left", panels), Trouble("Blue.", "left", fringes)]
     assert read_troubles(tmp_path) == wanted
 
 
 def test_a_step_that_finds_nothing_forgets_what_it_found_before(tmp_path: Path) -> None:
     now, said = context(tmp_path)
-    path = tell(now, StepId(StepKind.CAMERA), ["Hot."])
-    assert tell(now, StepId(StepKind.CAMERA), [None]) == path
+    path = tell(now, StepId(StepKind.CAMERA), {TroubleCode.HOT_PIXELS: "Hot."})
+    assert tell(now, StepId(StepKind.CAMERA), {TroubleCode.HOT_PIXELS: None}) == path
     assert json.loads(path.read_text()) == []
     assert read_troubles(tmp_path) == []
     assert len(said.all) == 1
@@ -52,6 +55,11 @@ def test_a_step_that_finds_nothing_forgets_what_it_found_before(tmp_path: Path) 
 
 def test_runs_of_earlier_versions_have_none(tmp_path: Path) -> None:
     assert read_troubles(tmp_path) == []
+
+
+def test_what_an_earlier_version_found_has_no_code(tmp_path: Path) -> None:
+    (tmp_path / "troubles-camera.json").write_text('[{"sentence": "Hot.", "projector": null}]')
+    assert read_troubles(tmp_path) == [Trouble("Hot.")]
 
 
 def test_projectors_whose_names_differ_keep_their_own(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from controller.capture.linearity import (
     find_hot,
     true_exposures,
 )
+from controller.core.troubles import TroubleCode
 from tests.controller.capture.sensor_model import SensorModel, textured
 
 LIGHT = textured()
@@ -100,11 +101,8 @@ def test_a_limit_seen_once_too_low_does_not_count() -> None:
 
 def test_faults_of_a_camera_are_named() -> None:
     sound = np.empty((0, 2))
-    assert camera_faults(sound, 3, 400_000) is None
+    assert not camera_faults(sound, 3, 400_000)
     said = camera_faults(np.array([[0.1, 0.101], [0.4, 0.392]]), 80, 400_000)
-    assert said is not None
-    assert "3.0 %" in said
-    assert "80 of its pixels" in said
-    only_hot = camera_faults(sound, 80, 400_000)
-    assert only_hot is not None
-    assert "exposure" not in only_hot
+    assert "3.0 %" in said[TroubleCode.EXPOSURE_TIMES]
+    assert "80 pixels" in said[TroubleCode.HOT_PIXELS]
+    assert list(camera_faults(sound, 80, 400_000)) == [TroubleCode.HOT_PIXELS]

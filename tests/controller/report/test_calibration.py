@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from controller.artefacts.calibration import read_calibration
-from controller.artefacts.grade import ErrorMaps, Trouble, write_grade, write_troubles
+from controller.artefacts.grade import ErrorMaps, write_grade, write_troubles
 from controller.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
 from controller.bundle.export import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
+from controller.core.troubles import Trouble
 from controller.report import plots
 from controller.report.calibration import StageDescription, resolution_px, size_px, write_calibration_report
 from controller.run.journal import Journal

@@ -13,11 +13,12 @@ from controller.calibrate.values import Calibration, PhaseMap
 from controller.capture.patterns import plan_patterns
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.form_factors import form_factors
-from controller.transport.indirect import IndirectLight, down_up
+from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_fit import beside, fit_indirect
 from controller.transport.indirect_shape import ALIKE_BLOCKS, PART_NOISE, UNSURE, shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, dark_light, stripe_parts
 from controller.transport.indirect_weights import BlockLight
+from controller.transport.surfaces.blocks import down_up
 from tests.controller.solve.conftest import plane_calibration
 
 SHAPE = (22, 27)

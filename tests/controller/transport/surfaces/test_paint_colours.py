@@ -10,7 +10,7 @@ import pytest
 from controller.calibrate.values import Calibration, ProjectorCalibration, Radiometry
 from controller.core.arrays import Float64
 from controller.transport.indirect_fit import fit_indirect
-from controller.transport.paint_colours import paint_colours
+from controller.transport.surfaces.paint_colours import paint_colours
 from tests.controller.calibrate.spectra import colours
 from tests.controller.solve.conftest import plane_calibration
 
