@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, signal
 
 from controller.calibrate.correspondence.captures import Captures, grey
 from controller.calibrate.values import SurfaceSpread
@@ -178,6 +177,8 @@ def _of_pattern(
     shown: Float64, at: FloatImage, seen: FloatImage, light: FloatImage, parts: npt.NDArray[np.int64], blur_px: float
 ) -> Iterator[_Evidence]:
     """Of each part of the picture that says anything; ``parts`` (pixels,): which one."""
+    from scipy import ndimage
+
     pixels = (np.arange(len(shown)) + 0.5) / FINE - 0.5
     if not (shown > 0.5).any():
         return
@@ -214,6 +215,8 @@ def _alike(values: FloatImage, distance: Float64) -> Mask:
 
 def _spread_along(shown: Float64, distance_px: float) -> Float64:
     """``shown`` (pixels x FINE,) after its light has diffused; dark beyond both ends."""
+    from scipy import signal
+
     left = np.exp(-1 / (FINE * distance_px))
     there, back = (signal.lfilter([1.0], [1.0, -left], one) for one in (shown, shown[::-1]))
     return np.asarray((there + back[::-1] - shown) * (1 - left) / (1 + left), np.float64)
@@ -221,6 +224,8 @@ def _spread_along(shown: Float64, distance_px: float) -> Float64:
 
 def _blurred_along(shown: Float64, sigma_px: float) -> Float64:
     """The same with a Gaussian blur."""
+    from scipy import ndimage
+
     return np.asarray(ndimage.gaussian_filter1d(shown, FINE * sigma_px, mode="constant", truncate=8.0), np.float64)
 
 

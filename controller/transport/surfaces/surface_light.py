@@ -7,7 +7,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from controller.calibrate.values import SurfaceSpread
 from controller.core.arrays import FloatImage, Mask
@@ -79,6 +78,8 @@ def _diffused(image: FloatImage, distance_px: float, *, transposed: bool = False
 
 
 def _solved(values: FloatImage, distance: float) -> FloatImage:
+    from scipy import fft
+
     rows, columns = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in values.shape[:2])
     left = (1 / (1 + distance**2 * (rows[:, None] + columns[None, :]))).astype(np.float32)[..., None]
     spectrum = fft.dctn(values, axes=(0, 1), norm="ortho")
