@@ -31,8 +31,11 @@ GOALS: Final = {"room": ((1.2, 6.0), (0.9, 5.0)), "hard": (None, (2.0, 8.0))}
 """CIEDE2000, median and 95 %, without and with one photograph."""
 Named = tuple[TroubleCode, str | None]
 """A trouble, and the projector that has it."""
-BENT_PX: Final = 0.5
-"""A lens that displaces no corner of the picture by more counts as straight."""
+BENT_PX: Final = (0.4, 0.6)
+"""A lens that displaces no corner of the picture by more than the first counts as straight, from the second on as bent.
+
+Between them is the level from which it is named: either is right there.
+"""
 
 
 def measure(size: str) -> list[Row]:
@@ -81,8 +84,9 @@ def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> 
     """Every trouble counts once for each projector that has it; the worst demo counts."""
     named, false = [], []
     for truth, figures in found:
-        said = {(TroubleCode(one["code"]), one["projector"]) for one in figures["troubles"]}
-        there = {one for one, level in _possible(truth).items() if level}
+        possible = _possible(truth)
+        said = {(TroubleCode(one["code"]), one["projector"]) for one in figures["troubles"]} & set(possible)
+        there = {one for one, level in possible.items() if level}
         named.append((len(said & there), len(there), sorted(f"{code} ({whose})" for code, whose in there - said)))
         false.append((len(said - there), sorted(f"{code} ({whose})" for code, whose in said - there)))
     worst = min(named, key=lambda one: one[0] - one[1])
@@ -114,8 +118,9 @@ def _possible(truth: BenchTruth) -> dict[Named, float]:
             (TroubleCode.WHITE_SEGMENT, one.name): one.light.white_segment,
             (TroubleCode.PROJECTOR_GLARE, one.name): one.light.glare,
             (TroubleCode.PAINT_COLOURS, one.name): float(one.light.bands_nm != NO_BANDS),
-            (TroubleCode.LENS_DISTORTION, one.name): float(_bend_px(one) >= BENT_PX),
         }
+        if not BENT_PX[0] <= (bend_px := _bend_px(one)) < BENT_PX[1]:
+            found[TroubleCode.LENS_DISTORTION, one.name] = float(bend_px >= BENT_PX[1])
     return found
 
 

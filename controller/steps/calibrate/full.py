@@ -22,7 +22,7 @@ from controller.calibrate.geometry.lens import bent
 from controller.calibrate.geometry.self_calibration import reconstruct
 from controller.calibrate.geometry.values import CameraPrior
 from controller.calibrate.metapixels.from_phase import fit_pixels
-from controller.calibrate.photometry.radiometry import measure_radiometry, painted, white_segment
+from controller.calibrate.photometry.radiometry import measure_radiometry, white_segment
 from controller.capture.raw import CAMERA_BLUR_PX
 from controller.core.errors import CalibrationError
 from controller.core.troubles import Trouble, TroubleCode
@@ -98,10 +98,7 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         known_px=used.known_px(context.folder, projector.name),
         noise=noise_of(bracket[0]),
     )
-    said = {
-        TroubleCode.WHITE_SEGMENT: white_segment(projector.name, radiometry.segment),
-        TroubleCode.PAINT_COLOURS: painted(projector.name, report.paint),
-    }
+    said = {TroubleCode.WHITE_SEGMENT: white_segment(projector.name, radiometry.segment)}
     matrix = bracket[0].read().camera_to_xyz
     light = Light(
         response=radiometry.response,

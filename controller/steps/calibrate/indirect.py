@@ -16,7 +16,7 @@ from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pi
 from controller.calibrate.correspondence.opposites import completed
 from controller.calibrate.photometry.colour_tiles import KnownIndirect, tile_code
 from controller.calibrate.photometry.lamp_light import lamp_flicker, unsteady
-from controller.calibrate.photometry.radiometry import measure_radiometry
+from controller.calibrate.photometry.radiometry import measure_radiometry, painted
 from controller.calibrate.photometry.separation import (
     indirect_figures,
     indirect_share,
@@ -71,7 +71,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
         share = indirect_share(
             seen, white, pixels.projector_px, linearity=linearity, spread=pixels.surface_spread
         )  # fmt: skip
-        radiometry, _ = measure_radiometry(
+        radiometry, report = measure_radiometry(
             captures,
             plan,
             indirect=KnownIndirect(share * white, radiometry),
@@ -86,8 +86,12 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
-    unsteadiness = unsteady(name, lamp_flicker(seen.strengths))
-    said = tell(context, StepId(StepKind.INDIRECT, name), {TroubleCode.UNSTEADY_LAMP: unsteadiness})
+    troubles = {
+        TroubleCode.UNSTEADY_LAMP: unsteady(name, lamp_flicker(seen.strengths)),
+        # In direct light alone tiles differ less, so that paint is seen where it was not before.
+        TroubleCode.PAINT_COLOURS: painted(name, report.paint),
+    }
+    said = tell(context, StepId(StepKind.INDIRECT, name), troubles)
     return [found.write(folder, name), figures.write(folder, name), said]
 
 
