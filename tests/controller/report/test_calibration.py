@@ -19,7 +19,7 @@ from controller.artefacts.projectors import Light, PixelFigures, write_radiometr
 from controller.bundle.export import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
-from controller.core.troubles import Trouble
+from controller.core.troubles import Trouble, TroubleCode
 from controller.report import plots
 from controller.report.calibration import StageDescription, resolution_px, size_px, write_calibration_report
 from controller.run.journal import Journal
@@ -29,6 +29,7 @@ NAMES = ("left", "<b>right</b>")
 ASKED = StageDescription("A <script>stage</script>", NAMES, 8.0)
 CAMERA = (40, 60)
 PROJECTOR = (12, 16)
+BLUE = "Blue is <i>off</i>. Run `velatura drift`."
 APART = ((0.3, 0.4), (0.0, 0.0), (0.0, -0.25))
 
 
@@ -91,7 +92,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(runs, "20260102-100000-quick", (2.5, 3.5))
     made = write_run(runs, "20260103-100000-calibrate", (9.0, 4.0))
     write_run(runs, "20260104-100000-calibrate", (1.0, 1.0))
-    write_troubles(made, StepId("pixels", "left"), [Trouble("Blue is <i>off</i>. Run `velatura drift`.", "left")])
+    write_troubles(made, StepId("pixels", "left"), [Trouble(BLUE, "left", TroubleCode.PANEL_ALIGNMENT)])
     write_calibration_report(made, ASKED)
     return made
 
@@ -126,7 +127,7 @@ def test_the_figures_are_for_machines_and_the_pictures_for_the_panel(run: Path) 
     assert figures["metapixels"] == {"left": 192, "<b>right</b>": 192}
     assert figures["colours_px"] == {"left": [list(place) for place in APART], "<b>right</b>": None}
     assert figures["geometry"]["reprojection_rms_px"] == 0.025
-    assert figures["troubles"] == [{"sentence": "Blue is <i>off</i>. Run `velatura drift`.", "projector": "left"}]
+    assert figures["troubles"] == [{"sentence": BLUE, "projector": "left", "code": "panel-alignment"}]
     for name in ("before.png", "resolution.png"):
         picture = cv2.imread(str(run / name))
         assert picture is not None
