@@ -67,7 +67,10 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     found = read_indirect(folder, projectors)
     for number, name in enumerate(projectors):
         light = Light.read(folder, name)
-        phase_map, mosaic = read_phase_map(folder, name)
+        pixels = _phase_pixels(folder, name)
+        phase_map = mosaic = spread = None
+        if pixels is not None:
+            phase_map, mosaic, spread = pixels.phase_map, pixels.known_mosaic, pixels.surface_spread
         # in place: of a mapped file, only the pages with saturated pixels become memory of this process
         white, radiometry = np.nan_to_num(light.white, copy=False), light.radiometry
         gain = read_white_gain(folder, name) if found is None else found[number].white_gain
@@ -79,7 +82,6 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
             white, indirect = _parted(white, found[number].share, folder)
             stripes = found[number].stripes
         metapixels = read_metapixels(folder, name)
-        spread = None if phase_map is None else Pixels.read(folder, name).surface_spread
         parts.append(ProjectorCalibration(name, metapixels, radiometry, white, phase_map, indirect, stripes, spread))
     black = np.nan_to_num(light.black, copy=False)
     red, green, blue = CAMERA_BLUR_PX
@@ -111,10 +113,16 @@ def _parted(white: FloatImage, share: npt.NDArray[np.floating], folder: Path) ->
 
 def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.NDArray[np.int64] | None]:
     """A projector's phase map and the camera's mosaic; None if the run has none, or its metapixels are from dots."""
+    pixels = _phase_pixels(folder, projector)
+    return (None, None) if pixels is None else (pixels.phase_map, pixels.known_mosaic)
+
+
+def _phase_pixels(folder: Path, projector: str) -> Pixels | None:
+    """What the sinusoids told of a projector; None if no phase map is used."""
     if mode_of(folder) == "paper":
-        return None, None
+        return None
     pixels = Pixels.read(folder, projector)
-    return (None, None) if pixels.phase_map is None else (pixels.phase_map, pixels.known_mosaic)
+    return None if pixels.phase_map is None else pixels
 
 
 def object_mask(parts: Sequence[ProjectorCalibration]) -> Mask:

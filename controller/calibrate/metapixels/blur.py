@@ -9,6 +9,8 @@ not: the contrast that it takes is given back first (``photometry.surface_spread
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +31,19 @@ LEAST_COARSE = 0.2
 """Of the phase patterns; less is left of them only where hardly any light is direct."""
 LEAST_VARIANCE_PX2 = 0.02
 MOST_VARIANCE_PX2 = 16.0
+
+
+@dataclass(frozen=True, slots=True)
+class BlurContrasts:
+    """Around each projector pixel, (rows, columns), NaN where nothing was seen.
+
+    ``fine`` (3, rows, columns) of ``BLUR_FREQUENCIES``; ``coarse`` (2, rows, columns) of the phase patterns along x, y
+    ``coarse_variance``: the blur's, in projector pixels squared, that the phase patterns tell alone
+    """
+
+    fine: FloatImage
+    coarse: FloatImage
+    coarse_variance: FloatImage
 
 
 def measure_blur(
@@ -53,22 +68,35 @@ def measure_blur(
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
+    return blur_of(measure_contrasts(captures, plan, correspondence, colours), spread)
+
+
+def measure_contrasts(
+    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+) -> BlurContrasts:
+    """What ``blur_of`` needs; parameters and errors as ``measure_blur``."""
     cells = cells_of(correspondence, plan.size_px)
     black = grey(captures, "black")
 
     def contrast(prefix: str, frequency: tuple[float, float]) -> FloatImage:
         left = np.empty((0, 0), np.float32) if colours is None else colours.contrast(frequency)
-        found = _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
-        return found / np.float32(contrast_left(spread, float(np.hypot(*frequency))))
+        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
 
     fine = np.stack([contrast(f"blur-{name}", frequency) for name, frequency in BLUR_FREQUENCIES.items()])
-    coarse_x, coarse_y = contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))
+    coarse = np.stack([contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))])
+    return BlurContrasts(fine, coarse, _coarse_variance(correspondence.modulation, cells, plan.size_px))
+
+
+def blur_of(seen: BlurContrasts, spread: SurfaceSpread | None = None) -> tuple[FloatImage, Mask]:
+    """As ``measure_blur``, from contrasts that were measured."""
+    left = [contrast_left(spread, float(np.hypot(*frequency))) for frequency in BLUR_FREQUENCIES.values()]
+    fine = seen.fine / np.array(left, np.float32)[:, None, None]
+    coarse_x, coarse_y = seen.coarse / np.float32(contrast_left(spread, 1 / PERIOD_PX))
     with np.errstate(invalid="ignore"):
         both = np.sqrt(coarse_x * coarse_y)
     blur, measured = _covariance(fine, np.stack([coarse_x, coarse_y, both]))
-    coarse = _coarse_variance(correspondence.modulation, cells, plan.size_px)
-    guessed = ~measured & np.isfinite(coarse)
-    blur[guessed] = coarse[guessed, None] * np.array([1, 0, 1], np.float32)
+    guessed = ~measured & np.isfinite(seen.coarse_variance)
+    blur[guessed] = seen.coarse_variance[guessed, None] * np.array([1, 0, 1], np.float32)
     return blur, measured | guessed
 
 

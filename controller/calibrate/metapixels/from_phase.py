@@ -14,7 +14,7 @@ from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import frame_margin_px
 from controller.calibrate.correspondence.inverse_map import invert_map
 from controller.calibrate.correspondence.phase_map import make_phase_map
-from controller.calibrate.metapixels.blur import measure_blur
+from controller.calibrate.metapixels.blur import blur_of, measure_contrasts
 from controller.calibrate.metapixels.footprints import measure_footprints
 from controller.calibrate.photometry.surface_spread import measure_spread
 from controller.calibrate.values import Correspondence, Metapixels, PhaseMap, SurfaceSpread
@@ -63,13 +63,14 @@ def fit_pixels(
     ``white`` (rows, columns, 3) less the black image: with it, light that spreads under the surface is found
     """
     inverse = invert_map(correspondence, plan.size_px)
-    blur, blur_valid = measure_blur(captures, plan, correspondence, colours)
+    contrasts = measure_contrasts(captures, plan, correspondence, colours)
+    blur, blur_valid = blur_of(contrasts)
     spread = None
     if white is not None:
         variance = float(np.nanmedian(blur[blur_valid][:, [0, 2]])) if blur_valid.any() else 0.0
         spread = measure_spread(captures, plan, correspondence.projector_px, white, blur_px=variance**0.5)
     if spread is not None:
-        blur, blur_valid = measure_blur(captures, plan, correspondence, colours, spread)
+        blur, blur_valid = blur_of(contrasts, spread)
     valid = inverse.valid & blur_valid
     flat = carry_covariance(inverse.jacobian, blur)
     centre, covariance = measure_footprints(correspondence, inverse, blur, flat, valid)

@@ -19,9 +19,9 @@ from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.decode import FINE_TO_COARSE
 from controller.calibrate.correspondence.opposites import step_variance
 from controller.calibrate.photometry.averaged_white import WhiteSums
-from controller.calibrate.photometry.surface_spread import contrast_left
+from controller.calibrate.photometry.surface_spread import FINE_FREQUENCY, contrast_left
 from controller.calibrate.values import Radiometry, SurfaceSpread
-from controller.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PHASE_STEPS, Pattern, PatternPlan
+from controller.capture.patterns import PERIOD_PX, PHASE_STEPS, Pattern, PatternPlan
 from controller.capture.profile import CameraNoise
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
@@ -30,7 +30,6 @@ from controller.core.jit import compiled
 
 COARSE: Final = ("phase-x", "phase-y")
 FINE: Final = ("blur-x", "blur-y")
-FINE_FREQUENCY: Final = BLUR_FREQUENCIES["x"][0]
 FAINTEST: Final = 1e-3
 """Of the 99th percentile of white: below it nothing is said from the pixel itself."""
 LEAST_FINE_CONTRAST: Final = 0.003

@@ -38,12 +38,12 @@ STEEPEST: Final = 0.7
 NARROWER: Final = 0.8
 """Of that blur is the blur alone, about."""
 ROUNDS: Final = 3
-"""Blur widens the spread, and the spread is a part of the blur that sinusoids show."""
+"""Of what is found in turns: the distance and the places that agree, the share and the blur without the spread."""
 FAINTEST: Final = 0.05
 """Of the 99th percentile of white: fainter pixels are left out."""
 FEWEST_PIXELS, MOST_PIXELS, FEWEST = 200, 20_000, 10
 OUTLIERS: Final = 5.0
-"""Median deviations of light over white, among pixels as far from an edge: what lies farther is another surface."""
+"""Median deviations: of light over white among pixels as far from an edge, and of shares among places."""
 LEAST_SHARE, MOST_SHARE = 0.03, 0.9
 SURE: Final = 4.0
 """Standard errors, by the differences between parts and patterns, from which a share counts."""
@@ -95,7 +95,7 @@ def _agreed(found: Sequence[_Evidence]) -> tuple[int, float, float]:
 
     A surface is the same everywhere. Creases and edges are not, so what differs from most places is left out.
     """
-    across, along = (np.stack([getattr(one, name) for one in found]) for name in ("across", "along"))
+    across, along = np.stack([one.across for one in found]), np.stack([one.along for one in found])
     kept = np.ones(len(found), np.bool_)
     for _ in range(ROUNDS):
         weight = np.maximum(across[kept].sum(axis=0), 1e-12)
