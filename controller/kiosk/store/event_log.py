@@ -32,6 +32,9 @@ CREATE TABLE IF NOT EXISTS events (
 CREATE TABLE IF NOT EXISTS done (number INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT UNIQUE NOT NULL, how TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS kept (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
+_TRIM: Final = """
+DELETE FROM {table} WHERE number <= (SELECT number FROM {table} ORDER BY number DESC LIMIT 1 OFFSET ?)
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +141,7 @@ class EventLog:
     def mark_done(self, key: str, how: str) -> None:
         """Record that ``key`` was done or skipped: in memory at once, on disk as soon as possible."""
         with self._lock:
+            self._done.pop(key, None)  # the newest is last, as on disk
             self._done[key] = how
             self._unwritten[("done", key)] = None
             self._flush(now=True)
@@ -189,8 +193,9 @@ class EventLog:
         self.problem = None
 
     def _trim(self, database: sqlite3.Connection) -> None:
-        database.execute("DELETE FROM events WHERE number <= ?", (self._number - MOST_EVENTS,))
-        database.execute("DELETE FROM done WHERE number <= (SELECT MAX(number) FROM done) - ?", (MOST_DONE,))
+        # Rows are counted, because after a damaged log numbers continue far above those of the rows that were kept.
+        for table, most in (("events", MOST_EVENTS), ("done", MOST_DONE)):
+            database.execute(_TRIM.format(table=table), (most,))
         for key in list(self._done)[: max(0, len(self._done) - MOST_DONE)]:
             del self._done[key]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
+from controller.kiosk.store.event_log import MOST_DONE, MOST_EVENTS, MOST_FAILURES, Decision, EventLog
 
 
 def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path: Path) -> None:
@@ -157,11 +157,10 @@ def test_a_log_that_is_a_device_is_not_read_without_an_end(tmp_path: Path) -> No
     assert path.is_symlink()
 
 
-def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_file(tmp_path: Path) -> None:
-    path = tmp_path / EventLog.FILE
+def _torn_log(path: Path) -> None:
+    """As SQLite reads zeros where a page is gone: columns that must have something have nothing."""
     path.parent.mkdir()
     with sqlite3.connect(path) as file:
-        # As SQLite reads zeros where a page is gone: columns that must have something have nothing.
         file.executescript(
             "CREATE TABLE events (number INTEGER PRIMARY KEY, unix_s REAL, level TEXT, code TEXT, text TEXT);"
             "CREATE TABLE done (number INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT UNIQUE, how TEXT);"
@@ -170,6 +169,11 @@ def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_f
             "INSERT INTO done (key, how) VALUES (NULL, NULL), ('drift-check 2026-01-01', 'begun');"
         )
     file.close()
+
+
+def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_file(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    _torn_log(path)
     log = EventLog(path, durable=False)
     assert [row.code for row in log.after(0)] == ["second"]
     log.add(Decision("third", "Three."))
@@ -180,3 +184,49 @@ def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_f
     assert log.done() == {"drift-check 2026-01-01"}
     assert list(path.parent.glob("*.damaged-*"))
     log.close()
+
+
+def test_what_a_damaged_log_had_stays_however_many_events_follow_and_whatever_the_clock_says(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    _torn_log(path)
+    # Numbers go on from the clock's; the oldest events are deleted when a number can be divided by 200.
+    log = EventLog(path, durable=False, wall=lambda: 1_795_000_000.0)
+    for number in range(450):
+        log.add(Decision(f"after-{number}", "It went on."))
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["second", *(f"after-{number}" for number in range(450))]
+    log.close()
+
+
+def test_the_oldest_events_and_finished_tasks_are_deleted_and_no_more_than_that(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for number in range(MOST_DONE + 50):
+        log.mark_done(f"drift-check {number}", "drift-none")
+        log.mark_done("every-night", f"{number}")
+    log.close()
+    with sqlite3.connect(path) as file:
+        # One number of ten was never used, as after damaged logs.
+        file.execute(
+            "WITH RECURSIVE one(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM one WHERE n < ?) "
+            "INSERT INTO events SELECT n * 10, 0.0, 'info', 'before-' || n, 'One.' FROM one",
+            (MOST_EVENTS,),
+        )
+    file.close()
+    log = EventLog(path, durable=False)
+    for number in range(200):
+        log.add(Decision(f"after-{number}", "It went on."))
+    for done in (log.done(), _reopened(log).done()):
+        assert (len(done), "every-night" in done, "drift-check 49" in done) == (MOST_DONE, True, False)
+    with sqlite3.connect(path) as file:
+        found = [code for (code,) in file.execute("SELECT code FROM events ORDER BY number")]
+    file.close()
+    assert (found[0], found[-1], len(found)) == ("before-201", "after-199", MOST_EVENTS)
+
+
+def _reopened(log: EventLog) -> EventLog:
+    log.close()
+    again = EventLog(log.path, durable=False)
+    again.close()
+    return again
