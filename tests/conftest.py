@@ -12,7 +12,7 @@ from collections.abc import Generator
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from hal.runtime.caches import SHORTEST, temporary
 from tests.scheduling import LongestFirst
@@ -22,9 +22,11 @@ WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if WORKERS > 1:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported, which none of the above does
 
-# The same examples in every run; HYPOTHESIS_PROFILE=search looks for new ones.
-settings.register_profile("suite", derandomize=True)
-settings.register_profile("search", print_blob=True)
+# The same examples in every run; HYPOTHESIS_PROFILE=search looks for new ones. How long drawing them takes says how
+# busy the computer is, and nothing about what is tested.
+UNTIMED = [HealthCheck.too_slow]
+settings.register_profile("suite", derandomize=True, deadline=None, suppress_health_check=UNTIMED)
+settings.register_profile("search", print_blob=True, deadline=None, suppress_health_check=UNTIMED)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
 # A shell that runs us in the background, or nohup, hands down ignored signals, and so would we to the programs that
