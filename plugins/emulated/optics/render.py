@@ -141,8 +141,9 @@ class Renderer:
         spread = truth.object.subsurface
         self._surface = None
         if spread.share > 0.0:
-            width = truth.camera.lens.size_px[0]
-            self._surface = Spread.over(samples.pixels, samples.points, width, spread.spread_m)
+            # Of the object alone: what spreads under its surface does not come out of the table that it stands on.
+            width, on = truth.camera.lens.size_px[0], samples.on_object
+            self._surface = Spread.over(samples.pixels[on], samples.points[on], width, spread.spread_m)
         self._last: tuple[tuple[object, ...], FloatImage] | None = None
 
     def light(self, frames: Sequence[ByteImage], levels: Sequence[float], shutter: Shutter = ALWAYS) -> FloatImage:
@@ -218,10 +219,12 @@ class Renderer:
         share = np.float32(self._truth.object.subsurface.share)
         if self._surface is None:
             return layer
-        falling = np.divide(layer, self._paint, out=np.zeros_like(layer), where=self._paint > 0.0)
-        on = self._samples.on_object[:, None]
-        spread = self._paint * self._surface.of(np.where(on, falling, np.float32(0.0)))
-        return np.where(on, (1 - share) * layer + share * spread, layer)
+        on = self._samples.on_object
+        seen, paint = layer[on], self._paint[on]
+        falling = np.divide(seen, paint, out=np.zeros_like(seen), where=paint > 0.0)
+        spread = layer.copy()
+        spread[on] = (1 - share) * seen + share * paint * self._surface.of(falling)
+        return spread
 
     def _footprints_of(self, index: int) -> tuple[list[Footprints], list[Footprints]]:
         """Of each part of ``sent_by_panels``, on paint and, where light spreads below, apart from it on the gloss.

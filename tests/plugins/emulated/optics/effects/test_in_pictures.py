@@ -77,6 +77,20 @@ def test_light_below_the_surface_blurs_stripes_and_keeps_their_light(tiny_truth:
     assert soft.sum() == pytest.approx(sharp.sum(), rel=0.05)
 
 
+def test_light_below_the_surface_of_the_object_does_not_come_out_of_the_room(
+    tiny_truth: BenchTruth, rays: Samples
+) -> None:
+    width = tiny_truth.camera.lens.size_px[0]
+    half = dataclasses.replace(rays, on_object=rays.pixels % width < width // 2)
+    sharp, soft = (
+        seen(with_object(tiny_truth, subsurface=Subsurface(share, 0.01)), half) for share in (0.0, 0.9)
+    )  # fmt: skip
+    # The camera's lens blurs over the border between them.
+    assert np.abs(soft - sharp)[:, width // 2 + 4 :].max() < 1e-5
+    beside = np.s_[:, width // 2 - 8 : width // 2]
+    assert soft[beside].sum() == pytest.approx(sharp[beside].sum(), rel=0.05)
+
+
 def test_a_wider_aperture_blurs_what_is_out_of_focus(tiny_truth: BenchTruth, rays: Samples) -> None:
     near = with_camera(tiny_truth, focus_m=0.6)
     slopes = [
