@@ -265,11 +265,13 @@ class EventLog:
 
     def _last_number(self) -> int:
         rows = self._query("SELECT seq FROM sqlite_sequence WHERE name = 'events'", int)
-        if rows:
+        newest = self._recent[-1].number if self._recent else 0
+        if rows and rows[0][0] >= newest:
             return int(rows[0][0])
-        # After a damaged or unreadable log, numbers continue far above all that it can have had.
-        lost = self._unavailable or self._torn or list(self.path.parent.glob("*.damaged-*"))
-        return int(self._wall()) if lost else 0
+        # After a damaged or unreadable log, numbers continue far above all that it can have had. Where a page is read
+        # as zeros, only the number may be gone.
+        lost = newest or self._unavailable or self._torn or list(self.path.parent.glob("*.damaged-*"))
+        return max(newest, int(self._wall())) if lost else 0
 
     def _query(self, statement: str, *kinds: type) -> list[tuple]:  # type: ignore[type-arg]
         """Its rows with values of these kinds; of a damaged file those before the damage: where the newest come first,

@@ -199,6 +199,25 @@ def test_what_a_damaged_log_had_stays_however_many_events_follow_and_whatever_th
     log.close()
 
 
+def test_numbers_go_on_above_the_newest_event_where_only_the_number_is_gone(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for number in range(3):
+        log.add(Decision(f"before-{number}", "One."))
+    log.close()
+    with sqlite3.connect(path) as file:
+        # As SQLite reads zeros in the page of the numbers.
+        file.execute("UPDATE sqlite_sequence SET name = NULL, seq = NULL")
+    file.close()
+    # The clock was lost, too.
+    log = EventLog(path, durable=False, wall=lambda: 0.0)
+    log.add(Decision("after", "Two."))
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["before-0", "before-1", "before-2", "after"]
+    log.close()
+
+
 def test_the_oldest_events_and_finished_tasks_are_deleted_and_no_more_than_that(tmp_path: Path) -> None:
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
