@@ -27,7 +27,8 @@ _CHANGES: Final = frozenset({"os.rename", "os.remove", "os.mkdir", "os.symlink",
 
 class Disk:
     """``full``: nothing can be written; ``blind``: no bundle can be read; ``free_bytes``: what it tells;
-    ``kill_after``: so many more operations happen before the program that does the next one is killed.
+    ``kill_after``: so many more operations happen before the program that does the next one is killed; ``refused_s``:
+    when it had no room last.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
@@ -35,6 +36,7 @@ class Disk:
         self.full = self.blind = False
         self.free_bytes = TOTAL_BYTES // 2
         self.kill_after: int | None = None
+        self.refused_s = 0.0
         self._outside = 0
 
     @contextlib.contextmanager
@@ -69,6 +71,7 @@ class Disk:
 
     def _refuse(self) -> None:
         if self.full:
+            self.refused_s = self._scheduler.now_s
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def reads(self, path: str) -> None:

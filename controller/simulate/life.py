@@ -23,6 +23,7 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
+from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import State
 from controller.simulate.disk import STAGE, watched
 from controller.simulate.happen import happenings
@@ -133,6 +134,7 @@ class Life:
             self.boot()
             try:
                 self._pass()
+                self._ends()
             except Broken as error:
                 self.broken = self.broken or error
             finally:
@@ -177,6 +179,11 @@ class Life:
                     self._waiting.append(item)
                 else:
                     self._happen(item)
+
+    def _ends(self) -> None:
+        """What the last service logged is judged now; others are when the next one begins. Raises Broken."""
+        if self.broken is None and self.service is not None and self.service.log.problem is None:
+            self.witness.log.in_file(STAGE / EventLog.FILE)
 
     def _happen(self, item: Item) -> None:
         happenings.happen(self, item)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -12,27 +13,33 @@ from controller.rig.lamp_ledger import LampFile
 from controller.simulate.disk import STAGE
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.power import power_cut
-from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, Item
+from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, WRITTEN_LAST, Item
 from controller.simulate.judge.bundles import SHOWN_S, is_sound
-from controller.simulate.judge.log_file import readable
+from controller.simulate.judge.log_file import PAGE_BYTES, pages_of, readable
 from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
 from controller.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
+BLOCK_BYTES: Final = 4096
+"""Disks and cards of today write and lose so much at a time."""
+LOG: Final = STAGE / "kiosk" / "events.sqlite"
 MEND_FILE_S: Final = 600.0
 _TWINS: Final = {LampFile.NAME: LampFile.COPY, LampFile.COPY: LampFile.NAME}
 
 
 def file_damaged(life: Living, item: Item) -> None:
     """While the service is away, a file becomes another one. Somebody puts the settings right after a while.
+    Raises Broken.
 
     With the arguments "stopped" the service has ended as it should: what its log's write-ahead log had is in the file.
     """
+    last = pages_of(LOG.with_name(f"{LOG.name}-wal")) if item.who.endswith(LOG.name) else []
     if item.arguments == STOPPED and life.service is not None:
         life.end(lit=True)
     else:
         life.end_of_program()
     path = STAGE / item.who
+    life.witness.log.in_file(LOG)
     before = path.read_bytes() if path.is_file() else None
     twin = _TWINS.get(item.who)
     if item.how == "removed" and twin is not None and not (STAGE / twin).is_file():
@@ -46,10 +53,10 @@ def file_damaged(life: Living, item: Item) -> None:
         if item.how == "removed":
             path.unlink()
         else:
-            path.write_bytes(_damaged(before, item))
+            path.write_bytes(_damaged(before, item, last))
         if item.who.startswith("kiosk/events"):
             life.witness.log.begun_checks.clear()
-            life.witness.log.damaged(readable(STAGE / "kiosk" / "events.sqlite"))
+            life.witness.log.damaged(readable(LOG))
             life.witness.wanted.unsure_until_hours()
         if item.who.endswith("lamps.json"):
             life.witness.lamps.ledger_lost()
@@ -65,17 +72,39 @@ def file_damaged(life: Living, item: Item) -> None:
     life.boot()
 
 
-def _damaged(content: bytes, item: Item) -> bytes:
-    at = int(item.number * len(content))
-    if item.how == "empty":
-        return b""
-    if item.how == "cut":
-        return content[:at]
+def _damaged(content: bytes, item: Item, last: Sequence[int]) -> bytes:
+    """``last``: the pages that were written last, of a file that has such."""
+    at = int(item.number % 1 * len(content))
+    if item.number >= WRITTEN_LAST and last:
+        part, within = divmod(item.number % 1 * len(last), 1)
+        at = max(0, min(int((last[int(part)] - 1 + within) * PAGE_BYTES), len(content) - 1))
+    match item.how:
+        case "empty":
+            return b""
+        case "cut":
+            return content[:at]
+        case "block":
+            return _flipped(content, at - at % BLOCK_BYTES, BLOCK_BYTES)
+        case "half":
+            # The first sectors of a block were written, and the others not.
+            at -= at % SECTOR_BYTES
+            return _zeros(content, at, at - at % BLOCK_BYTES + BLOCK_BYTES)
+        case "zeros":
+            # The file has its length, and what was to be there was never written.
+            return _zeros(content, at - at % SECTOR_BYTES, len(content))
     size = 64
     if len(content) > 8 * SECTOR_BYTES:
         # Disks lose whole sectors; in a small file that would be all of it.
         at, size = at - at % SECTOR_BYTES, SECTOR_BYTES
+    return _flipped(content, at, size)
+
+
+def _flipped(content: bytes, at: int, size: int) -> bytes:
     return content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + size]) + content[at + size :]
+
+
+def _zeros(content: bytes, at: int, until: int) -> bytes:
+    return content[:at] + bytes(min(until, len(content)) - at) + content[until:]
 
 
 def _put_right(life: Living, path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from controller.simulate.happen.commands import CHANGES
 from controller.simulate.happen.places import ZONES, hours, setting
-from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, Item
+from controller.simulate.happen.script import DIED, POWER_CUT, STOPPED, WRITTEN_LAST, Item
 from controller.simulate.judge.calendar import Calendar
 from controller.simulate.lamps import LINE_TROUBLES
 from controller.simulate.player import TROUBLES
@@ -53,7 +53,7 @@ PAST: Final = "past a change"
 _Weights = Mapping[str, float]
 KINDS: Final[_Weights] = {
     "line": 2, "lamp fails": 1, "lamp reports": 1, "lamp switched by hand": 1, "player": 2, "camera gone": 1,
-    "disk full": 2, "disk low": 0.5, "file damaged": 2, "bundle damaged": 2, "killed": 1, "bundles unreadable": 1.5,
+    "disk full": 2, "disk low": 0.5, "file damaged": 4, "bundle damaged": 2, "killed": 1, "bundles unreadable": 1.5,
     "killed while writing": 1, "power cut": 1, "restarted": 1, "clock set": 1, "network gone": 0.5, "drift": 0.5,
     "command": 6, "x server": 1, "cable out": 2, "published": 1,
     "settings edited": 1,
@@ -68,12 +68,14 @@ COMMANDS: Final[_Weights] = {
     "recalibrate": 4, "cancel": 3, "compare": 2, "set-schedule": 3, "seen": 1, "save-settings": 3, "test-shots": 1,
 }  # fmt: skip
 FILES: Final[_Weights] = {
-    "kiosk/events.sqlite": 3, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
+    "kiosk/events.sqlite": 9, "kiosk/events.sqlite-wal": 1, "kiosk/lamps.json": 1, "schedule.toml": 1, "stage.toml": 2,
     "bundles/starts.json": 1, "lamps.json": 3, "lamps-copy.json": 1, "kiosk/stage.toml.good": 1,
 }  # fmt: skip
 BEFORE: Final[Mapping[str, Sequence[str]]] = {
-    "file damaged": ("", STOPPED), "bundle damaged": ("", POWER_CUT), "bundles unreadable": ("", DIED, DIED),
-}  # fmt: skip
+    "file damaged": ("", STOPPED, STOPPED, STOPPED),
+    "bundle damaged": ("", POWER_CUT),
+    "bundles unreadable": ("", DIED, DIED),
+}
 """How the service or the player ended before something was damaged, or with it."""
 HOW: Final[Mapping[str, _Weights | Sequence[str]]] = {
     "line": {**dict.fromkeys(LINE_TROUBLES, 1), "silent": 3, "gone": 3},
@@ -82,13 +84,14 @@ HOW: Final[Mapping[str, _Weights | Sequence[str]]] = {
     "lamp switched by hand": ("off", "on"),
     "player": {"killed": 3, "hung": 2, **dict.fromkeys(("crashes", "crashes at a picture", *TROUBLES), 1)},
     "restarted": ("lamps stay lit", "lamps off"),
-    "clock set": ("hours", "days", "lost"),
+    "clock set": {"hours": 1, "days": 1, "lost": 2},
     "cable out": ("", UNNOTICED),
     "settings edited": CHANGES,
 }
-DAMAGES: Final[Mapping[str, Sequence[str]]] = {
-    "file damaged": ("cut", "flipped", "flipped", "empty", "removed"), "bundle damaged": ("", "", "all"),
-}  # fmt: skip
+DAMAGES: Final[Mapping[str, _Weights]] = {
+    "file damaged": {"cut": 1, "flipped": 1, "block": 3, "half": 3, "zeros": 2, "empty": 1, "removed": 1},
+    "bundle damaged": {"": 2, "all": 1},
+}
 """What is damaged, how and after what is drawn from all in each life: few would have the three at a time."""
 LASTS_S: Final[Mapping[str, tuple[float, float]]] = {
     "seconds": (0.5, 30.0), "minutes": (30.0, 900.0), "hours": (900.0, LONGEST_S), PAST: (300.0, 7200.0),
@@ -101,6 +104,8 @@ ENDLESS: Final = (
     "killed", "drift", "restarted", "killed while writing", "command", "lamp switched by hand", "published",
     "settings edited",
 )  # fmt: skip
+LAST: Final = 0.75
+"""Share of the damage to the log that meets what was written last, as when the power is switched off soon after."""
 MIND: Final = 0.7
 """Share of the commands "start" and "stop" that ask for what the hours do not."""
 
@@ -166,6 +171,11 @@ def _waiting(chance: random.Random, leaning: Leaning, together: Sequence[Item]) 
     ]
 
 
+def _any_of(chance: random.Random, weights: _Weights) -> str:
+    """The same in each life."""
+    return chance.choices(list(weights), list(weights.values()))[0]
+
+
 def _after_s(chance: random.Random, first: Item) -> float:
     match chance.choice(AFTER):
         case "while it lasts":
@@ -206,7 +216,7 @@ class _Drawing:
     def _one(self, at_s: float) -> Item:  # noqa: PLR0911 - one for each kind
         chance, leaning = self._chance, self._leaning
         at_s, what = round(at_s, 3), leaning.drawn(chance, "what", KINDS)
-        how = leaning.drawn(chance, what, HOW[what]) if what in HOW else chance.choice(DAMAGES.get(what, ("",)))
+        how = leaning.drawn(chance, what, HOW[what]) if what in HOW else _any_of(chance, DAMAGES.get(what, {"": 1}))
         lasts_s = self._lasts_s(at_s)
         lasts_s = 0.0 if what in ENDLESS else min(lasts_s, RESTLESS_S[what]) if how in RESTLESS else lasts_s
         name = chance.choice(NAMES)
@@ -219,7 +229,8 @@ class _Drawing:
                 times = chance.randint(1, 4) * how.startswith("crashes")
                 return Item(at_s, what, "", how, lasts_s if how in TROUBLES else 0.0, times)
             case "file damaged":
-                who, number = chance.choices(list(FILES), list(FILES.values()))[0], round(chance.random(), 3)
+                who, number = _any_of(chance, FILES), round(chance.random(), 3)
+                number += WRITTEN_LAST * (chance.random() < LAST)
                 return Item(at_s, what, who, how, number=number, arguments=chance.choice(BEFORE[what]))
             case "bundle damaged":
                 return Item(at_s, what, "", how, max(NOTICED_S, lasts_s), arguments=chance.choice(BEFORE[what]))

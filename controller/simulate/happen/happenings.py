@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
-from controller.kiosk.decide.planner import EARLIEST_S
 from controller.simulate.disk import STAGE, TOTAL_BYTES
 from controller.simulate.happen.commands import settings_edited
 from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
 from controller.simulate.happen.living import Living
-from controller.simulate.happen.power import display_away, power_cut
+from controller.simulate.happen.power import clock_lost, clock_set, display_away, power_cut
 from controller.simulate.happen.script import Item
-from controller.simulate.judge.witness import PLAYER_S, REPAIR_S
+from controller.simulate.judge.witness import PLAYER_S
 from controller.simulate.lamps import RULES, Lamp
 from controller.simulate.stage import OUTPUTS, publish
 
@@ -21,8 +20,6 @@ GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
 RETURNS_S: Final = 60.0
 """Somebody who finds no kiosk at the panel comes back after so long."""
-HOLD_S: Final = 7200.0
-"""For so long a kiosk's time may stand still after its clock was set back."""
 
 
 def happen(life: Living, item: Item) -> None:
@@ -205,24 +202,10 @@ def _restarted(life: Living, item: Item) -> None:
 
 def _clock(life: Living, item: Item) -> None:
     """Set wrongly, or ``lost``: at 1970, as after a battery that is empty."""
-    world, wanted = life.world, life.witness.wanted
-    world.clock_off_s = -world.truth_s if item.how == "lost" else item.number
-    world.is_synchronised = False
-    if world.wall() < EARLIEST_S and wanted.sure:
-        wanted.lose_time()
+    if item.how == "lost":
+        clock_lost(life, item.for_s)
     else:
-        wanted.wrong(item.for_s + HOLD_S + REPAIR_S, has_time=world.wall() >= EARLIEST_S)
-
-    def repair() -> None:
-        if world.is_synchronised:
-            return
-        world.clock_off_s, world.is_synchronised = 0.0, True
-        if wanted.unknown:
-            wanted.find_time()
-        else:
-            wanted.wrong(HOLD_S + REPAIR_S)
-
-    life.later(item.for_s, repair)
+        clock_set(life, item.number, item.for_s)
 
 
 def _no_network(life: Living, item: Item) -> None:

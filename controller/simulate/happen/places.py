@@ -19,6 +19,8 @@ LINGERS_S: Final = (0.0, 0.0, 20.0, 90.0)
 """Many projectors take one connection at a time, and notice late that a program was killed."""
 DISPLAY_AFTER_S: Final = (0.0, 15.0, 60.0)
 """A computer starts its display and the service at the same time."""
+NO_TIME_S: Final = (0.0, 0.0, 120.0, 1800.0)
+"""Small computers have no clock with a battery, and in others it is empty: the time comes with the network."""
 SMALL: Final = 0.5
 """Share of the computers on which the player answers late while they work."""
 
@@ -32,7 +34,8 @@ def setting(seed: str) -> Setting:
     drift_check = chance.choice(["03:30", "02:30", "23:00"])
     begins_s, bundles = begins(chance, zone, soon=soon).timestamp(), chance.choice((1, 2, 2))
     return Setting(begins_s, zone, rows, drift_check, bundles, chance.choice(LOGGED),
-                   chance.choice(LINGERS_S), chance.choice(DISPLAY_AFTER_S), chance.random() < SMALL)  # fmt: skip
+                   chance.choice(LINGERS_S), chance.choice(DISPLAY_AFTER_S), chance.random() < SMALL,
+                   chance.choice(NO_TIME_S))  # fmt: skip
 
 
 def hours(chance: random.Random, late: float) -> list[dict[str, str]]:

@@ -10,6 +10,8 @@ from controller.simulate.scheduler import DAY_S
 
 STOPPED = "stopped"
 """As the arguments of a damaged file: the service ended as it should before; without it, it was killed."""
+WRITTEN_LAST = 1.0
+"""The least size of a damage to what was written last, and not anywhere in a file."""
 POWER_CUT = "power cut"
 """As the arguments of a damaged bundle: with the computer's power; without it, only the player died."""
 
@@ -58,7 +60,8 @@ class Setting:
     ``bundles``: so many were published before: with the second, there is an older one to go back to. ``logged``: so
     many events are in the log of the months before. ``lingers_s``: a projector takes no new connection for so long
     after the end of a program that did not close its own. ``display_after_s``: so long after its power, the computer's
-    display is there. ``is_small``: the computer's player answers late while it works.
+    display is there. ``is_small``: the computer's player answers late while it works. ``no_time_s``: so long after its
+    power the computer has no time, because its clock has no battery.
     """
 
     begins_unix_s: float
@@ -70,6 +73,7 @@ class Setting:
     lingers_s: float = 0.0
     display_after_s: float = 0.0
     is_small: bool = False
+    no_time_s: float = 0.0
 
 
 def to_json(place: Setting, items: Sequence[Item]) -> str:

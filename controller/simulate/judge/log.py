@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
 from controller.simulate.happen.script import moment_of
+from controller.simulate.judge.log_file import readable
 from controller.simulate.judge.promises import Broken
 from controller.simulate.world import SimulatedWorld
 
@@ -23,6 +25,8 @@ MOST_AGAIN: Final = 20
 WORDS_S: Final = 300.0
 MOST_ENDS: Final = 12
 """Of a player because of its silence. One that loses two of five answers is ended up to seven times in this time."""
+WRITTEN_S: Final = 60.0
+"""Twice the pause after which the log is written again."""
 ENDED: Final = ("player-hung", "player-gone")
 
 
@@ -47,6 +51,8 @@ class LogWitness:
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
         self._due_check = ""
+        self._unwritten_since_s: float | None = None
+        self._looked_s = 0.0
         self._recent: deque[tuple[float, str]] = deque()
         self._often: Counter[str] = Counter()
         self._ends_s: deque[float] = deque(maxlen=MOST_ENDS)
@@ -61,6 +67,7 @@ class LogWitness:
     def begins(self) -> None:
         self._held.clear()
         self._ends_s.clear()
+        self._unwritten_since_s = None
         self.state = State.OFF.value
 
     def killed(self) -> None:
@@ -78,11 +85,21 @@ class LogWitness:
         """What was logged from ``read`` on has numbers that others had, which were never written."""
         self._alerted_number = min(self._alerted_number, self.read)
 
+    def in_file(self, file: Path) -> None:
+        """After its end, or at the end of a life: what was written is in the file. Raises Broken."""
+        left = readable(file)
+        # Older ones may go when a damaged file is replaced.
+        least = sorted(left)[-SHOWN] if len(left) >= SHOWN else 0
+        gone = [number for number, row in self.rows.items() if number >= least and left.get(number) != row.text]
+        if gone:
+            raise Broken("nothing lost", f"event {gone[0]} is gone from the log's file: {self.rows[gone[0]].text}")
+
     # -- judging
 
     def listen(self, service: Service, check_begins_rightly: Callable[[], bool]) -> list[EventRow]:
         """Read what is new, and return it. Raises Broken."""
         number = service.log.number
+        self._is_written(service, has_news=number != self.read)
         if service.log.problem is None:
             # What was logged while nothing could be written has been written now.
             self.rows.update((row.number, row) for row in self._held)
@@ -113,6 +130,17 @@ class LogWitness:
             elif row.text == CHECK_BEGINS:
                 self._check_begins(service)
         return list(new)
+
+    def _is_written(self, service: Service, *, has_news: bool) -> None:
+        """What is new since the last look was logged while there had long been room. Raises Broken."""
+        now_s, problem = self._world.scheduler.now_s, service.log.problem
+        if problem is None or self._world.disk.full:
+            self._unwritten_since_s = None
+        elif self._unwritten_since_s is None:
+            self._unwritten_since_s = now_s
+        elif has_news and self._looked_s > max(self._unwritten_since_s, self._world.disk.refused_s) + WRITTEN_S:
+            raise Broken("log written", f"since {now_s - self._unwritten_since_s:.0f} s: {problem}")
+        self._looked_s = now_s
 
     def alerts(self) -> None:
         """What was sent since the last look. Raises Broken."""

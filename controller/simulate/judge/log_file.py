@@ -1,4 +1,4 @@
-"""What is left in the file of an event log that was damaged: read a second time, without the kiosk's code."""
+"""What is in the file of an event log, also of a damaged one: read a second time, without the kiosk's code."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import contextlib
 import sqlite3
 import tempfile
 from pathlib import Path
+from typing import Final
+
+PAGE_BYTES: Final = 4096
+_HEADER_BYTES: Final = 32
+_FRAME_BYTES: Final = 24
 
 
 def readable(file: Path) -> dict[int, str]:
@@ -20,3 +25,10 @@ def readable(file: Path) -> dict[int, str]:
             for number, text in rows.execute("SELECT number, text FROM events ORDER BY number DESC"):
                 texts[number] = text
     return texts
+
+
+def pages_of(write_ahead_log: Path) -> list[int]:
+    """The numbers of the pages that it has: those that were written last."""
+    content = write_ahead_log.read_bytes() if write_ahead_log.is_file() else b""
+    frames = range(_HEADER_BYTES, len(content) - _FRAME_BYTES - PAGE_BYTES + 1, _FRAME_BYTES + PAGE_BYTES)
+    return sorted({int.from_bytes(content[at : at + 4], "big") for at in frames})

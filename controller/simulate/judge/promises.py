@@ -24,6 +24,7 @@ PROMISES: Final = {
     "outputs named": "Outputs without a picture, and no others, are named while the player answers.",
     "picture back": "A player that dies or hangs is restarted, and the picture is back soon.",
     "nothing lost": "Events, settings and counts survive each end of the service.",
+    "log written": "What is logged is on the disk, soon after the disk has room for it.",
     "once a night": "The nightly check is begun at most once a night.",
     "at night": "The nightly check begins only while the stage is closed.",
     "few words": "What goes wrong again every second does not fill the log.",

@@ -4,12 +4,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from controller.simulate.happen.draw import draw
 from controller.simulate.happen.places import setting
-from controller.simulate.happen.script import Item, Setting, from_json, to_json
+from controller.simulate.happen.script import STOPPED, Item, Setting, from_json, to_json
 from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import Life, Outcome
 
@@ -81,10 +82,10 @@ def test_what_waits_for_a_moment_happens_when_the_log_says_that() -> None:
     assert outcome.how == ""
 
 
-def a_life(items: list[Item], days: float, *, is_small: bool = False) -> Outcome:
+def a_life(items: list[Item], days: float, **values: Any) -> Outcome:
     """From Monday, 00:00 on: open from 10:00 to 18:00."""
     rows = [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
-    return Life("script", days, items, Setting(1_767_571_200.0, "UTC", rows, "03:30", is_small=is_small)).live()
+    return Life("script", days, items, Setting(1_767_571_200.0, "UTC", rows, "03:30", **values)).live()
 
 
 def test_the_player_of_a_small_computer_answers_late_while_it_works() -> None:
@@ -102,6 +103,32 @@ def test_an_administrator_edits_the_settings_on_a_full_disk_too() -> None:
     assert outcome.how == ""
     assert sum(" service-started " in line for line in outcome.last) == 4
     assert any("runs with the last good settings" in line for line in outcome.last)
+
+
+def test_a_computer_without_a_battery_has_no_time_after_a_power_cut() -> None:
+    cut = [Item(600.0, "power cut", for_s=5.0)]
+    without, with_battery = a_life(cut, 0.05, no_time_s=120.0), a_life(cut, 0.05)
+    assert [outcome.how for outcome in (without, with_battery)] == ["", ""]
+    unknown, known = [line for line in without.last if " clock-unknown " in line or " clock-known " in line]
+    assert float(unknown.split()[1]) < 1_000.0 < 1_767_571_200.0 < float(known.split()[1])
+    assert not any(" clock-unknown " in line for line in with_battery.last)
+
+
+@pytest.mark.parametrize("how", ["block", "half", "zeros"])
+def test_damage_to_what_was_written_last_meets_the_small_tables_of_a_log_of_months(how: str) -> None:
+    # One of those pages has the number of the last event.
+    items = [
+        Item(
+            1800.0 * (1 + page), "file damaged", "kiosk/events.sqlite", how,
+            number=1.0 + (page + 0.6) / 8, arguments=STOPPED,
+        )
+        for page in range(8)
+    ]  # fmt: skip
+    outcome = a_life(items, 0.25, logged=1000)
+    numbers = [int(line.split()[0]) for line in outcome.last]
+    assert outcome.how == ""
+    assert numbers[0] == 1001
+    assert numbers[-1] > 1_767_571_200
 
 
 def test_every_promise_is_on_the_page() -> None:
