@@ -40,7 +40,7 @@ def before_it(folder: Path, now: Path | None, starts: Starts) -> Path | None:
     """The bundle that can be gone back to from ``now``: one that is there, can be read, and was not given up itself."""
     earlier = previous(folder)
     others = ("" if now is None else now.name, starts.given_up)
-    return earlier if earlier is not None and earlier.name not in others and _readable(earlier) else None
+    return earlier if earlier is not None and earlier.name not in others and is_readable(earlier) else None
 
 
 class CountedStart:
@@ -112,7 +112,7 @@ class CountedStart:
             self._tell(f"The count of starts could not be saved: {error}")
 
 
-def _readable(file: Path) -> bool:
+def is_readable(file: Path) -> bool:
     """Whether it is worth going back to: three failed starts tell nothing certain, a damaged file does."""
     try:
         Bundle.open_trusted(file, ANY_SIGNER).close()

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from controller.bundle.fallback import before_it, chosen
+from controller.bundle.fallback import before_it, chosen, is_readable
 from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
@@ -138,8 +138,7 @@ class PlayerSupervisor:
         except WorkError as error:
             self._patience.begins()
             problem = Decision(error.code, error.what, error.remedy, "error")
-            waited = self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
-            if self._dark and waited and error.code.startswith("bundle-"):
+            if error.code.startswith("bundle-") and self._starts_again():
                 # Only starts are counted, and after three without a picture the player goes back to the bundle before.
                 self._restart(problem)
             else:
@@ -313,14 +312,33 @@ class PlayerSupervisor:
 
         Its starts had another cause than the bundle, such as a display that came late, so none of them was counted.
         """
-        want, now_s = self.want, self._monotonic()
+        want = self.want
         unread = want is not None and want.bundle is not None and not want.appearance
-        if self._with_bundle or not self._dark or not unread or now_s - self._looked_back_s < AGAIN_S:
+        return not self._with_bundle and self._dark and unread and self._earlier() is not None
+
+    def _starts_again(self) -> bool:
+        """Whether a player that can't load a bundle is to. One with a picture shows that of another bundle, such as one
+        without some projectors; of the one before it could show all.
+        """
+        if self._dark:
+            return self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
+        installed, want = self._installed, self.want
+        if installed is None or want is None or want.bundle != installed:
             return False
+        return self._earlier() is not None and not is_readable(installed)
+
+    @property
+    def _installed(self) -> Path | None:
+        link = self._settings(True).bundle
+        return None if link is None else chosen(link.parent)
+
+    def _earlier(self) -> Path | None:
+        """Looked for once a minute: the bundle that can be gone back to from the installed one."""
+        now_s, link = self._monotonic(), self._settings(True).bundle
+        if link is None or now_s - self._looked_back_s < AGAIN_S:
+            return None
         self._looked_back_s = now_s
-        installed = self._settings(True).bundle
-        folder = None if installed is None else installed.parent
-        return folder is not None and before_it(folder, chosen(folder), Starts.read(folder)) is not None
+        return before_it(link.parent, self._installed, Starts.read(link.parent))
 
     def _trouble(self, problem: Decision) -> None:
         if self._view.problem is None or self._view.problem.code != problem.code:
