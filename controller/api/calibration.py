@@ -23,6 +23,7 @@ from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
 from controller.calibrate.photometry.radiometry import measure_radiometry
 from controller.calibrate.photometry.separation import indirect_share, shown_contrast, sinusoid_contrast
+from controller.calibrate.photometry.waveform import coarse_waves, held_to
 from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
 from controller.capture.patterns import plan_patterns
 from controller.capture.profile import CameraProfile, load_profile
@@ -158,6 +159,7 @@ def _calibrated(
         return plain, fitted.mosaic
     encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
+    waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid)
     white = np.nan_to_num(seen.white)
     for _ in range(PASSES):
         linearity = shown_contrast(radiometry, encoded_with)
@@ -166,6 +168,7 @@ def _calibrated(
         )  # fmt: skip
         known = KnownIndirect(share * white, radiometry)
         radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
+        radiometry = held_to(waves, radiometry, encoded_with, share, white)
     thrown = share * white
     stripes = dark_light(captures.pictures, plan, fitted.phase_map.projector_px)
     part = replace(plain, radiometry=radiometry, white=white - thrown, indirect=thrown, stripes=stripes)

@@ -219,7 +219,7 @@ def _fit_mixing(tiles: TileMeasurements, weight: Float64, fit: RadiometryFit, *,
 def _fit_responses(tiles: TileMeasurements, weight: Float64, gamma: Float64, fit: RadiometryFit) -> None:
     curves = _solve(tiles, weight, gamma, fit, white_known=True)
     fit.fall = float(np.max(np.maximum.accumulate(curves, axis=1) - curves))
-    fit.response = np.stack([_rising(curve) for curve in curves])
+    fit.response = np.stack([rising(curve) for curve in curves])
 
 
 def _residual(tiles: TileMeasurements, fit: RadiometryFit) -> Float64:
@@ -298,7 +298,7 @@ def _kept(residual: Float64) -> Float64:
     return np.asarray(np.clip(1 - (residual / (1.6 * scale)) ** 2, 0, None) ** 2)
 
 
-def _rising(values: Float64) -> Float64:
+def rising(values: Float64) -> Float64:
     """The closest sequence that never falls, from 0 to 1."""
     from scipy.optimize import isotonic_regression
 

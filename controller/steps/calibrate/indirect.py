@@ -23,6 +23,7 @@ from controller.calibrate.photometry.separation import (
     shown_contrast,
     sinusoid_contrast,
 )
+from controller.calibrate.photometry.waveform import coarse_waves, held_to
 from controller.core.arrays import FloatImage
 from controller.core.troubles import TroubleCode
 from controller.rig.rig import RigProjector
@@ -65,6 +66,8 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
     white = seen.white
     code = tile_code(captures, plan, light.black, light.white, known_px=known_px, noise=noise)
+    known = pixels.phase_map
+    waves = () if known is None else coarse_waves(captures, plan, light.white, known, pixels.seen)
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
@@ -78,11 +81,11 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
             noise=noise,
             code=code,
         )
+        radiometry = held_to(waves, radiometry, light.response, share, white)
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
     segment = np.array([radiometry.segment]) if radiometry.segment else None
-    known = pixels.phase_map
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
