@@ -1,4 +1,4 @@
-"""Memory of a calibration and the solve of its base image, by step; each size in a process of its own.
+"""Memory of a calibration, of the solve of its base image and of an appearance, by step; each size in its own process.
 
 The calibration is written as a run writes it and read as a run reads it. ``BENCH_RUN=FOLDER`` measures a run that
 exists instead. ``python -m benchmarks.solving.memory FOLDER NAME...`` is one process; it prints one line of JSON.
@@ -25,13 +25,18 @@ from benchmarks import Row, at_most
 from benchmarks.lab.synthetic import PROJECTOR, write_synthetic_run
 from controller.artefacts.calibration import read_calibration
 from controller.artefacts.geometry import projectors_of
-from controller.solve.appearance import base_image, prepare_base
+from controller.calibrate.values import Calibration
+from controller.core.arrays import FloatImage
+from controller.solve.appearance import Base, base_image, prepare_base
 from controller.solve.bounded.solver import solve_bounded
-from controller.solve.memory_need import base_peak_bytes, stage_size
-from controller.transport import build_transport
+from controller.solve.memory_need import solve_peak_bytes, stage_size
+from controller.solve.request import SolveOptions, solve_appearance
+from controller.solve.targets.values import Target
+from controller.transport import LightTransport, build_transport
 
 SIZES: Final = tuple(PROJECTOR)
 GOAL: Final = 240.0
+OPTIONS: Final = SolveOptions(share=0.9, smoothness=1e-3, mode="full", adapt=1.0)
 WATCHED_EVERY_S: Final = 0.002
 _PROCESS: Final = re.compile(r"^(RssAnon|RssFile|RssShmem):\s+(\d+)", re.MULTILINE)
 
@@ -112,12 +117,11 @@ def one_run(run: Path, names: list[str]) -> dict[str, Any]:
         return made
 
     calibration = step("calibration read", lambda: read_calibration(run, names))
-    told = base_peak_bytes(stage_size(calibration))
+    told = solve_peak_bytes(stage_size(calibration))
     transport = step("transport", lambda: build_transport(calibration))
-    image = step("base image", lambda: base_image(calibration, "white"))
     black = calibration.black
-    solution = step("solve", lambda: solve_bounded(transport, image, black))
-    base = step("ready to scale", lambda: prepare_base(transport, image, black, solution))
+    base = _base(step, calibration, transport).in_files(run)
+    made = step("appearance", lambda: solve_appearance(transport, base, black, _target(black), OPTIONS, folder=run))
     watch.end()
     return {
         "pixels": transport.pixels,
@@ -127,8 +131,25 @@ def one_run(run: Path, names: list[str]) -> dict[str, Any]:
         "anonymous": watch.anonymous,
         "mapped": watch.mapped,
         "told": told,
-        "sweeps": base.solution.iterations,
+        "sweeps": [base.solution.iterations, made.figures["iterations"]],
     }
+
+
+def _base(step: Callable[[str, Callable[[], Any]], Any], calibration: Calibration, transport: LightTransport) -> Base:
+    image = step("base image", lambda: base_image(calibration, "white"))
+    solution = step("solve", lambda: solve_bounded(transport, image, calibration.black))
+    base: Base = step("ready to scale", lambda: prepare_base(transport, image, calibration.black, solution))
+    return base
+
+
+def _target(black: FloatImage) -> Target:
+    """A picture of large dark and bright squares and fine colours, part of which is out of reach."""
+    rows, columns = black.shape[:2]
+    y, x = np.ogrid[0:rows, 0:columns]
+    bright = (x // (columns // 9) + y // (rows // 6)) % 2 > 0
+    fine = np.random.default_rng(1).random((rows, columns, 3), np.float32)
+    fine *= np.where(bright, np.float32(0.9), np.float32(0.05))[..., None]
+    return Target(fine, np.ones((rows, columns), np.bool_))
 
 
 def _warm() -> None:
@@ -137,7 +158,8 @@ def _warm() -> None:
         names = write_synthetic_run(Path(folder), projector=(34, 44), camera=(82, 122))
         calibration = read_calibration(Path(folder), names)
         transport, image = build_transport(calibration), base_image(calibration, "white")
-        prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
+        base = prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
+        solve_appearance(transport, base, calibration.black, _target(calibration.black), OPTIONS)
         np.percentile(image, 50)
 
 

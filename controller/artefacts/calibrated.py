@@ -66,7 +66,8 @@ class Calibrated:
         if not self._indirect_known:
             geometry = read_geometry(self.folder) if has_geometry(self.folder) else None
             points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)
-            self._indirect = fit_indirect(self.calibration, self.transport.object_mask, points_m, normals)
+            found = fit_indirect(self.calibration, self.transport.object_mask, points_m, normals)
+            self._indirect = None if found is None else found.in_files(self.folder)
             self._indirect_known = True
         return self._indirect
 
@@ -88,13 +89,14 @@ class Calibrated:
         """The solved base image, as the step of that kind wrote it."""
         if self._base is None:
             solved = SolvedBase.read(self.base_folder, self.projectors)
-            self._base = prepare_base(self.transport, solved.image, self.calibration.black, solved.solution)
+            base = prepare_base(self.transport, solved.image, self.calibration.black, solved.solution)
+            self._base = base.in_files(self.folder)
         return self._base
 
     @property
     def drive(self) -> DriveLevels:
         if self._drive is None:
-            self._drive = DriveLevels(self.transport)
+            self._drive = DriveLevels(self.transport, self.folder)
         return self._drive
 
     @property
@@ -106,4 +108,4 @@ class Calibrated:
         return self._reflectance
 
     def keep_base(self, base: Base) -> None:
-        self._base = base
+        self._base = base.in_files(self.folder)

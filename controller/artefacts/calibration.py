@@ -27,10 +27,9 @@ from controller.calibrate.values import (
 )
 from controller.capture.brackets import merge_brackets
 from controller.capture.raw import CAMERA_BLUR_PX
-from controller.core.arrays import FloatImage, Mask, array_in_file
+from controller.core.arrays import FloatImage, Mask, array_in_file, strips
 from controller.core.channels import smallest
 
-ROWS_AT_ONCE = 256
 LIT_SHARE = 0.004
 """A camera pixel counts as lit if a projector's white is above this share of the brightest white."""
 
@@ -95,8 +94,7 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
 def _times(white: FloatImage, gain: npt.NDArray[np.floating], folder: Path) -> FloatImage:
     """Their product, in a nameless file of the run's disk where it is large."""
     product = array_in_file(folder, white.shape)
-    for first in range(0, len(white), ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
+    for rows in strips(len(white)):
         np.multiply(gain[rows].astype(np.float32), white[rows], out=product[rows])
     return product
 
@@ -104,8 +102,7 @@ def _times(white: FloatImage, gain: npt.NDArray[np.floating], folder: Path) -> F
 def _parted(white: FloatImage, share: npt.NDArray[np.floating], folder: Path) -> tuple[FloatImage, FloatImage]:
     """The direct and the indirect part of a white image, in nameless files of the run's disk where they are large."""
     direct, indirect = (array_in_file(folder, white.shape) for _ in range(2))
-    for first in range(0, len(white), ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
+    for rows in strips(len(white)):
         np.multiply(share[rows].astype(np.float32), white[rows], out=indirect[rows])
         np.subtract(white[rows], indirect[rows], out=direct[rows])
     return direct, indirect

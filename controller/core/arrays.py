@@ -14,9 +14,9 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Final, TypeAlias
+from typing import IO, Any, BinaryIO, Final, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,10 @@ ByteImage: TypeAlias = npt.NDArray[np.uint8]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 """(rows, columns)."""
 Float64: TypeAlias = npt.NDArray[np.float64]
+Array = TypeVar("Array", bound=npt.NDArray[Any])
 
+STRIP_ROWS: Final = 128
+"""Of a picture that is worked on in strips, so that what is needed on the way is small."""
 ALIGNMENT: Final = 64
 MAPPED_FROM: Final = 32 * 1024 * 1024
 """Bytes from which a file is mapped instead of read, and an array worth a file."""
@@ -48,6 +51,11 @@ _DAMAGED: Final = (
     zipfile.BadZipFile,
 )  # fmt: skip
 """What the libraries raise for a file that is not what it should be."""
+
+
+def strips(rows: int, at_once: int = STRIP_ROWS) -> Iterator[slice]:
+    """All rows of a picture, some at a time."""
+    return (slice(first, min(first + at_once, rows)) for first in range(0, rows, at_once))
 
 
 def save_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -121,18 +129,36 @@ def _check(data: memoryview, member: zipfile.ZipInfo) -> None:
         raise zipfile.BadZipFile(f"{member.filename} does not match its checksum")
 
 
-def array_in_file(folder: Path, shape: tuple[int, ...], *, from_bytes: int = MAPPED_FROM) -> FloatImage:
-    """An empty float32 array that need not stay in memory: in a nameless file of ``folder``, which ends with it.
+def array_in_file(
+    folder: Path, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, *, from_bytes: int = MAPPED_FROM
+) -> npt.NDArray[Any]:
+    """An empty array that need not stay in memory: in a nameless file of ``folder``, which ends with it.
 
     Below ``from_bytes``, or where no file can be had, it is in memory.
     """
-    size = math.prod(shape) * 4
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= max(from_bytes, 1):
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 os.posix_fallocate(file.fileno(), 0, size)
-                return np.frombuffer(mmap.mmap(file.fileno(), size), np.float32).reshape(shape)
+                return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
         except OSError:
             # a full or read-only disk: memory will do, or say that it does not
             pass
-    return np.empty(shape, np.float32)
+    return np.empty(shape, dtype)
+
+
+def moved_to_file(array: Array, folder: Path | None, *, from_bytes: int = MAPPED_FROM) -> Array:
+    """The same numbers, as in ``array_in_file`` where they are many, else ``array`` itself; so without a ``folder``."""
+    if folder is None or array.nbytes < from_bytes or _is_mapped(array):
+        return array
+    moved = array_in_file(folder, array.shape, array.dtype, from_bytes=from_bytes)
+    moved[...] = array
+    return cast("Array", moved)
+
+
+def _is_mapped(array: npt.NDArray[Any]) -> bool:
+    owner: object = array
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    return isinstance(owner, memoryview | mmap.mmap)

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, strips
 from controller.core.channels import largest
 from controller.core.errors import UsageError
 from controller.solve.bounded.solver import check_target
@@ -74,66 +74,109 @@ def adapted_target(
     drive = DriveLevels(transport) if drive is None else drive
     if strength == 0 or not drive.mask.any():
         return np.asarray(wanted, np.float32)
-    limits = SmoothLimits.on(drive.mask)
-    asked = np.maximum(wanted, 0)
-    lifted, lowest = _lifted(asked, floor, drive, limits)
-    paler = _paler(lifted, lowest, floor, drive, limits)
-    bent = _dimmed(paler, floor, drive, limits)
-    changed = np.where(drive.mask[..., None], wanted + np.float32(strength) * (bent - wanted), wanted)
-    return np.asarray(changed, np.float32)
+    target = _Bent(np.asarray(wanted, np.float32), np.asarray(floor, np.float32), drive, SmoothLimits.on(drive.mask))
+    target.lift()
+    target.pale()
+    return target.dimmed(strength)
 
 
-def _lifted(
-    wanted: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits
-) -> tuple[FloatImage, FloatImage]:
-    """``wanted`` with its darkest parts raised by grey light, and (rows, columns) the darkest grey of each pixel."""
-    grey = wanted @ GREY
-    lowest = _quotient(drive.of(floor), drive.of(np.ones_like(wanted)), otherwise=0.0)
-    lowest = np.maximum(largest(lowest), 0)
-    lacking = drive.mask & (grey < lowest)
-    level = limits.above(np.where(lacking, lowest, 0).astype(np.float32))
-    raised = _soft_maximum(grey, level)
-    return np.asarray(wanted + (raised - grey)[..., None], np.float32), np.maximum(lowest, level)
+class _Bent:
+    """A target on its way. The steps work on strips of rows, and keep what a whole picture has to be known for.
 
-
-def _paler(
-    lifted: FloatImage, lowest: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits
-) -> FloatImage:
-    """With less chroma where a channel would have to be darker than dark.
-
-    A channel's share of grey light says how saturated a colour is; the limit is on the smallest of these shares.
+    ``lowest``, ``level`` (rows, columns): the darkest grey of each pixel, and what the smooth floor makes of it;
+    ``chroma`` (rows, columns): what is left of the saturation, from 0 to 1
     """
-    grey = np.maximum(lifted @ GREY, np.float32(1e-12))[..., None]
-    share = lifted / grey
-    of_grey, of_colour = np.maximum(drive.of(grey - floor), 0), drive.of(lifted - floor)
-    kept = _quotient(of_grey, of_grey - of_colour, otherwise=1.0)
-    clear = np.clip((grey[..., 0] / np.maximum(lowest, np.float32(1e-12)) - 1) / CLEAR, 0, 1)
-    lacking = drive.mask[..., None] & (of_colour < -FORGIVEN)
-    chroma = np.ones(drive.mask.shape, np.float32)
-    for channel in range(3):
-        own = share[..., channel]
-        need = own + clear * (1 - kept[..., channel]) * (1 - own)
-        limit = limits.above(np.where(lacking[..., channel] & (own < 1), need, 0).astype(np.float32))
-        raised = np.minimum(_soft_maximum(own, limit), 1)
-        chroma = np.minimum(chroma, _quotient(1 - raised, 1 - own, otherwise=1.0, where=own < 1))
-    # Written so that full chroma leaves every bit as it is.
-    return np.asarray(lifted + (1 - np.clip(chroma, 0, 1))[..., None] * (grey - lifted), np.float32)
 
+    def __init__(self, wanted: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits) -> None:
+        self._wanted, self._floor, self._drive, self._limits = wanted, floor, drive, limits
+        self._lowest = self._level = np.zeros(drive.mask.shape, np.float32)
+        self._chroma: FloatImage = np.ones(drive.mask.shape, np.float32)
 
-def _dimmed(target: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits) -> FloatImage:
-    """With its brightest parts bent below a smooth ceiling."""
-    levels = drive.of(target - floor)
-    over = drive.mask[..., None] & (levels > 1 + FORGIVEN)
-    if not over.any():
-        return target
-    most = np.maximum(floor + drive.light(np.clip(levels, 0, 1)), np.float32(1e-12))
-    top = np.float32(target[drive.mask].max() / KNEE)
-    depth = np.where(over, np.clip(np.log(top / most), 0, DEEPEST), 0).astype(np.float32)
-    ceiling = top * np.exp(-np.stack([limits.above(depth[..., channel]) for channel in range(3)], axis=2))
-    of_ceiling = target / ceiling
-    gain = _quotient(_shoulder(of_ceiling), of_ceiling, otherwise=1.0)
-    together = gain.min(axis=2, keepdims=True)
-    return np.asarray(target * gain ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER), np.float32)
+    def lift(self) -> None:
+        """Raise the darkest parts by grey light."""
+        need = np.zeros_like(self._lowest)
+        for rows in strips(len(need)):
+            floor, wanted = self._floor[rows], np.maximum(self._wanted[rows], 0)
+            lowest = _quotient(self._drive.of(floor, rows), self._drive.of(np.ones_like(floor), rows), otherwise=0.0)
+            self._lowest[rows] = np.maximum(largest(lowest), 0)
+            lacking = self._drive.mask[rows] & (wanted @ GREY < self._lowest[rows])
+            need[rows] = np.where(lacking, self._lowest[rows], 0)
+        self._level = self._limits.above(need)
+        np.maximum(self._lowest, self._level, out=self._lowest)
+
+    def pale(self) -> None:
+        """Take chroma away where a channel would have to be darker than dark.
+
+        A channel's share of grey light says how saturated a colour is; the limit is on the smallest of these shares.
+        """
+        needs = np.zeros((3, *self._chroma.shape), np.float32)
+        for rows in strips(self._chroma.shape[0]):
+            needs[:, rows] = self._chroma_needed(rows)
+        for channel in range(3):
+            needs[channel] = self._limits.above(needs[channel])
+        for rows in strips(self._chroma.shape[0]):
+            chroma = np.ones_like(self._chroma[rows])
+            lifted, grey = self._lifted(rows)
+            for channel, limit in enumerate(needs[:, rows]):
+                own = lifted[..., channel] / grey
+                raised = np.minimum(_soft_maximum(own, limit), 1)
+                chroma = np.minimum(chroma, _quotient(1 - raised, 1 - own, otherwise=1.0, where=own < 1))
+            self._chroma[rows] = np.clip(chroma, 0, 1)
+
+    def _chroma_needed(self, rows: slice) -> FloatImage:
+        """(3, rows, columns): the least share of grey light that each channel can show, 0 where it can show its own."""
+        lifted, grey = self._lifted(rows)
+        floor = self._floor[rows]
+        of_grey = np.maximum(self._drive.of(grey[..., None] - floor, rows), 0)
+        of_colour = self._drive.of(lifted - floor, rows)
+        kept = _quotient(of_grey, of_grey - of_colour, otherwise=1.0)
+        clear = np.clip((grey / np.maximum(self._lowest[rows], np.float32(1e-12)) - 1) / CLEAR, 0, 1)[..., None]
+        own = lifted / grey[..., None]
+        need = own + clear * (1 - kept) * (1 - own)
+        lacking = self._drive.mask[rows][..., None] & (of_colour < -FORGIVEN) & (own < 1)
+        return np.moveaxis(np.where(lacking, need, 0), 2, 0).astype(np.float32)
+
+    def dimmed(self, strength: float) -> FloatImage:
+        """Bend the brightest parts below a smooth ceiling; all steps together, as strong as ``strength``."""
+        rows_of, mask = list(strips(len(self._wanted))), self._drive.mask
+        top = np.float32(max(self._paler(rows)[mask[rows]].max(initial=0) for rows in rows_of) / KNEE)
+        depths = np.empty((3, *mask.shape), np.float32)
+        for rows in rows_of:
+            depths[:, rows] = np.moveaxis(self._depth(rows, top), 2, 0)
+        is_dimmed = bool(depths.any())
+        for channel in range(3 if is_dimmed else 0):
+            depths[channel] = self._limits.above(depths[channel])
+        changed = self._wanted.copy()
+        for rows in rows_of:
+            bent = self._paler(rows)
+            if is_dimmed:
+                of_ceiling = np.asarray(bent / (top * np.exp(-np.moveaxis(depths[:, rows], 0, 2))), np.float32)
+                gain = _quotient(_shoulder(of_ceiling), of_ceiling, otherwise=1.0)
+                together = gain.min(axis=2, keepdims=True)
+                bent *= gain ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER)
+            wanted = self._wanted[rows]
+            changed[rows] = np.where(mask[rows][..., None], wanted + np.float32(strength) * (bent - wanted), wanted)
+        return changed
+
+    def _depth(self, rows: slice, top: np.float32) -> FloatImage:
+        """(rows, columns, 3): how far the ceiling is below ``top``; 0 where light is not lacking."""
+        target, floor = self._paler(rows), self._floor[rows]
+        levels = self._drive.of(target - floor, rows)
+        over = self._drive.mask[rows][..., None] & (levels > 1 + FORGIVEN)
+        most = np.maximum(floor + self._drive.light(np.clip(levels, 0, 1), rows), np.float32(1e-12))
+        return np.where(over, np.clip(np.log(top / most), 0, DEEPEST), 0).astype(np.float32)
+
+    def _lifted(self, rows: slice) -> tuple[FloatImage, FloatImage]:
+        """The target after ``lift``, and (rows, columns) its grey."""
+        wanted = np.maximum(self._wanted[rows], 0)
+        grey = wanted @ GREY
+        lifted = np.asarray(wanted + (_soft_maximum(grey, self._level[rows]) - grey)[..., None], np.float32)
+        return lifted, np.maximum(lifted @ GREY, np.float32(1e-12))
+
+    def _paler(self, rows: slice) -> FloatImage:
+        """The target after ``pale``. Full chroma leaves every bit as it is."""
+        lifted, grey = self._lifted(rows)
+        return np.asarray(lifted + (1 - self._chroma[rows])[..., None] * (grey[..., None] - lifted), np.float32)
 
 
 def _shoulder(value: FloatImage) -> FloatImage:

@@ -7,20 +7,22 @@ camera's colours, M p, so that projectors of different primaries are scaled alik
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Literal
 
 import cv2
 import numpy as np
 
 from controller.calibrate.values import Calibration
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, moved_to_file
 from controller.core.channels import largest
 from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
-from controller.transport.planes import frame_planes, plane_frames, plane_image, planes_above
+from controller.transport.planes import frame_planes, plane_frames, planes_above
 
 BaseKind = Literal["minimum", "white"]
 BaseChoice = Literal["minimum", "white", "high-pass"]
@@ -54,6 +56,16 @@ class Base:
     inverse: FloatImage
     coverage: FloatImage
     mixed: FloatImage
+
+    def in_files(self, folder: Path) -> Base:
+        """The same; what is large need not stay in memory, but in nameless files of ``folder``."""
+        frames = tuple(moved_to_file(frame, folder) for frame in self.solution.frames)
+        light, image, inverse, coverage, mixed = (
+            moved_to_file(one, folder)
+            for one in (self.solution.light, self.image, self.inverse, self.coverage, self.mixed)
+        )
+        solution = dataclasses.replace(self.solution, frames=frames, light=light)
+        return Base(image, solution, inverse, coverage, mixed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,13 +187,16 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
 
     F is half a cycle a projector pixel, whose pitch in the camera is the root of camera pixels by projector pixels.
     """
-    light = np.maximum(target - black, 0)
-    inverse = plane_image(base.inverse)
-    scale = light * inverse
-    low = _low_pass(transport, scale, (inverse > 0).astype(np.float32))
-    fine = np.divide(scale - low, inverse, out=np.zeros_like(scale), where=inverse > 0)
-    whole = float((light[transport.object_mask].astype(np.float64) ** 2).sum())
-    return float(np.sqrt((fine[transport.object_mask].astype(np.float64) ** 2).sum() / whole)) if whole > 0 else 0.0
+    mask = transport.object_mask
+    whole = fine = 0.0
+    for channel, inverse in enumerate(base.inverse):
+        light = np.maximum(target[..., channel] - black[..., channel], 0)
+        scale = light * inverse
+        left = scale - _low_pass(transport, scale, (inverse > 0).astype(np.float32))
+        np.divide(left, inverse, out=left, where=inverse > 0)
+        whole += float((light[mask].astype(np.float64) ** 2).sum())
+        fine += float((left[mask & (inverse > 0)].astype(np.float64) ** 2).sum())
+    return float(np.sqrt(fine / whole)) if whole > 0 else 0.0
 
 
 def _as_good(
@@ -215,7 +230,7 @@ def _lost(seen: FloatImage, wanted: FloatImage, mask: Mask) -> float:
 def _low_pass(
     transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
 ) -> FloatImage:
-    """The image below that part of the coarsest projector's frequency limit, where ``present``; (rows, columns, 3)."""
+    """The image, (rows, columns) or with channels, below that part of the coarsest projector's frequency limit."""
     pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
     # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
     sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi / of_limit

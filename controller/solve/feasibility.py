@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask
-from controller.core.channels import largest
+from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.channels import finite, largest, smallest
 from controller.core.errors import UsageError, WorkError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
@@ -16,22 +17,33 @@ from controller.transport import LightTransport
 
 FORGIVEN_DRIVE: Final = 2e-3
 """So much drive beyond black and white still counts as in reach."""
+MOST_BEYOND: Final = 6e4
+"""float16 ends at 65504."""
 
 
 @dataclass(frozen=True, slots=True)
 class Feasibility:
     """Which part of a target radiance the projectors can make.
 
-    ``too_bright``, ``too_dark`` (rows, columns, 3) float32, >= 0: by how much the channels of the projectors would have
-    to be driven above white, or below black; 1 is all of a channel's light
+    ``beyond`` (rows, columns, 3) float16: by how much the channels of the projectors would have to be driven above
+    white, negative: below black; 1 is all of a channel's light
     ``reachable`` (rows, columns) bool: on the object, and neither too bright, too dark nor too saturated
     ``share``: the part of the object's pixels that is reachable
     """
 
-    too_bright: FloatImage
-    too_dark: FloatImage
+    beyond: npt.NDArray[np.float16]
     reachable: Mask
     share: float
+
+    @property
+    def too_bright(self) -> npt.NDArray[np.float16]:
+        """(rows, columns, 3), >= 0."""
+        return np.maximum(self.beyond, np.float16(0))
+
+    @property
+    def too_dark(self) -> npt.NDArray[np.float16]:
+        """(rows, columns, 3), >= 0."""
+        return np.maximum(-self.beyond, np.float16(0))
 
 
 def feasibility(
@@ -48,12 +60,15 @@ def feasibility(
     """
     check_target(transport, target)
     drive = DriveLevels(transport) if drive is None else drive
-    needed = drive.of(target - black)
-    bright, dark = np.maximum(needed - 1, 0), np.maximum(-needed, 0)
     mask = drive.mask
-    reachable: Mask = mask & (largest(bright) <= margin) & (largest(dark) <= margin)
+    beyond, reachable = np.empty(target.shape, np.float16), np.empty(mask.shape, np.bool_)
+    for rows in strips(len(target)):
+        needed = drive.of(target[rows] - black[rows], rows)
+        off = needed - np.clip(needed, 0, 1)
+        reachable[rows] = mask[rows] & (largest(np.abs(off)) <= margin)
+        beyond[rows] = np.clip(off, -MOST_BEYOND, MOST_BEYOND)
     share = float(reachable[mask].mean()) if mask.any() else 0.0
-    return Feasibility(bright, dark, reachable, share)
+    return Feasibility(beyond, reachable, share)
 
 
 def choose_exposure(
@@ -79,17 +94,11 @@ def choose_exposure(
             remedy="Give a share above 0 and up to 1, for example 0.95.",
         )
     drive = DriveLevels(transport) if drive is None else drive
-    mask = drive.mask
-    per_exposure, at_none = drive.of(target)[mask].astype(np.float64), drive.of(-black)[mask].astype(np.float64)
-    possible = np.isfinite(per_exposure).all(axis=1) & np.isfinite(at_none).all(axis=1)
-    per_exposure, at_none = per_exposure[possible], at_none[possible]
-    room = np.full_like(per_exposure, np.inf)
-    # less than this needs no light worth counting, and its quotient would only overflow
-    largest = np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12).min(axis=1)
-    largest.sort()
+    most = np.concatenate([_most(drive, target[rows], black[rows], rows) for rows in strips(len(target))])
+    most.sort()
     # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
-    bound = int(np.floor((1 - share) * largest.size))
-    exposure = float(largest[min(bound, largest.size - 1)]) if largest.size else 0.0
+    bound = int(np.floor((1 - share) * most.size))
+    exposure = float(most[min(bound, most.size - 1)]) if most.size else 0.0
     if not 0 < exposure < np.inf:
         raise WorkError(
             "no-light",
@@ -97,6 +106,17 @@ def choose_exposure(
             remedy="Check the target. Check that the projectors lit the object during the calibration.",
         )
     return exposure
+
+
+def _most(drive: DriveLevels, target: FloatImage, black: FloatImage, rows: slice) -> Float64:
+    """(pixels,): the largest exposure of each pixel of the object in some rows of the picture."""
+    mask = drive.mask[rows]
+    per_exposure, at_none = (drive.of(light, rows)[mask].astype(np.float64) for light in (target, -black))
+    possible = finite(per_exposure) & finite(at_none)
+    per_exposure, at_none = per_exposure[possible], at_none[possible]
+    room = np.full_like(per_exposure, np.inf)
+    # less than this needs no light worth counting, and its quotient would only overflow
+    return smallest(np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12))
 
 
 def target_radiance(target: FloatImage, black: FloatImage, exposure: float) -> FloatImage:

@@ -1,4 +1,4 @@
-"""How much memory calibrating and a base image take at their peak, calculated before they begin (docs/decisions/0055).
+"""How much memory calibrations and solves take at their peak, calculated before they begin (docs/decisions/0055).
 
 Counted are arrays of the process itself. A calibration's own arrays lie in files, and what of them is in memory can be
 had back by the system at any time.
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from controller.calibrate.values import Calibration
+from controller.core.arrays import MAPPED_FROM
 from controller.core.errors import WorkError
 
 WINDOW: Final = 15
@@ -25,6 +26,8 @@ FITTED: Final = 75
 as many pixels as the camera."""
 PHOTOGRAPHED: Final = 17
 """The same of the photograph of the next projector that is read meanwhile."""
+INDIRECT, PAINT, SPREAD = 13, 18, 16
+"""Of what is known of a stage's indirect light, of colours that depend on the paint, and of light under the surface."""
 SPARE: Final = 1.1
 """Small arrays, stacks and tables of threads."""
 PROGRAM: Final = 300 * 1024 * 1024
@@ -37,7 +40,7 @@ class StageSize:
 
     ``camera``, ``projectors``: pixels of the camera, and of all projectors together; ``count`` of projectors
     ``windows``: pairs of a camera sample and a projector that lights it; ``samples``: of the camera, one a pixel with
-    a mosaic, else three
+    a mosaic, else three; ``has_indirect``, ``has_paint``, ``has_spread``: what is known of the stage's light
     """
 
     camera: int
@@ -45,6 +48,9 @@ class StageSize:
     count: int
     windows: int
     samples: int
+    has_indirect: bool = False
+    has_paint: bool = False
+    has_spread: bool = False
 
     @property
     def transport(self) -> int:
@@ -59,7 +65,13 @@ def stage_size(calibration: Calibration) -> StageSize:
     count = len(calibration.projectors)
     pixels = sum(part.metapixels.valid.size for part in calibration.projectors)
     camera = calibration.object_mask.size
-    return StageSize(camera, pixels, count, count * lit * channels, camera * channels)
+    parts = calibration.projectors
+    return StageSize(
+        camera, pixels, count, count * lit * channels, camera * channels,
+        has_indirect=any(part.indirect is not None for part in parts),
+        has_paint=all(part.radiometry.paint is not None for part in parts),
+        has_spread=any(part.spread is not None for part in parts),
+    )  # fmt: skip
 
 
 def planned_size(camera_px: tuple[int, int], projectors_px: Sequence[tuple[int, int]]) -> StageSize:
@@ -85,6 +97,28 @@ def base_peak_bytes(size: StageSize) -> int:
     ended = solving + 36 * P + 24 * C
     prepared = size.transport + 24 * C + 12 * P + 3 * C + max(12 * C + 12 * P + means, 15 * C + 36 * P)
     return int(SPARE * max(built, smoothed, begun, swept, ended, prepared)) + PROGRAM
+
+
+def appearance_peak_bytes(size: StageSize) -> int:
+    """Bytes at the peak of making a target reachable and solving it, its base ready to be scaled."""
+    C, P, W, S = size.camera, size.projectors, size.windows, size.samples
+    own = 12 * P // max(size.count, 1)
+    known = INDIRECT * size.has_indirect + PAINT * size.has_paint + SPREAD * size.has_spread
+    # Small images stay in memory: light of white, the base, what is known, and the target.
+    here = C if 12 * C < MAPPED_FROM else 0
+    kept = size.transport + C + (36 * P if own < MAPPED_FROM else 0) + (36 + 36 + known) * here
+    aimed = kept + 12 * C + 12 * here + 7 * C
+    floor = 12 * C if known else 0
+    adapted = aimed + floor + 12 * C + 12 * C + 12 * C + 24 * C
+    apart = aimed + 12 * here + (12 + 12 + 12 + 12 + 24) * C + (PAINT * size.has_paint + 16 * size.has_spread) * C
+    begun = kept + 36 * here + floor + (14 + 1 + 4) * C + 24 * P + 12 * C + 12 * P + 2 * own + 4 * W + 4 * S
+    swept = kept + 36 * here + floor + (14 + 1 + 8) * C + 24 * P + 36 * P + 20 * S
+    return int(SPARE * max(adapted, apart if known else 0, begun, swept)) + PROGRAM
+
+
+def solve_peak_bytes(size: StageSize) -> int:
+    """Bytes at the peak of a base image and of the appearances after it."""
+    return max(base_peak_bytes(size), appearance_peak_bytes(size))
 
 
 def calibration_peak_bytes(size: StageSize) -> int:

@@ -10,11 +10,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, moved_to_file
 from controller.solve.adapt import adapted_target
 from controller.solve.appearance import (
     FINE_DETAIL,
@@ -106,24 +107,30 @@ def solve_appearance(
     progress: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     engine: Engine | None = None,
+    folder: Path | None = None,
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
     ``indirect``: light by way of other surfaces, of which the frames then leave room in the target.
     ``engine``: what does the heavy loops (``engines``); None: the processor
+    ``folder``: for nameless files of what need not stay in memory during the solve; None: it stays there
 
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
     """
-    drive = DriveLevels(transport) if drive is None else drive
-    aim = aim_at(transport, black, requested.image, options, drive=drive, indirect=indirect)
+    drive = DriveLevels(transport, folder) if drive is None else drive
+    picture, valid = requested.image, requested.mask
+    del requested
+    aim = aim_at(transport, black, picture, options, drive=drive, indirect=indirect, folder=folder)
+    del picture
     began_s = time.perf_counter()
     solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled,
                     engine=engine)  # fmt: skip
     made = solve(aim.direct, tolerance=TOLERANCE if indirect is None else FIRST_TOLERANCE)
     if indirect is not None:
         # what can't be reached throws back other light than was wanted of it
-        light = indirect.forward(transport.forward(made.frames))
-        made = solve(target_radiance(aim.wanted - light, black, 1.0), start=made.frames)
+        frames = made.frames
+        del made
+        made = solve(_left_to_make(transport, aim.wanted, black, frames, indirect), start=frames)
     figures = aim.figures | {
         "mode": made.mode,
         "seconds": time.perf_counter() - began_s,
@@ -132,7 +139,6 @@ def solve_appearance(
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
-    valid = requested.mask
     reachable, asked_reachable = (found.reachable & valid for found in (aim.possible, aim.asked_possible))
     return AppearanceResult(made.frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
 
@@ -163,25 +169,46 @@ def aim_at(
     *,
     drive: DriveLevels,
     indirect: IndirectLight | None = None,
+    folder: Path | None = None,
 ) -> Aim:
     """Expose a picture, see what of it is in reach, and adapt it if asked.
 
     With ``indirect`` light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
-    dark, too, where more indirect light falls than is wanted. Raises what ``choose_exposure`` raises.
+    dark, too, where more indirect light falls than is wanted. ``folder``: as of ``solve_appearance``. Raises what
+    ``choose_exposure`` raises.
     """
     found = expose_target(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
-    wanted, needed, possible = found.wanted, found.needed, found.possible
-    figures: dict[str, float | int | str | None] = {"exposure": found.exposure, "reachable_share": possible.share}
+    asked, exposure, asked_possible = moved_to_file(found.wanted, folder), found.exposure, found.possible
+    wanted, needed, possible = asked, found.needed, asked_possible
+    del found
+    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
     if options.adapt > 0:
         for _ in range(1 if indirect is None else ADAPTATIONS):
-            shown = np.clip(needed - black, 0, transport.reach())
-            floor = black if indirect is None else black + indirect.forward(shown)
-            wanted = adapted_target(transport, found.wanted, floor, strength=options.adapt, drive=drive)
+            floor = black if indirect is None else _least(transport, black, needed, indirect)
+            # Each is as large as the camera's picture, so none stays while the next one is made.
+            del wanted, needed
+            wanted = adapted_target(transport, asked, floor, strength=options.adapt, drive=drive)
+            wanted = moved_to_file(wanted, folder)
+            del floor
             needed = direct_part(transport, wanted, black, indirect)
         possible = feasibility(transport, needed, black, drive=drive)
         figures |= {"adapted_share": possible.share}
-    direct = target_radiance(needed, black, 1.0)
-    return Aim(wanted, direct, possible, found.wanted, found.possible, found.exposure, figures)
+    direct = moved_to_file(target_radiance(needed, black, 1.0), folder)
+    return Aim(wanted, direct, possible, asked, asked_possible, exposure, figures)
+
+
+def _left_to_make(
+    transport: LightTransport, wanted: FloatImage, black: FloatImage, frames: Sequence[FloatImage],
+    indirect: IndirectLight,
+) -> FloatImage:  # fmt: skip
+    """The radiance (rows, columns, 3) that direct light has to make beside the indirect light of ``frames``."""
+    return target_radiance(wanted - indirect.forward(transport.forward(frames)), black, 1.0)
+
+
+def _least(transport: LightTransport, black: FloatImage, needed: FloatImage, indirect: IndirectLight) -> FloatImage:
+    """What is there (rows, columns, 3) without any projector's direct light, where ``needed`` is shown around."""
+    shown = np.clip(needed - black, 0, transport.reach())
+    return black + indirect.forward(shown)
 
 
 def _solved(

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, strips
 
 CELL: Final = 0.012
 """Side of a cell, relative to the picture's longer side."""
@@ -75,17 +75,15 @@ class SmoothLimits:
 
     def _on_pixels(self, values: FloatImage) -> FloatImage:
         """Values of cells, interpolated over those that hold a pixel of the object."""
-        rows, columns = self.mask.shape
-        across, down = ((np.arange(n, dtype=np.float32) - (self.side - 1) / 2) / self.side for n in (columns, rows))
-        at_x, at_y = np.meshgrid(across.astype(np.float32), down.astype(np.float32))
-
-        def spread(image: FloatImage) -> FloatImage:
-            soft = cv2.GaussianBlur(image, (0, 0), SOFT_CELLS)
-            found = cv2.remap(soft, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            return np.asarray(found, np.float32)
-
-        share = np.maximum(spread(self.cells.astype(np.float32)), np.float32(1e-3))
-        return np.asarray(np.where(self.mask, spread(values) / share, 0), np.float32)
+        columns, rows = (np.arange(n, dtype=np.float32) for n in self.mask.shape[::-1])
+        across, down = (((at - (self.side - 1) / 2) / self.side).astype(np.float32) for at in (columns, rows))
+        soft = [cv2.GaussianBlur(image, (0, 0), SOFT_CELLS) for image in (values, self.cells.astype(np.float32))]
+        found = np.empty(self.mask.shape, np.float32)
+        for part in strips(len(found)):
+            at = np.meshgrid(across, down[part])
+            value, share = (cv2.remap(one, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in soft)
+            found[part] = np.where(self.mask[part], value / np.maximum(share, np.float32(1e-3)), 0)
+        return found
 
 
 def lowest_above(stiffness: Any, obstacle: Float64) -> Float64:

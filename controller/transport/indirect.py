@@ -12,18 +12,19 @@ y = (I + N)(I + D) d, the camera sees y + S up F down y.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, moved_to_file, strips
 from controller.transport.surfaces.blocks import down, down_adjoint, up, up_adjoint
 from controller.transport.surfaces.surface_light import SurfaceLight
 
 ROUNDS: Final = 30
-ROWS_AT_ONCE: Final = 128
 CONVERGED: Final = 1e-5
 """Relative change of the direct light, at which it is known."""
 LEAST_VOLUME: Final = 0.02
@@ -73,6 +74,19 @@ class IndirectLight:
         painted = direct if self.paint is None else direct + _times(self.paint, direct)
         return painted, np.float32(0) if self.surface is None else self.surface.forward(painted)
 
+    def _shown(self, direct: FloatImage, reach: FloatImage | None) -> tuple[FloatImage, FloatImage | None]:
+        """What falls on surfaces while what can be shown of ``direct`` is shown, and what spreads under them."""
+        own = np.empty(direct.shape, np.float32)
+        for rows in strips(len(own)):
+            part = displayable(direct[rows], None if reach is None else reach[rows])
+            own[rows] = part if self.paint is None else part + _times(self.paint[:, :, rows], part)
+        spread = None if self.surface is None else self.surface.forward(own)
+        if spread is not None:
+            own += spread
+        blocks = down(own, self.grid, self.side)
+        del own
+        return up(self.factors @ blocks, self.grid, self.side, self.lit.shape), spread
+
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
         blocks = self.factors @ down(direct, self.grid, self.side)
@@ -94,20 +108,35 @@ class IndirectLight:
         It is negative where more indirect light falls than is wanted. No light is less than none, nor more than
         ``reach``, so that G takes no more than that of it.
         """
-        lit = self.lit[..., None]
-        wanted = np.where(lit, total, 0).astype(np.float32)
         unpainted = None if self.paint is None else _inverse(self.paint)
-        direct = wanted if unpainted is None else wanted + _times(unpainted, wanted)
-        size = max(float(np.abs(wanted).max(initial=0)), 1e-30)
+        direct = np.zeros(total.shape, np.float32)
+        size = self._approached(direct, total, unpainted)
         for _ in range(ROUNDS):
-            painted, spread = self._own(displayable(direct, reach))
-            after = np.where(lit, wanted - self.scale * self.falling(painted + spread) - spread, 0)
-            after = after if unpainted is None else after + _times(unpainted, after)
-            change = float(np.abs(after - direct).max(initial=0))
-            direct = after.astype(np.float32, copy=False)
-            if change < CONVERGED * size:
+            falling, spread = self._shown(direct, reach)
+            if self._approached(direct, total, unpainted, falling, spread) < CONVERGED * max(size, 1e-30):
                 break
         return direct
+
+    def _approached(
+        self, direct: FloatImage, total: FloatImage, unpainted: Colours | None, falling: FloatImage | None = None,
+        spread: FloatImage | None = None,
+    ) -> float:  # fmt: skip
+        """Let ``direct`` be what is left of ``total`` beside other light; the largest change of a number."""
+        change = 0.0
+        for rows in strips(len(direct)):
+            left = np.asarray(total[rows], np.float32)
+            left = left if falling is None else left - self.scale[rows] * falling[rows]
+            left = np.where(self.lit[rows][..., None], left if spread is None else left - spread[rows], 0)
+            left = left if unpainted is None else left + _times(unpainted[:, :, rows], left)
+            change = max(change, float(np.abs(left - direct[rows]).max(initial=0)))
+            direct[rows] = left
+        return change
+
+    def in_files(self, folder: Path) -> Self:
+        """The same; what is large need not stay in memory, but in nameless files of ``folder``."""
+        paint = None if self.paint is None else moved_to_file(self.paint, folder)
+        surface = None if self.surface is None else self.surface.in_files(folder)
+        return dataclasses.replace(self, scale=moved_to_file(self.scale, folder), paint=paint, surface=surface)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All that the products depend on, by name."""
@@ -120,16 +149,16 @@ class IndirectLight:
 def _times(matrices: Colours, image: FloatImage) -> FloatImage:
     """Each pixel's matrix (3, 3, rows, columns) times its colour (rows, columns, 3)."""
     found = np.empty(image.shape, np.float32)
-    for channel, row in enumerate(matrices):
-        found[..., channel] = sum(one * image[..., other] for other, one in enumerate(row))
+    for rows in strips(len(image)):
+        for channel, row in enumerate(matrices[:, :, rows]):
+            found[rows, :, channel] = sum(one * image[rows, :, other] for other, one in enumerate(row))
     return found
 
 
 def _inverse(deviation: Colours) -> Colours:
     """(I + D)^-1 - I of each pixel, (3, 3, rows, columns), where there is one, by Cramer's rule."""
     found = np.empty(deviation.shape, np.float16)
-    for start in range(0, deviation.shape[2], ROWS_AT_ONCE):
-        rows = slice(start, start + ROWS_AT_ONCE)
+    for rows in strips(deviation.shape[2]):
         first, second, third = deviation[:, :, rows].astype(np.float32) + np.eye(3, dtype=np.float32)[..., None, None]
         columns = [np.cross(one, other, axis=0) for one, other in ((second, third), (third, first), (first, second))]
         volume = np.sum(first * columns[0], axis=0)

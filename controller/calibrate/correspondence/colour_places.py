@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage
-
-ROWS_AT_ONCE: Final = 128
-"""Shares are worked out again where they are needed: kept, those of a large camera would fill its memory."""
+from controller.core.arrays import Float64, FloatImage, strips
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,18 +36,18 @@ class ColourPlaces:
     def of(cls, shifts_px: Float64, white: FloatImage, mixing: Float64) -> Self:
         """From a white image (rows, columns, 3), less black, NaN where not known, and (3, 3) colour mixing."""
         plain = mixing.astype(np.float32)
-        parts = (white[first : first + ROWS_AT_ONCE] for first in range(0, len(white), ROWS_AT_ONCE))
-        light = np.sum([np.nansum(part, axis=(0, 1), dtype=np.float64) for part in parts], axis=0) @ mixing
+        parts = (np.nansum(white[rows], axis=(0, 1), dtype=np.float64) for rows in strips(len(white)))
+        light = np.sum(list(parts), axis=0) @ mixing
         typical = light / light.sum() if light.sum() > 0 else np.full(3, 1 / 3)
         return cls(np.asarray(shifts_px, np.float64), white, plain, typical.astype(np.float32))
 
     def shares(self) -> Iterator[tuple[slice, FloatImage]]:
         """Rows, and (those rows, columns, 3) the parts of white's light that are red, green and blue there.
 
-        Where white is not known or dark, they are ``typical``.
+        Where white is not known or dark, they are ``typical``. They are worked out again where they are needed: kept,
+        those of a large camera would fill its memory.
         """
-        for first in range(0, len(self.white), ROWS_AT_ONCE):
-            rows = slice(first, first + ROWS_AT_ONCE)
+        for rows in strips(len(self.white)):
             light = np.asarray(self.white[rows] @ self.mixing, np.float32)
             whole = channels.total(light)
             known = np.isfinite(whole) & (whole > 0)

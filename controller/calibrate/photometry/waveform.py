@@ -89,18 +89,20 @@ def coarse_waves(
         return ()
     black = coloured(captures, "black", white.shape[:2])
     lit = lit_pixels(white) & valid & channels.finite(phase_map.projector_px)
+    at = _parts(phase_map.projector_px, lit, plan.size_px)
+    if len(at) < FEWEST_PARTS:
+        return ()
+    bright = np.percentile(white[lit][::7], 99, axis=0)
     table = _table()
     waves = []
     for axis, prefix in enumerate(COARSE):
         steps = plan.sinusoids(prefix)
-        images = [coloured(captures, step.name, black.shape[:2]) - black for step in steps]
-        used = lit & np.logical_and.reduce([channels.finite(image) for image in images])
-        at = _parts(phase_map.projector_px, used, plan.size_px)
-        if len(at) < FEWEST_PARTS:
-            return ()
-        bright = np.percentile(white[lit][::7], 99, axis=0)
+        # One photograph after the other: all of them would be too much memory for a large camera.
+        light = np.stack([_colours(captures, step.name, black, at) for step in steps], axis=2)
         seen = white.reshape(-1, 3)[at].astype(np.float64)
-        ratio = np.stack([image.reshape(-1, 3)[at] for image in images], axis=2) / seen[:, :, None]
+        known = np.asarray(np.isfinite(light).all(axis=(2, 3)), np.bool_)
+        ratio = np.where(known[:, :, None, None], light / seen[:, :, None], 0)
+        weight = np.where(known[..., None], np.minimum(seen / bright, 1), 0)
         place = phase_map.projector_px.reshape(-1, 2)[at].astype(np.float64)
         variance = _variance(phase_map.spread_px2, place, axis)
         shifts = [round(step.phase_rad / (2 * np.pi) * PERIOD_PX) for step in steps]
@@ -110,8 +112,14 @@ def coarse_waves(
             np.stack([_levels(table, place[..., axis] - shift + step, variance) @ ASKED for shift in shifts], axis=2)
             for step in (near, -near)
         )
-        waves.append(Wave(ratio, np.minimum(seen / bright, 1), levels, (ahead - behind) / (2 * near)))
+        waves.append(Wave(ratio, weight, levels, (ahead - behind) / (2 * near)))
     return tuple(waves)
+
+
+def _colours(captures: Captures, name: str, black: FloatImage, at: npt.NDArray[np.int64]) -> Float64:
+    """(parts, pixels, 3) light of a photograph, less black, NaN where it is not known."""
+    picture = coloured(captures, name, black.shape[:2]).reshape(-1, 3)[at]
+    return np.asarray(picture - black.reshape(-1, 3)[at], np.float64)
 
 
 def held_to(

@@ -21,7 +21,7 @@ from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.solve.appearance import BaseChoice, base_image, solve_base
-from controller.solve.memory_need import base_peak_bytes, check_memory, stage_size
+from controller.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.solve.scaling.dither import to_device
 from controller.solve.targets.values import Target
@@ -121,7 +121,7 @@ def random_pattern(size_px: tuple[int, int]) -> Pattern:
 
 
 def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
-    need = base_peak_bytes(stage_size(calibrated.calibration))
+    need = solve_peak_bytes(stage_size(calibrated.calibration))
     context.reporter.say(check_memory(need, free_bytes()))
     black = calibrated.calibration.black
     image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
@@ -159,6 +159,7 @@ def _answer_here(
         indirect=calibrated.indirect,
         progress=_watched(context),
         engine=calibrated.engine,
+        folder=calibrated.folder,
     )
 
 

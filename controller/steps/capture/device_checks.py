@@ -16,7 +16,7 @@ from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.solve.memory_need import base_peak_bytes, calibration_peak_bytes, check_memory, planned_size
+from controller.solve.memory_need import calibration_peak_bytes, check_memory, planned_size, solve_peak_bytes
 from hal.runtime.memory import free_bytes
 
 Size = tuple[int, int]
@@ -45,7 +45,7 @@ def device_checks(rig: Rig, prior: CameraPrior) -> list[Step]:
         if missing:
             context.reporter.say(missing, Level.WARNING)
         size, free = planned_size(size_px, list(wanted.values())), free_bytes()
-        needs = (base_peak_bytes(size), "The solve"), (calibration_peak_bytes(size), "The calibration")
+        needs = (solve_peak_bytes(size), "The solve"), (calibration_peak_bytes(size), "The calibration")
         context.reporter.say(check_memory(max(needs)[0], free, max(needs)[1]))
         if prior.size_px not in (None, size_px):
             raise _wrong_lens(prior.size_px or size_px, size_px)

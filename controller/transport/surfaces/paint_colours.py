@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from controller.calibrate.photometry.paint_mixing import colour_of
 from controller.calibrate.values import Calibration, Radiometry
 from controller.core import channels
-from controller.core.arrays import Float64, Mask
+from controller.core.arrays import Float64, Mask, strips
 from controller.transport.indirect import Colours
-
-ROWS_AT_ONCE: Final = 128
 
 
 def paint_colours(calibration: Calibration, lit: Mask) -> Colours | None:
@@ -28,8 +24,7 @@ def paint_colours(calibration: Calibration, lit: Mask) -> Colours | None:
     if any(part.radiometry.paint is None for part in calibration.projectors):
         return None
     found = np.zeros((3, 3, *lit.shape), np.float16)
-    for first in range(0, len(lit), ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
+    for rows in strips(len(lit)):
         light, total = np.zeros((3, 3, *lit[rows].shape)), np.full(lit[rows].shape, 1e-30)
         for part in calibration.projectors:
             white = np.maximum(part.white[rows], 0).astype(np.float64)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from controller.calibrate.values import SurfaceSpread
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, moved_to_file
 from controller.transport.surfaces.blocks import down, down_adjoint, up, up_adjoint
 
 BLOCKS_A_DISTANCE: Final = 4.0
@@ -44,10 +46,19 @@ class SurfaceLight:
 
     def forward(self, light: FloatImage) -> FloatImage:
         """N x of ``light`` (rows, columns, 3)."""
-        there = self.white > 0
-        falling = np.divide(light, self.white, out=np.zeros_like(self.white), where=there)
-        leaving = self.white * _over(_diffused(falling, self.distance_px), self.near)
-        return np.where(there, np.float32(self.share) * (leaving - light), np.float32(0))
+        found = np.empty(light.shape, np.float32)
+        # One channel after the other: what is needed on the way is a third as large.
+        for channel in range(3):
+            white, one = self.white[..., channel : channel + 1], light[..., channel : channel + 1]
+            there = white > 0
+            falling = np.divide(one, white, out=np.zeros(white.shape, np.float32), where=there)
+            leaving = _over(_diffused(falling, self.distance_px), self.near)
+            del falling
+            leaving *= white
+            leaving -= one
+            leaving *= np.float32(self.share)
+            found[..., channel : channel + 1] = np.where(there, leaving, np.float32(0))
+        return found
 
     def adjoint(self, image: FloatImage) -> FloatImage:
         """N' r of ``image`` (rows, columns, 3)."""
@@ -55,6 +66,11 @@ class SurfaceLight:
         back = _diffused(_over(self.white * image, self.near), self.distance_px, transposed=True)
         back = np.divide(back, self.white, out=np.zeros_like(self.white), where=there)
         return np.where(there, np.float32(self.share) * (back - image), np.float32(0))
+
+    def in_files(self, folder: Path) -> Self:
+        """The same, in nameless files of ``folder`` where that is worth it."""
+        white, near = (moved_to_file(one, folder) for one in (self.white, self.near))
+        return dataclasses.replace(self, white=white, near=near)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All that the products depend on, by name."""
@@ -78,12 +94,14 @@ def _diffused(image: FloatImage, distance_px: float, *, transposed: bool = False
 
 
 def _solved(values: FloatImage, distance: float) -> FloatImage:
+    """``values`` may be used for something else."""
     from scipy import fft
 
     rows, columns = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in values.shape[:2])
     left = (1 / (1 + distance**2 * (rows[:, None] + columns[None, :]))).astype(np.float32)[..., None]
-    spectrum = fft.dctn(values, axes=(0, 1), norm="ortho")
-    return np.asarray(fft.idctn(spectrum * left, axes=(0, 1), norm="ortho"), np.float32)
+    spectrum = fft.dctn(values, axes=(0, 1), norm="ortho", overwrite_x=True)
+    spectrum *= left
+    return np.asarray(fft.idctn(spectrum, axes=(0, 1), norm="ortho", overwrite_x=True), np.float32)
 
 
 __all__ = ["SurfaceLight"]

@@ -2,28 +2,46 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.lab.synthetic import synthetic_calibration
-from controller.calibrate.values import Calibration
+from controller.calibrate.values import Calibration, SurfaceSpread
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image, solve_base
 from controller.solve.memory_need import (
     PROGRAM,
     SPARE,
+    appearance_peak_bytes,
     base_peak_bytes,
     calibration_peak_bytes,
     check_memory,
     planned_size,
+    solve_peak_bytes,
     stage_size,
 )
+from controller.solve.request import SolveOptions, solve_appearance
+from controller.solve.targets.values import Target
 from controller.transport import build_transport
+from controller.transport.indirect import IndirectLight
+from controller.transport.surfaces.surface_light import SurfaceLight
 
 
-def solved_bytes(calibration: Calibration) -> int:
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    # as many camera pixels for each projector pixel as at paper size
+    made = synthetic_calibration(projector=(186, 246), camera=(460, 688))
+    _solved_bytes(made)  # compiled, and tables made
+    return made
+
+
+def _solved_bytes(calibration: Calibration) -> int:
     gc.collect()
     tracemalloc.start()
     try:
@@ -34,23 +52,70 @@ def solved_bytes(calibration: Calibration) -> int:
         tracemalloc.stop()
 
 
-def test_the_need_told_covers_what_is_taken_and_is_not_far_above() -> None:
-    # as many camera pixels for each projector pixel as at paper size
-    calibration = synthetic_calibration(projector=(186, 246), camera=(460, 688))
-    told = base_peak_bytes(stage_size(calibration)) - PROGRAM
-    solved_bytes(calibration)  # compiled, and tables made
-    taken = solved_bytes(calibration)
-    assert taken <= told <= 1.25 * SPARE * taken
+def _indirect(calibration: Calibration, *, has_paint: bool, has_spread: bool) -> IndirectLight:
+    lit, side = calibration.object_mask, 30
+    grid = -(-lit.shape[0] // side), -(-lit.shape[1] // side)
+    factors = np.full((grid[0] * grid[1],) * 2, 0.2 / (grid[0] * grid[1]), np.float32)
+    scale = np.where(lit[..., None], 0.2, 0).astype(np.float32) * np.ones(3, np.float32)
+    white = np.sum([part.white for part in calibration.projectors], axis=0)
+    paint = np.full((3, 3, *lit.shape), 0.01, np.float16) if has_paint else None
+    surface = SurfaceLight.of(SurfaceSpread(0.3, 5.0, 2.0), white, lit) if has_spread else None
+    return IndirectLight(factors, scale, lit, grid, side, paint=paint, surface=surface)
+
+
+def _appearance_bytes(calibration: Calibration, know: Callable[[], IndirectLight | None], folder: Path) -> int:
+    gc.collect()
+    tracemalloc.start()
+    try:
+        transport = build_transport(calibration)
+        base = solve_base(transport, base_image(calibration), calibration.black, tolerance=0.1).in_files(folder)
+        indirect = know()
+        tracemalloc.reset_peak()
+        shape = calibration.black.shape
+        solve_appearance(
+            transport,
+            base,
+            calibration.black,
+            Target(np.random.default_rng(1).random(shape, np.float32), np.ones(shape[:2], np.bool_)),
+            SolveOptions(share=0.9, smoothness=1e-3, mode="full", adapt=1.0),
+            indirect=None if indirect is None else indirect.in_files(folder),
+            folder=folder,
+        )
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_need_stated_covers_what_is_taken_and_is_not_far_above(calibration: Calibration) -> None:
+    stated = base_peak_bytes(stage_size(calibration)) - PROGRAM
+    taken = _solved_bytes(calibration)
+    assert taken <= stated <= 1.25 * SPARE * taken
+
+
+@pytest.mark.parametrize("known", [(), ("indirect",), ("indirect", "paint", "spread")], ids=str)
+def test_the_need_of_an_appearance_covers_what_is_taken_and_is_not_far_above(
+    calibration: Calibration, tmp_path: Path, known: tuple[str, ...]
+) -> None:
+    size = dataclasses.replace(stage_size(calibration), **{f"has_{name}": True for name in known})
+
+    def know() -> IndirectLight | None:
+        if not known:
+            return None
+        return _indirect(calibration, has_paint="paint" in known, has_spread="spread" in known)
+
+    taken = _appearance_bytes(calibration, know, tmp_path)
+    stated = appearance_peak_bytes(size) - PROGRAM
+    assert taken <= stated <= 1.25 * SPARE * taken
 
 
 def test_four_projectors_of_3840_by_2160_are_within_8_gb() -> None:
-    assert base_peak_bytes(planned_size((8192, 5464), [(3840, 2160)] * 4)) < 8e9
+    assert solve_peak_bytes(planned_size((8192, 5464), [(3840, 2160)] * 4)) < 8e9
 
 
 def test_calibrating_with_45_megapixels_is_within_4_gb_and_can_need_more_than_the_solve() -> None:
     assert calibration_peak_bytes(planned_size((8192, 5464), [(3840, 2160)] * 4)) < 5e9
     small = planned_size((8192, 5464), [(800, 600)])
-    assert calibration_peak_bytes(small) > base_peak_bytes(small)
+    assert calibration_peak_bytes(small) > solve_peak_bytes(small)
     with pytest.raises(WorkError, match="The calibration needs about"):
         check_memory(calibration_peak_bytes(small), 1_000_000_000, "The calibration")
 

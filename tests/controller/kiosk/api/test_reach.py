@@ -21,7 +21,7 @@ def test_each_pixel_has_one_reason_and_one_colour() -> None:
     bright[0, 3, 0], dark[0, 3, 1] = 0.1, 0.2
     reachable = np.array([[True, False, False, False, True, False]])
     asked = np.array([[True, True, True, True, False, False]])
-    kinds = kinds_of(Feasibility(bright, dark, reachable, 0.0), asked)
+    kinds = kinds_of(Feasibility((bright - dark).astype(np.float16), reachable, 0.0), asked)
     assert [np.flatnonzero(kinds[name]).tolist() for name in ("share", "too_bright", "too_dark", "too_colourful")] == [
         [0], [1], [2], [3]
     ]  # fmt: skip
