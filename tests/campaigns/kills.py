@@ -17,6 +17,7 @@ import importlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import socket
@@ -287,7 +288,8 @@ def copy(begun: Path, to: Path) -> Path:
     for file in (to / "bench.toml", to / "stage.toml"):
         text = file.read_text()
         for old, new in zip(_ports_in(begun), free, strict=True):
-            text = text.replace(str(old), str(new))
+            # Alone, not where its digits are a part of another number.
+            text = re.sub(rf"(?<![\d.]){old}(?![\d.])", str(new), text)
         file.write_text(text)
     return to
 
