@@ -13,6 +13,7 @@ PHOTOGRAPHS = 40
 """Of 58, which both lives have in common; all of them: ``python -m tests.campaigns.kills``."""
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_a_calibration_that_is_killed_three_times_ends_in_the_same_bundle_to_the_byte(tmp_path: Path) -> None:
     with Nursery(tmp_path) as nursery, ThreadPoolExecutor(2) as both:

@@ -21,6 +21,7 @@ def short(kind: Container[str], *, step: str = "") -> int:
     return next(number for number in there if matrix[number][1].name in kind)
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_faults_on_real_wires_end_explained_and_are_mended(tmp_path: Path) -> None:
     wires = {fault.name for _, fault in cases()} - ON_USB - TETHERED

@@ -29,7 +29,7 @@ from tests.end_to_end.kiosk import codes, wait_for
 from tests.end_to_end.program import Command, lamps, processes_on, strikes
 from tests.end_to_end.test_technician import devices
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 SHOWN_MS, FADE_MS = 1500, 500
 
 
