@@ -235,17 +235,19 @@ class Renderer:
         if made is None:
             samples, gloss = self._samples, self._samples.gloss[index]
             white = np.repeat(gloss[:, None], 3, axis=1)
+            # One for both: they are as large as all samples.
+            places = panel_places(self._truth.projectors[index], samples.at_px[index])
             if self._surface is None:
                 paint = samples.albedo + white if gloss.size else samples.albedo
-                made = self._summed(index, paint), []
+                made = self._summed(index, places, paint), []
             else:
-                made = self._summed(index, samples.albedo), self._summed(index, white) if gloss.size else []
+                shine = self._summed(index, places, white) if gloss.size else []
+                made = self._summed(index, places, samples.albedo), shine
             self._footprints[index] = made
         return made
 
-    def _summed(self, index: int, albedo: FloatImage) -> list[Footprints]:
+    def _summed(self, index: int, places: Sequence[FloatImage], albedo: FloatImage) -> list[Footprints]:
         samples, projector = self._samples, self._truth.projectors[index]
-        places = panel_places(projector, samples.at_px[index])
         return [
             Footprints.of(
                 Lit(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
