@@ -185,7 +185,9 @@ class EventLog:
                     self._trim(database)
         except (sqlite3.Error, OSError) as error:
             self.problem, self._retry_at_s = str(error), self._monotonic() + _RETRY_S
-            if isinstance(error, sqlite3.Error) and not self._unavailable and _is_corrupt(error):
+            # Still unavailable: it was full when the kiosk began, and now it can be opened no better.
+            is_lost = _is_damage if self._unavailable else _is_corrupt
+            if isinstance(error, sqlite3.Error) and is_lost(error):
                 self._put_aside()
             return
         self._waiting.clear()
@@ -223,10 +225,10 @@ class EventLog:
             for end in ("-wal", "-shm"):
                 Path(f"{self.path}{end}").unlink(missing_ok=True)
             self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+            self._retry_at_s = self._monotonic()
         self._database, self._unavailable = self._connected(Path(":memory:")), True
         self._waiting = deque(self._recent, SHOWN)
         self._unwritten = {("done", key): None for key in self._done} | {("kept", key): None for key in self._kept}
-        self._retry_at_s = self._monotonic()
 
     def _copied(self) -> sqlite3.Connection:
         """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""

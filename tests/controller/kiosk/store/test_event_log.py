@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import sqlite3
 from pathlib import Path
@@ -59,6 +60,49 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
     assert log.done() == {"drift-check 2026-01-01", "drift-check 2026-01-02"}
     log.close()
     assert not list(path.parent.glob("*.damaged-*"))
+
+
+@pytest.mark.parametrize("whole", [4096, 8 * 4096])
+def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
+    tmp_path: Path, whole: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, is_full = tmp_path / EventLog.FILE, [True]
+    log = EventLog(path, durable=False)
+    for _ in range(100):
+        log.add(Decision("before", "One. " * 50))
+    log.close()
+    content = path.read_bytes()
+    # The schema's page is not damaged where it is ``whole``.
+    path.write_bytes(content[: whole - 2000] + bytes(byte ^ 0xA5 for byte in content[whole - 2000 :]))
+
+    def full(database: Any, **options: Any) -> sqlite3.Connection:
+        if is_full and database == path:
+            error = sqlite3.OperationalError("database or disk is full")
+            error.sqlite_errorcode = sqlite3.SQLITE_FULL
+            raise error
+        found: sqlite3.Connection = sqlite3.connect(database, **options)
+        return found
+
+    def replace(old: Path, new: Path) -> Path:
+        if is_full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return rename(old, new)
+
+    rename = Path.replace
+    monkeypatch.setattr(Path, "replace", replace)
+    now_s = [0.0]
+    log = EventLog(path, durable=False, connect=full, monotonic=lambda: now_s[0])
+    log.add(Decision("full", "Two."))
+    is_full.clear()
+    for _ in range(4):
+        now_s[0] += 31.0
+        log.add(Decision("after", "Three."))
+    assert log.problem is None
+    log.close()
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)][-5:] == ["full", *["after"] * 4]
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
 
 
 @pytest.mark.parametrize("length", [50, 5000])
