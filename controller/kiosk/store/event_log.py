@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -24,6 +24,8 @@ MOST_FAILURES: Final = 20
 _TRIM_EVERY: Final = 200
 _RETRY_S: Final = 30.0
 _MEMORY: Final = Path("/dev/shm")  # noqa: S108 - the folder in it has a name of its own
+_WHOLE: Final = 1
+"""SQLite's ``user_version`` of a file that has all that is known."""
 _LEVELS: Final[dict[str, EventLevel]] = {"info": "info", "warning": "warning", "error": "error"}
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS events (
@@ -55,8 +57,8 @@ class EventLog:
     """Thread-safe. ``problem``: why the log can't be written now, or None.
 
     ``durable``: events survive a power cut, too, not only the end of the process. Events that can't be written are kept
-    in memory until there is space again. A damaged file is renamed and replaced. ``connect``: as ``sqlite3.connect``;
-    ``also``: gets every new event.
+    in memory until there is space again. A damaged file is renamed and replaced by one with all that is known, at no
+    moment of which a power cut loses it. ``connect``: as ``sqlite3.connect``; ``also``: gets every new event.
     """
 
     FILE: Final = "kiosk/events.sqlite"
@@ -169,18 +171,10 @@ class EventLog:
             return
         try:
             if self._unavailable:
+                self._end_replacing()
                 self._database, self._unavailable = self._connected(self.path), False
             with self._database as database:
-                for row in self._waiting:
-                    database.execute(
-                        "INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?)",
-                        (row.number, row.unix_s, row.level, row.code, row.text),
-                    )
-                for kind, key in self._unwritten:
-                    if kind == "done":
-                        database.execute("INSERT OR REPLACE INTO done (key, how) VALUES (?, ?)", (key, self._done[key]))
-                    else:
-                        database.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, self._kept[key]))
+                self._write(database, self._waiting, self._unwritten)
                 if self._number % _TRIM_EVERY == 0:
                     self._trim(database)
         except (sqlite3.Error, OSError) as error:
@@ -190,9 +184,26 @@ class EventLog:
             if isinstance(error, sqlite3.Error) and is_lost(error):
                 self._put_aside()
             return
+        self._all_written()
+
+    def _all_written(self) -> None:
         self._waiting.clear()
         self._unwritten.clear()
         self.problem = None
+
+    def _write(
+        self, database: sqlite3.Connection, events: Iterable[EventRow], values: Iterable[tuple[str, str]]
+    ) -> None:
+        for row in events:
+            database.execute(
+                "INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?)",
+                (row.number, row.unix_s, row.level, row.code, row.text),
+            )
+        for kind, key in values:
+            if kind == "done":
+                database.execute("INSERT OR REPLACE INTO done (key, how) VALUES (?, ?)", (key, self._done[key]))
+            else:
+                database.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, self._kept[key]))
 
     def _trim(self, database: sqlite3.Connection) -> None:
         # Rows are counted, because after a damaged log numbers continue far above those of the rows that were kept.
@@ -203,13 +214,14 @@ class EventLog:
 
     def _opened(self) -> sqlite3.Connection:
         try:
+            self._end_replacing()
             return self._connected(self.path)
         except (sqlite3.DatabaseError, OSError) as error:
             self.problem = str(error)
             if isinstance(error, sqlite3.Error) and _is_damage(error):
                 # A damaged log must not keep the stage dark; the file is kept for analysis.
                 with contextlib.suppress(OSError, sqlite3.Error):
-                    self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+                    self._rename_damaged()
                     database = self._connected(self.path)
                     self.problem = None
                     return database
@@ -217,18 +229,59 @@ class EventLog:
             return self._copied()
 
     def _put_aside(self) -> None:
-        """A file that can be read in part, but takes nothing any more: all that is known goes into a new one soon."""
+        """A file that can be read in part, but takes nothing any more: all that is known goes into a new one, if there
+        is space, else into memory until there is.
+        """
         with contextlib.suppress(sqlite3.Error):
             self._database.close()
-        with contextlib.suppress(OSError):
-            # Another file's write-ahead log must not be read into the new one.
-            for end in ("-wal", "-shm"):
-                Path(f"{self.path}{end}").unlink(missing_ok=True)
-            self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
-            self._retry_at_s = self._monotonic()
-        self._database, self._unavailable = self._connected(Path(":memory:")), True
-        self._waiting = deque(self._recent, SHOWN)
-        self._unwritten = {("done", key): None for key in self._done} | {("kept", key): None for key in self._kept}
+        known = [("done", key) for key in self._done] + [("kept", key) for key in self._kept]
+        try:
+            self._remove(self._new)
+            with contextlib.closing(self._connected(self._new)) as database:
+                with database:
+                    self._write(database, self._recent, known)
+                    database.execute(f"PRAGMA user_version={_WHOLE}")
+                _without_write_ahead_log(database)
+            self._take_new()
+            self._database, self._unavailable = self._connected(self.path), False
+        except (sqlite3.Error, OSError):
+            self._database, self._unavailable = self._connected(Path(":memory:")), True
+            self._waiting, self._unwritten = deque(self._recent, SHOWN), dict.fromkeys(known)
+        else:
+            self._all_written()
+
+    def _end_replacing(self) -> None:
+        """Of a file that was being replaced when the power failed: a new one that is whole takes its place."""
+        if not self._new.exists():
+            return
+        with contextlib.closing(self._connect(self._new, timeout=2.0)) as database:
+            (state,) = database.execute("PRAGMA user_version").fetchone()
+            if state == _WHOLE:
+                _without_write_ahead_log(database)
+        if state == _WHOLE:
+            self._take_new()
+        else:
+            self._remove(self._new)
+
+    def _take_new(self) -> None:
+        if self.path.exists():
+            self._rename_damaged()
+        self._new.replace(self.path)
+
+    def _rename_damaged(self) -> None:
+        # Another file's write-ahead log must not be read into the new one.
+        for end in ("-wal", "-shm"):
+            Path(f"{self.path}{end}").unlink(missing_ok=True)
+        self.path.replace(self.path.with_suffix(f".damaged-{int(self._wall())}"))
+
+    @property
+    def _new(self) -> Path:
+        return self.path.with_suffix(".new")
+
+    @staticmethod
+    def _remove(path: Path) -> None:
+        for end in ("", "-wal", "-shm"):
+            Path(f"{path}{end}").unlink(missing_ok=True)
 
     def _copied(self) -> sqlite3.Connection:
         """An in-memory copy of a log that can be read but not opened, as on a full disk; see ``_flush``."""
@@ -291,6 +344,13 @@ class EventLog:
         except sqlite3.Error as error:
             self.problem, self._torn = str(error), self._torn or _is_corrupt(error)
         return rows
+
+
+def _without_write_ahead_log(database: sqlite3.Connection) -> None:
+    """Let all be in the file itself, which then can be renamed. Raises sqlite3.Error."""
+    (mode,) = database.execute("PRAGMA journal_mode=DELETE").fetchone()
+    if mode != "delete":
+        raise sqlite3.OperationalError(f"the log stays in mode {mode}")
 
 
 def _is_damage(error: sqlite3.Error) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -293,3 +294,73 @@ def _reopened(log: EventLog) -> EventLog:
     again = EventLog(log.path, durable=False)
     again.close()
     return again
+
+
+class _Killed(BaseException):
+    """What a kill is to the code that it meets: nothing after it runs."""
+
+
+def test_a_kill_at_any_moment_of_replacing_a_damaged_log_loses_nothing_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = [f"before-{number}" for number in range(20)]
+    log = EventLog(tmp_path / "sound" / "events.sqlite", durable=False)
+    for code in known:
+        log.add(Decision(code, "One. " * 50))
+    log.mark_done("drift-check 2026-01-01", "drift-none")
+    log.keep("override", "open")
+    log.close()
+    with sqlite3.connect(log.path) as file:
+        # A row that can't be, so that the file is replaced at the start.
+        file.executescript(
+            "PRAGMA writable_schema=ON; UPDATE sqlite_master SET sql = replace(sql, 'NOT NULL', '') "
+            "WHERE name IN ('events', 'done', 'kept'); PRAGMA writable_schema=RESET;"
+            "INSERT INTO events (number) VALUES (100);"
+        )
+    file.close()
+    left = [0]
+
+    def step() -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            raise _Killed
+
+    class Connection(sqlite3.Connection):
+        def execute(self, *arguments: Any) -> sqlite3.Cursor:
+            step()
+            return super().execute(*arguments)
+
+    def connect(database: Any, **options: Any) -> sqlite3.Connection:
+        return sqlite3.connect(database, factory=Connection, **options)
+
+    def counted(own: Callable[..., Any]) -> Callable[..., Any]:
+        def operation(*arguments: Any, **options: Any) -> Any:
+            step()
+            return own(*arguments, **options)
+
+        return operation
+
+    for name in ("replace", "unlink"):
+        monkeypatch.setattr(Path, name, counted(getattr(Path, name)))
+    moments = 0
+    for moment in range(1, 200):
+        path = tmp_path / str(moment) / "events.sqlite"
+        path.parent.mkdir()
+        shutil.copyfile(log.path, path)
+        left[0] = moment
+        try:
+            EventLog(path, durable=False, connect=connect).close()
+        except _Killed:
+            moments += 1
+        left[0] = 0
+        again = EventLog(path, durable=False)
+        again.add(Decision("after", "Two."))
+        again.close()
+        again = EventLog(path, durable=False)
+        assert [row.code for row in again.after(0)] == [*known, "after"], moment
+        assert again.done() == {"drift-check 2026-01-01"}
+        assert again.value("override") == "open"
+        again.close()
+        if moments < moment:
+            break
+    assert moments > 40
