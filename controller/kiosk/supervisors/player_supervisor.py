@@ -137,6 +137,8 @@ class PlayerSupervisor:
                 )
         except WorkError as error:
             self._patience.begins()
+            # It says why it can't show that, so it does answer: an end changes nothing.
+            self._reached = (self.want,)
             problem = Decision(error.code, error.what, error.remedy, "error")
             if error.code.startswith("bundle-") and self._starts_again():
                 # Only starts are counted, and after three without a picture the player goes back to the bundle before.
