@@ -130,14 +130,14 @@ def _check(data: memoryview, member: zipfile.ZipInfo) -> None:
 
 
 def array_in_file(
-    folder: Path, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, *, from_bytes: int = MAPPED_FROM
+    folder: Path | None, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, *, from_bytes: int = MAPPED_FROM
 ) -> npt.NDArray[Any]:
     """An empty array that need not stay in memory: in a nameless file of ``folder``, which ends with it.
 
-    Below ``from_bytes``, or where no file can be had, it is in memory.
+    Below ``from_bytes``, without a ``folder``, or where no file can be had, it is in memory.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size >= max(from_bytes, 1):
+    if folder is not None and size >= max(from_bytes, 1):
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 os.posix_fallocate(file.fileno(), 0, size)

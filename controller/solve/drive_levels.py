@@ -31,7 +31,7 @@ class DriveLevels:
         pixels = sum(rows * columns for rows, columns in transport.sizes)
         ones = np.ones((3, pixels), np.float32)
         shape = (3, 3, *transport.camera_shape)
-        self._light = np.empty(shape, np.float32) if folder is None else array_in_file(folder, shape)
+        self._light = array_in_file(folder, shape)
         self._light[:] = 0
         segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
         for n, mixing in enumerate(transport.mixing):
