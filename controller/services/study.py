@@ -44,6 +44,11 @@ RESULTS = "study"
 POWER_DOWN_S = 10.0
 
 
+def experiments() -> dict[str, str]:
+    """The title of each experiment, by its name."""
+    return {one.name: one.title + (" (only if named)" if one.optional else "") for one in EXPERIMENTS}
+
+
 def study(
     *,
     names: Sequence[str],

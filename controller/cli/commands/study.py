@@ -23,13 +23,16 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for the stages and their calibrations.")] = Path("study"),
     pages: Annotated[Path | None, typer.Option(help="Folder for the pages (default: OUT/pages).")] = None,
     seed: Seeds = None,
+    list_only: Annotated[bool, typer.Option("--list", help="List the experiments, and end.")] = False,
     as_json: Json = False,
 ) -> None:
     """Repeat the paper's experiments on emulated stages and write a page for each. Continues unfinished experiments."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.study import study
+        from controller.services.study import experiments, study
 
+        if list_only:
+            return experiments()
         return study(
             names=tuple(names or ()),
             size=size,
