@@ -254,10 +254,16 @@ class EventLog:
         """Of a file that was being replaced when the power failed: a new one that is whole takes its place."""
         if not self._new.exists():
             return
-        with contextlib.closing(self._connect(self._new, timeout=2.0)) as database:
-            (state,) = database.execute("PRAGMA user_version").fetchone()
-            if state == _WHOLE:
-                _without_write_ahead_log(database)
+        try:
+            with contextlib.closing(self._connect(self._new, timeout=2.0)) as database:
+                (state,) = database.execute("PRAGMA user_version").fetchone()
+                if state == _WHOLE:
+                    _without_write_ahead_log(database)
+        except sqlite3.Error as error:
+            if not _is_damage(error):
+                raise
+            # Written in part; the log itself may be sound.
+            state = 0
         if state == _WHOLE:
             self._take_new()
         else:

@@ -364,3 +364,16 @@ def test_a_kill_at_any_moment_of_replacing_a_damaged_log_loses_nothing_of_it(
         if moments < moment:
             break
     assert moments > 40
+
+
+def test_a_new_file_that_was_written_in_part_does_not_take_the_place_of_a_sound_log(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    log.add(Decision("before", "One."))
+    log.close()
+    path.with_suffix(".new").write_bytes(b"\xa5" * 5000)
+    log = EventLog(path, durable=False)
+    assert [row.code for row in log.after(0)] == ["before"]
+    log.close()
+    assert not path.with_suffix(".new").exists()
+    assert not list(path.parent.glob("*.damaged-*"))
