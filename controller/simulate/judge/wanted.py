@@ -29,6 +29,8 @@ class Wanted:
         """Whether the kiosk has no time. Then it is closed, unless people say something else."""
         self._wrong_until_s = self._unsure_until_s = 0.0
         self._forgotten = False
+        self._ran_s = 0.0
+        """When the kiosk was last seen to run with a time."""
 
     def open(self) -> bool:
         """Whether it is to be open now."""
@@ -52,6 +54,11 @@ class Wanted:
 
     # -- what happens to it
 
+    def ran(self) -> None:
+        """The kiosk runs now."""
+        if not self.unknown:
+            self._ran_s = self._truth()
+
     def say(self, wanted: bool) -> None:
         """A person opened or closed the stage."""
         self._said = (wanted, None) if self.unknown else None
@@ -72,8 +79,12 @@ class Wanted:
         self.open()
 
     def lose_time(self) -> None:
-        """The kiosk knows that it has no time. For one of which everything is sure."""
-        self.unknown, self._forgotten = True, False
+        """The kiosk knows that it has no time. For one of which everything is sure.
+
+        But what people said when nothing was sure still holds, if it had no power when that was to end.
+        """
+        self.unknown = True
+        self._forgotten = self._forgotten and self._ran_s <= self._unsure_until_s
 
     def find_time(self) -> None:
         """It has the right one again."""
