@@ -46,18 +46,32 @@ OUTLIERS: Final = 5.0
 """Median deviations: of light over white among pixels as far from an edge, and of shares among places."""
 LEAST_SHARE, MOST_SHARE = 0.03, 0.9
 SURE: Final = 4.0
-"""Standard errors, by the differences between parts and patterns, from which a share counts."""
+"""Standard errors, by the differences between parts, from which a share counts."""
+MOST_VARIED: Final = 0.35
+"""Standard deviation of the parts' shares, of the share. A material is the same everywhere (at most 0.24 on the bench);
+light between near surfaces, which is like it, is not (at least 0.45)."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Evidence:
     """Of one pattern in a part of the picture, for each distance, without what is even, a slope, a blur or a veil.
 
-    ``across``: squares of what a share of 1 would show; ``along``: that times what is seen
+    ``across``: squares of what a share of 1 would show; ``along``: that times what is seen; ``part``: its number
     """
 
     across: Float64
     along: Float64
+    part: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Agreed:
+    """What most evidence says: the number of a distance, the share, its standard error, and the deviation of parts."""
+
+    best: int
+    share: float
+    error: float
+    varied: float
 
 
 def measure_spread(
@@ -81,17 +95,19 @@ def measure_spread(
     found = list(_evidence(captures, plan, position_px, light, use, blur_px))
     if len(found) < FEWEST:
         return None
-    best, share, error = _agreed(found)
-    distance_px = float(DISTANCES_PX[best])
-    narrow = _without_blur(share, distance_px, blur_px)
-    inside = 0 < best < len(DISTANCES_PX) - 1 and distance_px > STEEPEST * blur_px
-    if not inside or share < SURE * error or not LEAST_SHARE < narrow < MOST_SHARE:
+    agreed = _agreed(found)
+    distance_px = float(DISTANCES_PX[agreed.best])
+    inside = 0 < agreed.best < len(DISTANCES_PX) - 1 and distance_px > STEEPEST * blur_px
+    if not inside or agreed.share < SURE * agreed.error or agreed.varied > MOST_VARIED * agreed.share:
+        return None
+    narrow = _without_blur(agreed.share, distance_px, blur_px)
+    if not LEAST_SHARE < narrow < MOST_SHARE:
         return None
     return SurfaceSpread(narrow, distance_px / _scale(position_px, use), distance_px)
 
 
-def _agreed(found: Sequence[_Evidence]) -> tuple[int, float, float]:
-    """The number of a distance, the share, and its standard error.
+def _agreed(found: Sequence[_Evidence]) -> _Agreed:
+    """What most of the places say.
 
     A surface is the same everywhere. Creases and edges are not, so what differs from most places is left out.
     """
@@ -106,7 +122,11 @@ def _agreed(found: Sequence[_Evidence]) -> tuple[int, float, float]:
         kept = off <= OUTLIERS * max(_weighted_median(off, across[:, best]), 1e-6)
     weights = across[kept, best] / across[kept, best].sum()
     share = float(weights @ each[kept])
-    return best, share, float(np.sqrt(np.sum((weights * (each[kept] - share)) ** 2)))
+    # Patterns err alike where they show the same part.
+    part = np.unique([one.part for one in found], return_inverse=True)[1][kept]
+    off_by, weight = np.bincount(part, weights * (each[kept] - share)), np.bincount(part, weights)
+    varied = np.sum(off_by**2 / np.maximum(weight, 1e-12))
+    return _Agreed(best, share, float(np.sqrt(np.sum(off_by**2))), float(np.sqrt(varied)))
 
 
 def _weighted_median(values: Float64, weights: Float64) -> float:
@@ -199,7 +219,7 @@ def _of_pattern(
             continue
         basis = np.linalg.qr(other[chosen])[0]
         left = alone[chosen] - basis @ (basis.T @ alone[chosen])
-        yield _Evidence(np.sum(left[:, :-1] ** 2, axis=0), left[:, :-1].T @ left[:, -1])
+        yield _Evidence(np.sum(left[:, :-1] ** 2, axis=0), left[:, :-1].T @ left[:, -1], int(part))
 
 
 def _alike(values: FloatImage, distance: Float64) -> Mask:

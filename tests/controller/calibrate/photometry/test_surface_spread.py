@@ -46,6 +46,8 @@ class Marble:
     """Of white, a mean of the whole picture that falls off to one side."""
     glare: float = 0.0
     """Spread by a lens over a fifth of the picture."""
+    crease: float = 0.0
+    """Of the light of near surfaces, beside a crease at the left edge; it falls off to the right."""
     noise: float = 1e-3
 
     @property
@@ -81,6 +83,9 @@ class Marble:
         if self.share:
             beside = diffused(falling, self.distance_px / SCALE)
             falling = np.asarray(falling + self.share * (beside - falling), np.float32)
+        if self.crease:
+            near = np.exp(-np.arange(SHAPE[1]) / (SHAPE[1] / 3)).astype(np.float32)
+            falling = np.asarray(falling + self.crease * near * diffused(falling, self.distance_px / SCALE), np.float32)
         slope = np.linspace(1.0, 0.4, SHAPE[1], dtype=np.float32)
         veil = cv2.GaussianBlur(falling, (0, 0), SHAPE[1] / 5)
         other = self.indirect * slope * falling.mean()
@@ -115,6 +120,12 @@ def test_share_and_distance_are_found(share: float, distance_px: float, blur_px:
 @pytest.mark.parametrize(("indirect", "glare"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.03)])
 def test_nothing_spreads_under_other_surfaces(blur_px: float, indirect: float, glare: float) -> None:
     assert Marble(blur_px=blur_px, indirect=indirect, glare=glare).spread() is None
+
+
+@pytest.mark.parametrize("crease", [0.1, 0.4])
+@pytest.mark.parametrize("distance_px", [1.0, 2.0])
+def test_light_between_near_surfaces_is_no_spread(crease: float, distance_px: float) -> None:
+    assert Marble(crease=crease, distance_px=distance_px).spread() is None
 
 
 def test_a_code_in_colours_says_nothing() -> None:
