@@ -47,9 +47,9 @@ OUTLIERS: Final = 5.0
 LEAST_SHARE, MOST_SHARE = 0.03, 0.9
 SURE: Final = 4.0
 """Standard errors, by the differences between parts, from which a share counts."""
-MOST_VARIED: Final = 0.35
-"""Standard deviation of the parts' shares, of the share. A material is the same everywhere (at most 0.24 on the bench);
-light between near surfaces, which is like it, is not (at least 0.45)."""
+MOST_VARIED: Final = 0.4
+"""Standard deviation of the parts' shares, of the share. A material is the same everywhere; light between near
+surfaces, which falls off alike, is not (docs/decisions/0107)."""
 
 
 @dataclass(frozen=True, slots=True)
