@@ -269,4 +269,4 @@ def _rows(found: list[dict[str, float]]) -> list[Row]:
     return rows
 
 
-__all__: Sequence[str] = ("measure",)
+__all__: Sequence[str] = ("GOALS", "Judge", "measure", "traced_stage")

@@ -84,7 +84,7 @@ def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> 
     """Every trouble counts once for each projector that has it; the worst demo counts."""
     named, false = [], []
     for truth, figures in found:
-        possible = _possible(truth)
+        possible = possible_troubles(truth)
         said = {(TroubleCode(one["code"]), one["projector"]) for one in figures["troubles"]} & set(possible)
         there = {one for one, level in possible.items() if level}
         named.append((len(said & there), len(there), sorted(f"{code} ({whose})" for code, whose in there - said)))
@@ -98,7 +98,7 @@ def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> 
     ]
 
 
-def _possible(truth: BenchTruth) -> dict[Named, float]:
+def possible_troubles(truth: BenchTruth) -> dict[Named, float]:
     """All troubles that may be told, with their levels; 0 where there is none."""
     sensor = truth.camera.sensor
     found: dict[Named, float] = {
@@ -132,4 +132,4 @@ def _bend_px(projector: ProjectorTruth) -> float:
     return abs(lens.distortion[0]) * away**3 * lens.focal_px
 
 
-__all__: Sequence[str] = ("measure",)
+__all__: Sequence[str] = ("measure", "possible_troubles")

@@ -1,0 +1,60 @@
+"""A stage that another program draws by paths (Mitsuba): surfaces light each other, and no model of ours made it."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from benchmarks.calibration.indirect import GOALS, Judge, traced_stage
+from benchmarks.calibration.rooms import possible_troubles
+from controller.artefacts.calibrated import Calibrated
+from controller.artefacts.grade import read_troubles
+from controller.artefacts.solved import read_solved
+from controller.core.troubles import TroubleCode
+from controller.run.progress import Silent
+from controller.services.calibrate import calibrate, make_appearances
+from controller.services.refine import Refinement
+from controller.stage.bench import BenchProcess
+from controller.stage.calibrations import finished_calibrations
+from controller.stage.check import check_stage
+from controller.stage.session import OwnSession
+from plugins.emulated.optics.truth import read_truth
+
+pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
+SCENE, SEED = "two-objects", 1
+BLOCKS_PERCENT, FALSELY_PERCENT = 4.0, 2.0
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Calibrated through its devices, with an even grey that was not refined."""
+    stage = traced_stage(tmp_path_factory.mktemp("traced"), SCENE, "small", SEED)
+    session, cancel = OwnSession(stage), threading.Event()
+    with BenchProcess(stage, cancel=cancel):
+        calibrate(session=session, reporter=Silent(), cancel=cancel, accept_grade=True)
+        make_appearances(
+            session=session, names=["grey"], reporter=Silent(), cancel=cancel, accept_grade=True,
+            refinement=Refinement(0),
+        )  # fmt: skip
+    return stage
+
+
+def test_even_grey_is_even_grey_without_a_photograph_of_it(stage: Path) -> None:
+    names = check_stage(stage).names
+    (run,) = finished_calibrations(stage)
+    solved = read_solved(run, "grey", names)
+    judge = Judge(stage, Calibrated(run, names))
+    found = judge.appearance(solved, [solved.frames[name] for name in names])
+    median, most = GOALS[0]
+    assert found["median"] <= median
+    assert found["95"] <= most
+    assert found["blocks %"] <= BLOCKS_PERCENT
+    assert found["falsely %"] <= FALSELY_PERCENT
+
+
+def test_no_trouble_is_named_that_is_not_there(stage: Path) -> None:
+    (run,) = finished_calibrations(stage)
+    named = {(TroubleCode(str(trouble.code)), trouble.projector) for trouble in read_troubles(run)}
+    assert named <= {one for one, level in possible_troubles(read_truth(stage)).items() if level}
