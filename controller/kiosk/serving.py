@@ -14,16 +14,17 @@ from controller.kiosk.service import MakeJobs, Service
 from controller.kiosk.store import archive, settings_change
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.store.journal import journal_of
+from controller.kiosk.store.settings import checked_settings
 from controller.kiosk.world import World
-from controller.stage.check import Checked, check_stage
+from controller.stage.check import Checked
 from controller.stage.run import stage_lock
 from hal.deadline import Stop
 
 
 def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
-    """The stage's settings, or the last good ones and why. Raises what ``check_stage`` raises."""
+    """The stage's settings, or the last good ones and why. Raises what ``checked_settings`` raises."""
     try:
-        return check_stage(stage, drivers=world.drivers), None
+        return checked_settings(stage, world.drivers), None
     except UsageError as error:
         return settings_change.last_good(stage, error, world.drivers)
 
@@ -40,7 +41,7 @@ def serving(
 ) -> Iterator[Service]:
     """A started service, its loop in a thread; ended, with the lamps cooled, on leaving. ``alive``: as ``Service``'s.
 
-    Raises what ``check_stage`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
+    Raises what ``checked_settings`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
     """
     world = world or World()
     if (stage / archive.RESTORING).exists():

@@ -270,7 +270,7 @@ class StageKiosk(AttachedKiosk):
         if service is None:
             self.reload.set()
             return
-        checked = check_stage(self.stage, drivers=self._world.drivers)
+        checked = settings.checked_settings(self.stage, self._world.drivers)
         found = settings_change.change(self._in_use, checked.stage.tables)
         if not found.restarts:
             service.use(checked)

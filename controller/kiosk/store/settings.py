@@ -17,8 +17,9 @@ from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import LARGEST_TEXT, read_bytes
 from controller.core.storage import write_atomically
+from controller.kiosk.store.schedule_file import of_table
 from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import check_stage
+from controller.stage.check import Checked, check_stage
 from hal.registry import Drivers
 
 BEFORE: Final = "stage.toml.before"
@@ -41,7 +42,14 @@ def validate(content: str) -> None:
         raise UsageError(
             "stage-syntax", what=f"{FILE} is not valid TOML: {error}.", remedy="Correct this line."
         ) from error
-    parse_stage(parsed, Place(FILE, KeyLines(content)))
+    of_table(parse_stage(parsed, Place(FILE, KeyLines(content))).schedule)
+
+
+def checked_settings(stage: Path, drivers: Drivers | None = None, *, instead: Path | None = None) -> Checked:
+    """As ``check_stage``, and the opening hours, without which no kiosk starts. Raises also as ``check_schedule``."""
+    checked = check_stage(stage, drivers=drivers, instead=instead)
+    of_table(checked.stage.tables.schedule)
+    return checked
 
 
 def tables_of(content: str) -> StageTables:

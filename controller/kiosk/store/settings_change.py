@@ -13,7 +13,8 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.store.event_log import Decision
-from controller.stage.check import Checked, check_stage
+from controller.kiosk.store.settings import checked_settings
+from controller.stage.check import Checked
 from hal.registry import Drivers
 
 GOOD: Final = "kiosk/stage.toml.good"
@@ -97,7 +98,7 @@ def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) ->
     if error.code == "stage-missing" or not (stage / GOOD).is_file():
         raise error
     try:
-        checked = check_stage(stage, drivers=drivers, instead=stage / GOOD)
+        checked = checked_settings(stage, drivers, instead=stage / GOOD)
     except VelaturaError:
         raise error from None
     why = f"{error.what} The kiosk runs with the last good settings, and starts no job."

@@ -38,6 +38,8 @@ WRONG = {
     "a driver's own key": (TEXT.replace("port =", "prot ="), "prot"),
     "a profile that there is not": (TEXT.replace("optoma-later", "optoma-latest"), "optoma-latest"),
     "a camera's address": (TEXT.replace("ptpip:127.0.0.1", "ptpip:127.0.0.1:no"), "line"),
+    "half of the hours": (TEXT + '\n[[schedule.hours]]\nday = "sun"\nopens = "16:11"\n', "16:11"),
+    "no time zone": (TEXT + '\n[schedule]\ntime_zone = "Europe/Nowhere"\n', "Europe/Nowhere"),
     "too long": ("# " + "x" * (1 << 20), "too long"),
     "nested": ("a = " + 5000 * "[" + 5000 * "]", "TOML"),
 }

@@ -94,6 +94,19 @@ def test_the_last_good_settings_stand_in_for_damaged_ones_which_stay_as_they_are
     assert still.value is damaged.value
 
 
+def test_hours_that_were_cut_off_are_damage_too(tmp_path: Path) -> None:
+    stage = vase(tmp_path / "stage")
+    hours = '\n[[schedule.hours]]\nday = "sun"\nopens = "16:11"\ncloses = "18:55"\n'
+    (stage / "stage.toml").write_text(TEXT + hours)
+    GoodSettings().keep(settings.checked_settings(stage))
+    (stage / "stage.toml").write_text((TEXT + hours).partition("closes")[0])
+    with pytest.raises(UsageError) as damaged:
+        settings.checked_settings(stage)
+    checked, problem = last_good(stage, damaged.value)
+    assert checked.stage.tables.schedule.hours[0].closes == "18:55"
+    assert "16:11" in problem.text
+
+
 def test_good_settings_that_a_full_disk_did_not_take_are_kept_once_it_has_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
