@@ -66,6 +66,8 @@ class LiveMaps:
     """A stage's maps. ``gain``, ``offset`` (height, width, 3) float16, ``present`` (height, width) uint8.
 
     ``indirect``: light by way of other surfaces; None where there is none that counts
+    ``paint`` (height, width, 3, 3) float16: what is added to the scale of a colour (third axis) of each of them, where
+    a lamp's colours depend on the paint; None where they do not
     """
 
     target_px: tuple[int, int]
@@ -76,6 +78,7 @@ class LiveMaps:
     noise: Float
     outputs: tuple[OutputMaps, ...]
     indirect: LiveIndirect | None = None
+    paint: npt.NDArray[np.float16] | None = None
 
     @classmethod
     def read(cls, bundle: Bundle) -> Self:
@@ -90,10 +93,13 @@ class LiveMaps:
             float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
             _shaped(bundle.live_array("noise"), (TILE, TILE), "f4", "noise"), outputs,
             _indirect(bundle, (height, width)) if "indirect.factors" in live.arrays else None,
+            bundle.live_array("paint") if "paint" in live.arrays else None,
         )  # fmt: skip
         _shaped(found.gain, (height, width, 3), "f2", "gain")
         _shaped(found.offset, (height, width, 3), "f2", "offset")
         _shaped(found.present, (height, width), "u1", "present")
+        if found.paint is not None:
+            _shaped(found.paint, (height, width, 3, 3), "f2", "paint")
         return found
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
@@ -102,6 +108,8 @@ class LiveMaps:
         whole: dict[str, npt.NDArray[Any]] = {"gain": self.gain, "offset": self.offset, "present": self.present}
         if self.indirect is not None:
             parts |= {f"indirect.{key}": values for key, values in self.indirect.arrays().items()}
+        if self.paint is not None:
+            whole["paint"] = self.paint
         return whole | {"unit": np.array([self.unit], np.float32), "noise": self.noise} | parts
 
 
@@ -175,6 +183,8 @@ def compensate_light(maps: LiveMaps, light: Float) -> tuple[Bytes, ...]:
     if maps.indirect is not None:
         falling = maps.indirect.falling(maps.indirect.samples(light))
         above -= maps.indirect.surface.astype(np.float32) * maps.indirect.spread(falling / np.float32(maps.unit))
+    if maps.paint is not None:
+        above += np.einsum("yxck,yxk->yxc", maps.paint.astype(np.float32), above)
     scale = np.maximum(above, 0)
     return tuple(_frame(maps, output, scale) for output in maps.outputs)
 

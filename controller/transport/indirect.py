@@ -69,9 +69,17 @@ class IndirectLight:
         own = painted + spread
         return self.scale * self.falling(own, beside) + (own - direct)
 
+    def painted(self, direct: FloatImage) -> FloatImage:
+        """(I + D) d of a direct camera image (rows, columns, 3)."""
+        return direct if self.paint is None else direct + _times(self.paint, direct)
+
+    def unpainted(self) -> Colours | None:
+        """(I + D)^-1 - I, (3, 3, rows, columns); None where D is nothing."""
+        return None if self.paint is None else _inverse(self.paint)
+
     def _own(self, direct: FloatImage) -> tuple[FloatImage, FloatImage | np.float32]:
         """(I + D) d, and N of it."""
-        painted = direct if self.paint is None else direct + _times(self.paint, direct)
+        painted = self.painted(direct)
         return painted, np.float32(0) if self.surface is None else self.surface.forward(painted)
 
     def _shown(self, direct: FloatImage, reach: FloatImage | None) -> tuple[FloatImage, FloatImage | None]:
@@ -108,7 +116,7 @@ class IndirectLight:
         It is negative where more indirect light falls than is wanted. No light is less than none, nor more than
         ``reach``, so that G takes no more than that of it.
         """
-        unpainted = None if self.paint is None else _inverse(self.paint)
+        unpainted = self.unpainted()
         direct = np.zeros(total.shape, np.float32)
         size = self._approached(direct, total, unpainted)
         for _ in range(ROUNDS):

@@ -49,6 +49,8 @@ class LiveRenderer:
         grid = (1, 1) if indirect is None else indirect.grid
         surface = np.zeros((1, 1, 3), np.float16) if indirect is None else indirect.surface
         self._thrown = [_texture(surface), _texture(np.zeros((*grid, 3), np.float32))]
+        paint = np.zeros((1, 1, 3, 3), np.float16) if maps.paint is None else maps.paint
+        self._paint = [_texture(paint[:, :, colour]) for colour in range(3)]
         self._scale = _empty(width, height, gl.GL_RGBA32F)
         self._outputs = [_OutputTextures(output) for output in maps.outputs]
         self._buffer = _name(gl.glGenFramebuffers)
@@ -94,7 +96,7 @@ class LiveRenderer:
 
     def close(self) -> None:
         """Free the textures; the context must be current."""
-        textures = [self._target, *self._maps_of_target, *self._thrown, self._noise, self._scale]
+        textures = [self._target, *self._maps_of_target, *self._thrown, *self._paint, self._noise, self._scale]
         for output in self._outputs:
             textures += [output.frame, *output.inputs.values()]
         gl.glDeleteTextures(len(textures), (gl.GLuint * len(textures))(*textures))
@@ -110,10 +112,11 @@ class LiveRenderer:
         self._put_falling(target, brightness)
         present, gain, offset = self._maps_of_target
         surface, falling = self._thrown
+        of_red, of_green, of_blue = self._paint
         program, indirect = self._scaling, self._maps.indirect
         program.use(
             target=self._target, present=present, gain=gain, offset=offset, tables=self._outputs[0].tables,
-            surface=surface, falling=falling,
+            surface=surface, falling=falling, of_red=of_red, of_green=of_green, of_blue=of_blue,
         )  # fmt: skip
         gl.glUniform1f(program.at("side"), 0.0 if indirect is None else indirect.side)
         gl.glUniform1f(program.at("factor"), float(brightness_factor(self._maps, brightness)))

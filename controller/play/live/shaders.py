@@ -20,6 +20,9 @@ uniform sampler2D offset;
 uniform sampler2D tables;
 uniform sampler2D surface;
 uniform sampler2D falling;
+uniform sampler2D of_red;
+uniform sampler2D of_green;
+uniform sampler2D of_blue;
 uniform float factor;
 uniform float side;
 float light(uint value) { return texelFetch(tables, ivec2(int(value), 0), 0).r; }
@@ -39,11 +42,14 @@ void main() {
     vec3 wanted = vec3(light(value.r), light(value.g), light(value.b));
     vec3 found = wanted * (texelFetch(gain, at, 0).rgb * factor) - texelFetch(offset, at, 0).rgb;
     if (side > 0.0) found -= thrown(at);
+    if (textureSize(of_red, 0).x == textureSize(gain, 0).x) found += vec3(
+        dot(texelFetch(of_red, at, 0).rgb, found), dot(texelFetch(of_green, at, 0).rgb, found),
+        dot(texelFetch(of_blue, at, 0).rgb, found));
     scale = vec4(max(found, vec3(0.0)), float(texelFetch(present, at, 0).r) / 255.0);
 }
 """
 """Step 1: C_s at every pixel of the target, and beside it where there is base light. ``side`` is 0 where no light comes
-by way of other surfaces."""
+by way of other surfaces; ``of_red`` is one pixel where colours do not depend on the paint."""
 
 FRAME: Final = """#version 330 core
 out vec4 colour;

@@ -23,6 +23,8 @@ GENERATOR: Final = 27
 """Of the lattice of samples in a block: even along both sides."""
 MOST_CORRECTION: Final = 2.0
 """By which large blocks are made to throw back as much white as small ones."""
+MOST_PAINT: Final = 8.0
+"""Of another colour's scale that is added: paints that throw back nearly one colour would need more."""
 
 Reduce = Callable[[FloatImage], FloatImage]
 
@@ -40,7 +42,7 @@ def indirect_maps(
 
     Parameters
     ----------
-    reach, black : (rows, columns, 3) all direct light of the projectors, and the black image
+    reach, black : (rows, columns, 3) all direct light of the projectors as the paint shows it, and the black image
     inverse : (rows, columns, 3) 1 / base light, 0 where there is none
     unit : radiance by which ``LiveMaps.gain`` was multiplied
     factor : camera pixels along a target pixel; ``reduce``: from those of the camera to those of the target
@@ -61,6 +63,22 @@ def indirect_maps(
     sampled = np.stack([bare.samples(image) for image in (reduce(indirect.scale) * ratio, reduce(black))] + [direct])
     surface = reduce(indirect.scale * inverse) * ratio * np.float32(unit)
     return LiveIndirect(factors, grid, side, places, sampled.astype(np.float32), surface.astype(np.float16))
+
+
+def paint_map(indirect: IndirectLight, inverse: FloatImage, reduce: Reduce) -> npt.NDArray[np.float16] | None:
+    """``LiveMaps.paint`` of colours that depend on the paint; None where they do not.
+
+    ``inverse``, ``reduce``: as of ``indirect_maps``
+    """
+    unpainted = indirect.unpainted()
+    if unpainted is None:
+        return None
+    base = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    rows = []
+    for colour, of_each in enumerate(unpainted):
+        added = np.moveaxis(of_each, 0, 2).astype(np.float32) * base * inverse[..., colour, None]
+        rows.append(reduce(np.clip(added, -MOST_PAINT, MOST_PAINT)))
+    return np.stack(rows, axis=2).astype(np.float16)
 
 
 def _merged(factors: FloatImage, grid: tuple[int, int], merged: int) -> tuple[FloatImage, tuple[int, int]]:

@@ -91,6 +91,7 @@ class Interactive:
         # radiance to scale; one float more, because four are read where three are meant
         self._gain = _padded(maps.gain.astype(np.float32) * brightness_factor(maps, 1.0))
         self._offset = _padded(maps.offset.astype(np.float32))
+        self._paint = np.zeros(0, np.float32) if maps.paint is None else maps.paint.astype(np.float32).ravel()
         self._used = _used(maps)
         self._reflected = _reflected(maps)
         self._outputs = tuple(self._prepared(output) for output in maps.outputs)
@@ -106,11 +107,12 @@ class Interactive:
         factor, block = self._factor, self._block
         maps = self._gain, self._offset, self._used
         even = not (self.camera[0] % 2 or self.camera[1] % 2)
-        if self.maps.indirect is None and factor == 2 and block == 1 and even:
+        plain = self.maps.indirect is None and self.maps.paint is None
+        if plain and factor == 2 and block == 1 and even:
             finite = scale_twos(picture.ravel(), *maps, self.camera[1], self._side, self._scale)
         else:
             small = picture if factor == 1 else small_picture(picture, factor)
-            finite = scale_plainly(small, block, *maps, self._side, self._scale, self._of(small))
+            finite = scale_plainly(small, block, *maps, self._side, self._scale, self._of(small), self._paint)
         if not finite:
             raise not_finite("target")
         made = self.blank()
@@ -136,7 +138,7 @@ class Interactive:
         if indirect is not None:
             reflected = _with(reflected, indirect, light[indirect.samples(pixels)])
         maps = self._gain, self._offset, self._used
-        scale_picture(pixels, light, self._block, *maps, self._side, self._scale, reflected)
+        scale_picture(pixels, light, self._block, *maps, self._side, self._scale, reflected, self._paint)
         self._show(into)
 
     def _of(self, light: FloatImage) -> ReflectedLight:

@@ -77,6 +77,41 @@ def scale_twos(
     return bool(good.all())
 
 
+@compiled()
+def _scale_row(
+    wanted: FloatImage,
+    row: int,
+    rows: int,
+    gain: FloatImage,
+    offset: FloatImage,
+    paint: FloatImage,
+    scale: FloatImage,
+    into: Index,
+) -> None:
+    """The scale of a row of blocks; ``wanted`` (block, 3 x columns): what of the target's light is left to be made."""
+    block, columns = wanted.shape[0], wanted.shape[1] // 3
+    share = np.float32(1 / block**2)
+    for x in range(-(-columns // block)):
+        reds = greens = blues = np.float32(0)
+        for v in range(min(block, rows - row * block)):
+            for u in range(x * block, min((x + 1) * block, columns)):
+                i = 3 * ((row * block + v) * columns + u)
+                r = wanted[v, 3 * u] * gain[i] - offset[i]
+                g = wanted[v, 3 * u + 1] * gain[i + 1] - offset[i + 1]
+                b = wanted[v, 3 * u + 2] * gain[i + 2] - offset[i + 2]
+                if paint.size:
+                    k = 3 * i
+                    red = r + paint[k] * r + paint[k + 1] * g + paint[k + 2] * b
+                    green = g + paint[k + 3] * r + paint[k + 4] * g + paint[k + 5] * b
+                    b = b + paint[k + 6] * r + paint[k + 7] * g + paint[k + 8] * b
+                    r, g = red, green
+                reds += max(r, np.float32(0))
+                greens += max(g, np.float32(0))
+                blues += max(b, np.float32(0))
+        scale[4 * (into + x)], scale[4 * (into + x) + 1] = reds * share, greens * share
+        scale[4 * (into + x) + 2] = blues * share
+
+
 @compiled(parallel=True)
 def scale_plainly(
     picture: FloatImage,
@@ -87,29 +122,27 @@ def scale_plainly(
     side: int,
     scale: FloatImage,
     reflected: ReflectedLight,
+    paint: FloatImage,
 ) -> bool:
-    """The scale of a radiance (rows, columns, 3) of the targets' size, in blocks; whether all is finite."""
+    """The scale of a radiance (rows, columns, 3) of the targets' size, in blocks; whether all is finite.
+
+    ``paint`` (9 x target pixels,): as ``LiveMaps.paint``; of no size where there is none
+    """
     rows, columns, _ = picture.shape
-    high, wide = -(-rows // block), -(-columns // block)
+    high = -(-rows // block)
     good = np.ones(high, np.bool_)
-    share = np.float32(1 / block**2)
     for row in prange(high):
         total = np.float32(0)
-        less = np.zeros((block, 3 * columns), np.float32)
-        if reflected.surface.size:
-            for v in range(row * block, min((row + 1) * block, rows)):
-                reflected_row(reflected, v, 0, columns, less[v - row * block])
-        for x in range(wide):
-            k = 4 * ((row + MARGIN) * side + MARGIN + x)
-            for c in range(3):
-                found = np.float32(0)
-                for v in range(row * block, min((row + 1) * block, rows)):
-                    for u in range(x * block, min((x + 1) * block, columns)):
-                        i = 3 * (v * columns + u) + c
-                        total += picture[v, u, c] * np.float32(0)
-                        light = picture[v, u, c] - less[v - row * block, 3 * u + c]
-                        found += max(light * gain[i] - offset[i], np.float32(0))
-                scale[k + c] = found * share
+        wanted = np.zeros((block, 3 * columns), np.float32)
+        for v in range(row * block, min((row + 1) * block, rows)):
+            line = wanted[v - row * block]
+            if reflected.surface.size:
+                reflected_row(reflected, v, 0, columns, line)
+            for u in range(columns):
+                for c in range(3):
+                    total += picture[v, u, c] * np.float32(0)
+                    line[3 * u + c] = picture[v, u, c] - line[3 * u + c]
+        _scale_row(wanted, row, rows, gain, offset, paint, scale, (row + MARGIN) * side + MARGIN)
         good[row] = total == 0
     return bool(good.all())
 
@@ -148,40 +181,39 @@ def scale_picture(
     side: int,
     scale: FloatImage,
     reflected: ReflectedLight,
+    paint: FloatImage,
 ) -> None:
-    """The scale of a picture (rows, columns, 3) of the targets' size; ``light`` (256,): radiance of its values."""
+    """The scale of a picture (rows, columns, 3) of the targets' size; ``light`` (256,): radiance of its values.
+
+    ``paint``: as of ``scale_plainly``
+    """
     rows, columns, _ = picture.shape
-    high, wide = -(-rows // block), -(-columns // block)
-    share = np.float32(1 / block**2)
-    for row in prange(high):
+    for row in prange(-(-rows // block)):
         into = (row + MARGIN) * side + MARGIN
-        if block == 1 and reflected.surface.size:
+        first, last = np.int64(used[row, 0]), np.int64(used[row, 1])
+        if block == 1 and paint.size == 0 and reflected.surface.size:
             less = np.empty((1, 3 * columns), np.float32)
-            reflected_row(reflected, row, np.int64(used[row, 0]), np.int64(used[row, 1]), less[0])
-            for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
+            reflected_row(reflected, row, first, last, less[0])
+            for x in range(first, last):
                 r = light[picture[row, x, 0]] - less[0, 3 * x]
                 g = light[picture[row, x, 1]] - less[0, 3 * x + 1]
                 b = light[picture[row, x, 2]] - less[0, 3 * x + 2]
                 scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
             continue
-        if block == 1:
-            for x in range(np.int64(used[row, 0]), np.int64(used[row, 1])):
+        if block == 1 and paint.size == 0:
+            for x in range(first, last):
                 r, g, b = light[picture[row, x, 0]], light[picture[row, x, 1]], light[picture[row, x, 2]]
                 scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
             continue
-        taken = np.zeros((block, 3 * columns), np.float32)
-        if reflected.surface.size:
-            for v in range(row * block, min((row + 1) * block, rows)):
-                reflected_row(reflected, v, 0, columns, taken[v - row * block])
-        for x in range(wide):
-            for c in range(3):
-                found = np.float32(0)
-                for v in range(row * block, min((row + 1) * block, rows)):
-                    for u in range(x * block, min((x + 1) * block, columns)):
-                        i = 3 * (v * columns + u) + c
-                        wanted = light[picture[v, u, c]] - taken[v - row * block, 3 * u + c]
-                        found += max(wanted * gain[i] - offset[i], np.float32(0))
-                scale[4 * (into + x) + c] = found * share
+        wanted = np.zeros((block, 3 * columns), np.float32)
+        for v in range(row * block, min((row + 1) * block, rows)):
+            line = wanted[v - row * block]
+            if reflected.surface.size:
+                reflected_row(reflected, v, 0, columns, line)
+            for u in range(columns):
+                for c in range(3):
+                    line[3 * u + c] = light[picture[v, u, c]] - line[3 * u + c]
+        _scale_row(wanted, row, rows, gain, offset, paint, scale, into)
 
 
 @compiled(parallel=True)

@@ -9,6 +9,7 @@ Gaussian to within what a stage's grade leaves open (docs/decisions/0021), and t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 import cv2
@@ -22,7 +23,7 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.solve.appearance import Base
 from controller.solve.scaling.dither import blue_noise
-from controller.solve.scaling.indirect_maps import indirect_maps
+from controller.solve.scaling.indirect_maps import indirect_maps, paint_map
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
 from controller.transport.planes import image_planes, plane_frames, plane_image
@@ -52,7 +53,7 @@ def scaling_maps(
 
     One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``;
     means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6). ``indirect``: light
-    by way of other surfaces, which is left out of what the projectors make.
+    by way of other surfaces, which is left out of what the projectors make, and colours that depend on the paint.
     Raises UsageError("response-not-rising"), WorkError("live-white-segment").
     """
     if any(radiometry.segment for radiometry in radiometries):
@@ -70,12 +71,15 @@ def scaling_maps(
     gain = reduced(inverse, factor, unit).astype(np.float16)
     dark = reduced(np.maximum(black, 0), factor) * gain.astype(np.float32) / np.float32(unit)
     offset = np.maximum(dark, reduced(plane_image(base.inverse * image_planes(np.maximum(black, 0))), factor))
-    thrown = None
-    if indirect is not None and indirect.factors.any():
-        reach = transport.reach()
-        thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, lambda image: reduced(image, factor))
+    thrown = paint = None
+    if indirect is not None:
+        reduce = partial(reduced, factor=factor)
+        paint = paint_map(indirect, inverse, reduce)
+        if indirect.factors.any():
+            reach = indirect.painted(transport.reach())
+            thrown = indirect_maps(indirect, reach, black, inverse, unit, factor, reduce)
     size_px = present.shape[1], present.shape[0]
-    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), outputs, thrown)
+    return LiveMaps(size_px, gain, _rounded_up(offset), present, unit, blue_noise(), outputs, thrown, paint)
 
 
 def _output_maps(

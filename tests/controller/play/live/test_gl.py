@@ -75,6 +75,12 @@ def random_indirect(seed: int) -> Arrays:
     }
 
 
+def random_paint(seed: int) -> Arrays:
+    """Colours that depend on the paint."""
+    width, height = TARGET
+    return {"paint": np.random.default_rng(seed).normal(0, 0.2, (height, width, 3, 3)).astype(np.float16)}
+
+
 def write(path: Path, arrays: Arrays) -> Path:
     frames = {name: np.zeros((rows, columns, 3), np.uint8) for name, columns, rows in OUTPUTS}
     write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS,
@@ -87,11 +93,15 @@ def maps_of(path: Path) -> LiveMaps:
         return LiveMaps.read(bundle)
 
 
-@pytest.mark.parametrize(("seed", "indirect"), [(1, False), (2, True)])
+@pytest.mark.parametrize(
+    ("seed", "more"),
+    [(1, {}), (2, random_indirect(2)), (3, random_paint(3)), (4, random_indirect(4) | random_paint(4))],
+    ids=["direct", "indirect", "paint", "both"],
+)
 def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(
-    tmp_path: Path, seed: int, indirect: bool
+    tmp_path: Path, seed: int, more: Arrays
 ) -> None:
-    bundle = write(tmp_path / "live.vel", random_live(seed) | (random_indirect(seed) if indirect else {}))
+    bundle = write(tmp_path / "live.vel", random_live(seed) | more)
     target = np.random.default_rng(seed).integers(0, 256, (*TARGET[::-1], 3), dtype=np.uint8)
     np.savez(tmp_path / "asked.npz", target=target, brightness=1.3)
     subprocess.run(
@@ -153,6 +163,8 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
         ("P2.response", np.zeros((3, 255), np.float32)),
         ("unit", np.array([np.nan], np.float32)),
         ("P1.unmix", np.full((3, 3), np.inf, np.float32)),
+        ("paint", np.zeros((*TARGET, 3, 3), np.float16)),
+        ("paint", np.full((*TARGET[::-1], 3, 3), np.nan, np.float16)),
         ("indirect.factors", np.zeros((11, 12), np.float32)),
         ("indirect.places", np.full((64, 12, 2), 60, np.uint16)),
         ("indirect.side", np.zeros(1, np.float32)),

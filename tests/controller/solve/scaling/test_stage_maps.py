@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -155,24 +155,42 @@ def thrown_back(stage: Stage) -> IndirectLight:
     return IndirectLight(factors, surface, transport.object_mask, grid, side)
 
 
+def painted(stage: Stage, most: float = 0.5) -> IndirectLight:
+    """Colours that depend on the paint: white stays white, others are off by up to ``most``, in stripes."""
+    calibration, transport, _ = stage
+    columns = transport.camera_shape[1]
+    white = np.sum([part.white for part in calibration.projectors], axis=0)
+    white = np.maximum(white / np.maximum(white.max(axis=2, keepdims=True), 1e-9), 0.05)
+    stripes = (most * np.sin(np.arange(columns) / 5)).astype(np.float32)
+    mixed = np.full((3, 3), 0.5) - 1.5 * np.eye(3)
+    paint = np.einsum("ck,x,yxc,yxk->ckyx", mixed, stripes, white, 1 / white)
+    paint = np.where(transport.object_mask, paint, 0).astype(np.float16)
+    return dataclasses.replace(thrown_back(stage), factors=np.zeros_like(thrown_back(stage).factors), paint=paint)
+
+
+def both(stage: Stage) -> IndirectLight:
+    return dataclasses.replace(thrown_back(stage), paint=painted(stage).paint)
+
+
 @pytest.mark.parametrize("largest_px", [2048, 100], ids=["camera's size", "half of it"])
-def test_the_processor_leaves_room_for_indirect_light_as_the_reference_does(largest_px: int) -> None:
+@pytest.mark.parametrize("light", [thrown_back, painted, both])
+def test_the_processor_leaves_room_for_other_light_as_the_reference_does(
+    largest_px: int, light: Callable[[Stage], IndirectLight]
+) -> None:
     stage = solved("white")
     calibration, transport, base = stage
     radiometries = [part.radiometry for part in calibration.projectors]
-    maps = scaling_maps(
-        transport, base, calibration.black, radiometries, indirect=thrown_back(stage), largest_px=largest_px
-    )
+    maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=light(stage), largest_px=largest_px)
     target, brightness = wanted(stage, largest_px)
     scaler = Interactive(maps)
     frames = scaler.blank()
     scaler.show_picture(target, brightness, frames)
-    plain = compensate(dataclasses.replace(maps, indirect=None), target, brightness)
+    plain = compensate(dataclasses.replace(maps, indirect=None, paint=None), target, brightness)
     radiance = light_table()[target] * np.float32(brightness)
     as_light = Interactive(maps, maps.present.shape).frames(radiance)
     for n, reference in enumerate(compensate(maps, target, brightness)):
         lit = maps.outputs[n].shape[..., 0] > 0
-        assert np.abs(reference.astype(int) - plain[n])[lit].mean() > 3, "indirect light counts here"
+        assert np.abs(reference.astype(int) - plain[n])[lit].mean() > 3, "that light counts here"
         for made in (frames[n], as_light[n]):
             assert np.abs(made.astype(int) - reference)[lit].mean() <= 0.75
 
@@ -193,6 +211,25 @@ def test_a_live_picture_with_its_indirect_light_is_as_bright_as_wanted() -> None
         away[name] = abs(float(whole[mask].mean() / light[mask].mean()) - 1)
     assert away["known"] < 0.02
     assert away["unknown"] > 4 * away["known"]
+
+
+def test_a_live_picture_on_paint_that_changes_colours_has_the_wanted_ones() -> None:
+    stage = solved("white")
+    calibration, transport, base = stage
+    indirect = painted(stage, 0.3)  # all of it can be made up for
+    radiometries = [part.radiometry for part in calibration.projectors]
+    target, brightness = wanted(stage)
+    target[..., 0], target[..., 2] = 200, 90
+    light = light_table()[target] * np.float32(brightness)
+    mask = transport.object_mask & (0.5 * transport.reach() > light).all(axis=2)
+    away = {}
+    for name, known in (("known", indirect), ("unknown", None)):
+        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
+        direct = seen(stage, compensate(maps, target, brightness))
+        whole = direct + indirect.forward(direct) + calibration.black
+        away[name] = float(np.median(np.abs(whole[mask] / light[mask] - 1)))
+    assert away["known"] < 0.03
+    assert away["unknown"] > 3 * away["known"]
 
 
 def test_a_picture_of_another_size_is_refused_with_both_sizes(stage: Stage) -> None:
