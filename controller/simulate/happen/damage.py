@@ -140,6 +140,10 @@ def bundle_damaged(life: Living, item: Item) -> None:
 
     def repair() -> None:
         publish(STAGE, int(world.truth_s))
+        written = current(bundles)
+        if written is not None:
+            # Twice in one second gives the same name, and a sound file in the place of a bad one.
+            witness.bundles.spoilt.pop(written.name, None)
         witness.disturb(0.0, PLAYER_S)
 
     life.later(repaired_s, repair)
