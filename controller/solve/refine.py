@@ -8,7 +8,7 @@ up from photograph to photograph. Arrays in, arrays out (docs/decisions/0044).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -50,6 +50,10 @@ EDGE_PX: Final = 2.0
 """The correction ends smoothly over about twice this beyond the pixels in reach."""
 LEAST_GAIN: Final = 0.02
 """CIEDE2000: what two photographs of the same frames differ by, as a mean over the pixels."""
+STEADY_STEP_PX: Final = 3
+"""Every so many rows and columns are looked at for what lamps that flicker change."""
+SURE: Final = 2.0
+"""Standard deviations of what lamps flicker by: a smaller factor of a projector's light says nothing."""
 CORRELATED_PX: Final = 16.0
 """Camera pixels whose errors count as one when the uncertainty of a mean is estimated."""
 
@@ -116,6 +120,36 @@ def refusal(
     if trusted.sum() < (1 - MOST_REJECTED) * mask.sum():
         return "something moved or stood in the picture"
     return None
+
+
+def without_flicker(
+    photograph: ResultPhotograph, predicted: FloatImage, parts: Sequence[FloatImage], stage: RefinedStage, trusted: Mask
+) -> ResultPhotograph:
+    """The photograph without what lamps that flicker can explain of it, so that frames are not corrected for that.
+
+    The light of each projector is some factor of what is predicted. What lamps flicker by is known from two exposures
+    alike. A factor is kept as far as it is clearly larger, as James and Stein (1961) shrink means.
+
+    Parameters
+    ----------
+    parts : (rows, columns, 3) the light of each projector in ``predicted``
+    """
+    at = np.zeros(trusted.shape, np.bool_)
+    at[::STEADY_STEP_PX, ::STEADY_STEP_PX] = trusted[::STEADY_STEP_PX, ::STEADY_STEP_PX]
+    at &= channels.finite(photograph.first) & channels.finite(photograph.last)
+    scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
+    columns = np.stack([(part[at] / scale[at]).ravel() for part in parts], axis=1).astype(np.float64)
+    if len(columns) <= len(parts):
+        return photograph
+    errors = [
+        (error[at] / scale[at]).ravel().astype(np.float64)
+        for error in (photograph.radiance - predicted, photograph.last - photograph.first)
+    ]
+    factors, between = np.linalg.lstsq(columns, np.stack(errors, axis=1), rcond=None)[0].T
+    flicker2 = float(np.mean(between**2)) / 2
+    taken = np.minimum(SURE**2 * flicker2 / np.maximum(factors**2, 1e-30), 1) * factors
+    light = np.sum([np.float32(factor) * part for factor, part in zip(taken, parts, strict=True)], axis=0)
+    return replace(photograph, radiance=np.asarray(photograph.radiance - light, np.float32))
 
 
 def noise_variance(sigma: FloatImage, mask: Mask, scale_px: float) -> FloatImage:

@@ -32,6 +32,7 @@ from controller.solve.refine import (
     refusal,
     solve_again,
     trusted_pixels,
+    without_flicker,
 )
 from controller.steps import costs
 from controller.steps.appearance.causes import causes_step
@@ -143,11 +144,12 @@ class _Round:
         if refused is not None:
             self.context.reporter.say(f"A photograph of {self.name} was not used: {refused}.", Level.WARNING)
             return replace(now, photographs=(*now.photographs, {"refused": refused}))
+        said = self._equations(now, photograph, predicted, trusted)
+        photograph = without_flicker(photograph, predicted, self._parts(now.frames), self._stage, trusted)
         found = self._error(photograph.radiance, trusted)
         row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
         rows = (*now.photographs, row)
-        said = self._equations(now, photograph, predicted, trusted)
         if now.best is not None and now.error is not None:
             better = gain(now.error, found.map)
             if better.mean <= 0:
@@ -205,6 +207,12 @@ class _Round:
     def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
         light = self.calibrated.predicted_light(self._in_order(frames))
         return np.asarray(light + self.calibrated.calibration.black, np.float32)
+
+    def _parts(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
+        """The light of each projector in ``_predicted``."""
+        transport, indirect = self.calibrated.transport, self.calibrated.indirect
+        direct = [transport.forward_part(n, frame) for n, frame in enumerate(self._in_order(frames))]
+        return direct if indirect is None else [one + indirect.forward(one) for one in direct]
 
     def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
         return [frames[projector] for projector in self.calibrated.projectors]

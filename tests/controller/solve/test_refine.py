@@ -25,6 +25,7 @@ from controller.solve.refine import (
     refusal,
     solve_again,
     trusted_pixels,
+    without_flicker,
     without_noise,
 )
 from controller.transport import LightTransport, build_transport
@@ -71,6 +72,23 @@ class Result:
         light = spoil(self.seen(frames))
         first, last, merged = (light + rng.normal(0, self.noise, light.shape).astype(np.float32) for _ in range(3))
         return ResultPhotograph(merged, np.full_like(merged, self.noise), first, last)
+
+    def flickering(self, frames: tuple[FloatImage, ...], by: float, dimmed: float = 1.0) -> ResultPhotograph:
+        """Each lamp has another strength in each exposure, ``by`` (standard deviation) off; the first is ``dimmed``."""
+        self.seed += 1
+        rng = np.random.default_rng(self.seed)
+        parts = [self.true.forward_part(n, frame) for n, frame in enumerate(frames)]
+        images = []
+        for _ in range(3):
+            strengths = rng.normal(1, by, len(parts)) * np.array([dimmed, *[1.0] * (len(parts) - 1)])
+            light = np.sum([np.float32(one) * part for one, part in zip(strengths, parts, strict=True)], axis=0)
+            noise = rng.normal(0, self.noise, light.shape)
+            images.append(np.asarray(light + self.calibration.black + noise, np.float32))
+        return ResultPhotograph(images[2], np.full_like(images[2], self.noise), images[0], images[1])
+
+    def steady(self, frames: tuple[FloatImage, ...], photograph: ResultPhotograph) -> ResultPhotograph:
+        parts = [self.transport.forward_part(n, frame) for n, frame in enumerate(frames)]
+        return without_flicker(photograph, self.predicted(frames), parts, self.stage, self.mask)
 
     def predicted(self, frames: tuple[FloatImage, ...]) -> FloatImage:
         return np.asarray(self.transport.forward(frames) + self.calibration.black, np.float32)
@@ -135,6 +153,34 @@ def test_a_correction_is_never_worse_whatever_is_wrong_with_the_model(seed: int)
     before, after, last = map(found.mean_error, (found.frames, once, twice))
     assert after <= before + LEAST_GAIN
     assert last <= after + LEAST_GAIN
+
+
+@pytest.mark.parametrize("by", [0.005, 0.01, 0.02])
+def test_lamps_that_flicker_are_not_corrected(by: float) -> None:
+    found = result(noise=1e-5)
+    away: dict[str, list[float]] = {"as seen": [], "steady": []}
+    for _ in range(12):
+        photograph = found.flickering(found.frames, by)
+        predicted = found.predicted(found.frames)
+        for name, one in (("as seen", photograph), ("steady", found.steady(found.frames, photograph))):
+            away[name].append(float(np.abs((one.radiance - predicted)[found.mask]).mean()))
+    assert np.mean(away["steady"]) < 0.5 * np.mean(away["as seen"])
+    assert all(steady <= seen + 2e-4 for steady, seen in zip(away["steady"], away["as seen"], strict=True))
+
+
+def test_a_lamp_that_is_darker_is_corrected_although_lamps_flicker() -> None:
+    found = result()
+    photograph = found.flickering(found.frames, 0.005, dimmed=0.92)
+    changed = [np.abs((one.radiance - found.predicted(found.frames))[found.mask]).mean()
+               for one in (photograph, found.steady(found.frames, photograph))]  # fmt: skip
+    assert changed[1] == pytest.approx(changed[0], rel=0.1)
+
+
+def test_light_that_is_in_no_model_is_kept_beside_steady_lamps() -> None:
+    found = result(light=indirect(0.1))
+    photograph = found.photograph(found.frames)
+    steady = found.steady(found.frames, photograph)
+    np.testing.assert_allclose(steady.radiance[found.mask], photograph.radiance[found.mask], atol=1e-3)
 
 
 @pytest.mark.parametrize("noise", [0.0003, 0.003, 0.02])
