@@ -58,7 +58,9 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
         if row.day not in WEEKDAYS and _date(row.day) is None:
             raise _wrong(f"The day of row {number}", row.day, "mon to sun, or a date such as 2026-12-24")
         if bool(row.opens) != bool(row.closes):
-            raise _wrong(f"The hours of row {number}", f"{row.opens}-{row.closes}", "both times, or neither (closed)")
+            raise _wrong(
+                f"The time span of row {number}", f"{row.opens}-{row.closes}", "both times, or neither (closed)"
+            )
         for text in (row.opens, row.closes):
             if text and not _TIME.fullmatch(text):
                 raise _wrong(f"A time of row {number}", text, '"HH:MM", from 00:00 to 23:59')

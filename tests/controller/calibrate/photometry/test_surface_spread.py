@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +17,7 @@ from controller.calibrate.photometry.surface_spread import contrast_left, measur
 from controller.calibrate.values import Correspondence, SurfaceSpread
 from controller.capture.pattern_frames import frame
 from controller.capture.patterns import Code, PatternKind, PatternPlan, plan_patterns
-from controller.core.arrays import FloatImage
+from controller.core.arrays import Float64, FloatImage
 
 SHAPE = (260, 330)
 SIZE = (144, 108)
@@ -26,13 +27,20 @@ SCALE = 0.4
 
 
 def diffused(light: FloatImage, distance_px: float) -> FloatImage:
-    """The point response K0(r / d) / (2 pi d^2), each sample a mean over its pixel; mirrored at the borders."""
+    """Light (rows, columns) that has diffused; mirrored at the borders."""
+    kernel = point_response(distance_px)
+    wide = np.pad(light, len(kernel) // 2, mode="symmetric")
+    return np.asarray(fftconvolve(wide, kernel, mode="valid"), np.float32)
+
+
+@functools.cache
+def point_response(distance_px: float) -> Float64:
+    """K0(r / d) / (2 pi d^2), each sample a mean over its pixel."""
     reach, fine = int(np.ceil(9 * distance_px)), 8
     at = (np.arange((2 * reach + 1) * fine) + 0.5) / fine - reach - 0.5
     point = k0(np.maximum(np.hypot(at[:, None], at[None, :]), 1e-3) / distance_px)
     kernel = point.reshape(2 * reach + 1, fine, 2 * reach + 1, fine).mean(axis=(1, 3))
-    wide = np.pad(light, reach, mode="symmetric")
-    return np.asarray(fftconvolve(wide, kernel / kernel.sum(), mode="valid"), np.float32)
+    return np.asarray(kernel / kernel.sum())
 
 
 @dataclass(frozen=True)
