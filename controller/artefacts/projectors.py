@@ -268,18 +268,20 @@ class IndirectFigures:
     """``indirect-PROJECTOR.json``: indirect light as a share of a projector's white, ``median`` and ``p95`` of pixels.
 
     ``response`` (3,): relative change of the response at value 64 by being fitted to direct light
+    ``flicker``: standard deviation of the lamp's light from photograph to photograph, relative; 0 where not known
     """
 
     median: float
     p95: float
     response: tuple[float, ...] = ()
+    flicker: float = 0.0
 
     @property
     def matters(self) -> bool:
         return self.median >= LEAST_MEDIAN or self.p95 >= LEAST_P95
 
     def write(self, run: Path, projector: str) -> Path:
-        row = {"median": self.median, "p95": self.p95, "response": list(self.response)}
+        row = {"median": self.median, "p95": self.p95, "response": list(self.response), "flicker": self.flicker}
         return write_json(json_path(run, StepKind.INDIRECT, projector), row)
 
     @classmethod
@@ -289,7 +291,8 @@ class IndirectFigures:
         if not path.exists():
             return None
         row = read_json(path)
-        return cls(float(row["median"]), float(row["p95"]), tuple(float(value) for value in row["response"]))
+        response = tuple(float(value) for value in row["response"])
+        return cls(float(row["median"]), float(row["p95"]), response, float(row.get("flicker", 0.0)))
 
 
 def read_indirect(run: Path, projectors: Sequence[str]) -> list[Indirect] | None:

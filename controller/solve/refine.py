@@ -123,16 +123,23 @@ def refusal(
 
 
 def without_flicker(
-    photograph: ResultPhotograph, predicted: FloatImage, parts: Sequence[FloatImage], stage: RefinedStage, trusted: Mask
+    photograph: ResultPhotograph,
+    predicted: FloatImage,
+    parts: Sequence[FloatImage],
+    stage: RefinedStage,
+    trusted: Mask,
+    flicker: Sequence[float],
 ) -> ResultPhotograph:
     """The photograph without what lamps that flicker can explain of it, so that frames are not corrected for that.
 
-    The light of each projector is some factor of what is predicted. What lamps flicker by is known from two exposures
-    alike. A factor is kept as far as it is clearly larger, as James and Stein (1961) shrink means.
+    The light of each projector is some factor of what is predicted. A factor is kept as far as it is clearly larger
+    than what lamps flicker by, as James and Stein (1961) shrink means. That is the mean of what two exposures alike say
+    of all lamps, few numbers of this very light, and of what the calibration says of each, in other exposures.
 
     Parameters
     ----------
     parts : (rows, columns, 3) the light of each projector in ``predicted``
+    flicker : standard deviation of each lamp in the calibration's photographs, relative; 0 where it is not known
     """
     at = np.zeros(trusted.shape, np.bool_)
     at[::STEADY_STEP_PX, ::STEADY_STEP_PX] = trusted[::STEADY_STEP_PX, ::STEADY_STEP_PX]
@@ -146,7 +153,8 @@ def without_flicker(
         for error in (photograph.radiance - predicted, photograph.last - photograph.first)
     ]
     factors, between = np.linalg.lstsq(columns, np.stack(errors, axis=1), rcond=None)[0].T
-    flicker2 = float(np.mean(between**2)) / 2
+    here2, known2 = float(np.mean(between**2)) / 2, np.square(flicker)
+    flicker2 = np.where(known2 > 0, (here2 + known2) / 2, here2)
     taken = np.minimum(SURE**2 * flicker2 / np.maximum(factors**2, 1e-30), 1) * factors
     light = np.sum([np.float32(factor) * part for factor, part in zip(taken, parts, strict=True)], axis=0)
     return replace(photograph, radiance=np.asarray(photograph.radiance - light, np.float32))

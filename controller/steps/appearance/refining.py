@@ -14,6 +14,7 @@ import numpy as np
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.camera import inherit_camera
 from controller.artefacts.kinds import StepKind
+from controller.artefacts.projectors import IndirectFigures
 from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
 from controller.capture.brackets import merge_brackets
 from controller.core.arrays import Float64, FloatImage, Mask
@@ -145,7 +146,8 @@ class _Round:
             self.context.reporter.say(f"A photograph of {self.name} was not used: {refused}.", Level.WARNING)
             return replace(now, photographs=(*now.photographs, {"refused": refused}))
         said = self._equations(now, photograph, predicted, trusted)
-        photograph = without_flicker(photograph, predicted, self._parts(now.frames), self._stage, trusted)
+        parts = self._parts(now.frames)
+        photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
         found = self._error(photograph.radiance, trusted)
         row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
@@ -199,6 +201,11 @@ class _Round:
         indirect = [part.indirect for part in calibration.projectors if part.indirect is not None]
         white = white + np.sum(indirect, axis=0, dtype=np.float32)
         return RefinedStage(calibration.black, np.maximum(white, 0))
+
+    @property
+    def _flicker(self) -> list[float]:
+        known = [IndirectFigures.read(self.calibrated.folder, name) for name in self.calibrated.projectors]
+        return [0.0 if one is None else one.flicker for one in known]
 
     def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
         matrix = self.calibrated.calibration.camera_to_xyz

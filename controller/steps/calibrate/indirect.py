@@ -84,13 +84,14 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
         radiometry = held_to(waves, radiometry, light.response, share, white)
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
-    figures = IndirectFigures(median, p95, tuple(float(value) for value in change))
+    flicker = lamp_flicker(seen.strengths)
+    figures = IndirectFigures(median, p95, tuple(float(value) for value in change), flicker)
     segment = np.array([radiometry.segment]) if radiometry.segment else None
     stripes = None if known is None else dark_light(captures, plan, known.projector_px)
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
     troubles = {
-        TroubleCode.UNSTEADY_LAMP: unsteady(name, lamp_flicker(seen.strengths)),
+        TroubleCode.UNSTEADY_LAMP: unsteady(name, flicker),
         # In direct light alone tiles differ less, so that paint is seen where it was not before.
         TroubleCode.PAINT_COLOURS: painted(name, report.paint),
     }

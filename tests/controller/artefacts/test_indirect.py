@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ NAMES = ("left", "right")
 
 def write(run: Path, projector: str, median: float, p95: float) -> None:
     Indirect(np.full((2, 3, 3), median, np.float32), np.full((3, 256), 0.5), np.eye(3)).write(run, projector)
-    IndirectFigures(median, p95, (0.01, 0.0, -0.01)).write(run, projector)
+    IndirectFigures(median, p95, (0.01, 0.0, -0.01), 0.008).write(run, projector)
 
 
 def test_what_was_measured_is_read_back(tmp_path: Path) -> None:
@@ -22,7 +23,7 @@ def test_what_was_measured_is_read_back(tmp_path: Path) -> None:
     assert found is not None
     assert [float(one.share[0, 0, 0]) for one in found] == [0.25, 0.5]
     np.testing.assert_array_equal(found[0].radiometry.response, 0.5)
-    assert IndirectFigures.read(tmp_path, "left") == IndirectFigures(0.25, 0.75, (0.01, 0.0, -0.01))
+    assert IndirectFigures.read(tmp_path, "left") == IndirectFigures(0.25, 0.75, (0.01, 0.0, -0.01), 0.008)
 
 
 @pytest.mark.parametrize(
@@ -44,6 +45,11 @@ def test_a_stage_with_next_to_none_is_taken_as_one_without(
 def test_runs_from_before_it_was_measured(tmp_path: Path) -> None:
     write(tmp_path, "left", 0.2, 0.4)
     assert read_indirect(tmp_path, NAMES) is None
+    (file,) = tmp_path.glob("indirect-left.json")
+    row = json.loads(file.read_text())
+    del row["flicker"]
+    file.write_text(json.dumps(row))
+    assert IndirectFigures.read(tmp_path, "left") == IndirectFigures(0.2, 0.4, (0.01, 0.0, -0.01), 0.0)
 
 
 def test_what_stripes_tell_is_kept(tmp_path: Path) -> None:
