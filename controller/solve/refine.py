@@ -80,6 +80,12 @@ class RefinedStage:
     white: FloatImage
 
 
+def _counted_over(predicted: FloatImage, stage: RefinedStage) -> FloatImage:
+    """The light over which errors count: that of the picture and ``FLOOR`` of white."""
+    light = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
+    return np.asarray(light, np.float32)
+
+
 def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask) -> Mask:
     """The pixels of ``mask`` on which the photograph shows the result and nothing else, such as a hand or its shadow.
 
@@ -89,7 +95,7 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     measured = mask & channels.finite(photograph.radiance)
     if not measured.any():
         return measured
-    scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
+    scale = _counted_over(predicted, stage)
     error = masked_blur(photograph.radiance - predicted, measured, EDGE_PX) / scale
     inside = error[measured]
     middle = np.median(inside, axis=0)
@@ -144,7 +150,7 @@ def without_flicker(
     at = np.zeros(trusted.shape, np.bool_)
     at[::STEADY_STEP_PX, ::STEADY_STEP_PX] = trusted[::STEADY_STEP_PX, ::STEADY_STEP_PX]
     at &= channels.finite(photograph.first) & channels.finite(photograph.last)
-    scale = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
+    scale = _counted_over(predicted, stage)
     columns = np.stack([(part[at] / scale[at]).ravel() for part in parts], axis=1).astype(np.float64)
     if len(columns) <= len(parts):
         return photograph

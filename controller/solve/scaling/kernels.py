@@ -78,6 +78,16 @@ def scale_twos(
 
 
 @compiled()
+def _reflected_rows(reflected: ReflectedLight, row: int, block: int, rows: int, columns: int) -> FloatImage:
+    """(block, 3 x columns): light by way of other surfaces in a row of blocks; 0 where there is none."""
+    found = np.zeros((block, 3 * columns), np.float32)
+    if reflected.surface.size:
+        for v in range(row * block, min((row + 1) * block, rows)):
+            reflected_row(reflected, v, 0, columns, found[v - row * block])
+    return found
+
+
+@compiled()
 def _scale_row(
     wanted: FloatImage,
     row: int,
@@ -133,11 +143,9 @@ def scale_plainly(
     good = np.ones(high, np.bool_)
     for row in prange(high):
         total = np.float32(0)
-        wanted = np.zeros((block, 3 * columns), np.float32)
+        wanted = _reflected_rows(reflected, row, block, rows, columns)
         for v in range(row * block, min((row + 1) * block, rows)):
             line = wanted[v - row * block]
-            if reflected.surface.size:
-                reflected_row(reflected, v, 0, columns, line)
             for u in range(columns):
                 for c in range(3):
                     total += picture[v, u, c] * np.float32(0)
@@ -205,11 +213,9 @@ def scale_picture(
                 r, g, b = light[picture[row, x, 0]], light[picture[row, x, 1]], light[picture[row, x, 2]]
                 scale_of_one(r, g, b, gain, offset, row * columns + x, scale, into + x)
             continue
-        wanted = np.zeros((block, 3 * columns), np.float32)
+        wanted = _reflected_rows(reflected, row, block, rows, columns)
         for v in range(row * block, min((row + 1) * block, rows)):
             line = wanted[v - row * block]
-            if reflected.surface.size:
-                reflected_row(reflected, v, 0, columns, line)
             for u in range(columns):
                 for c in range(3):
                     line[3 * u + c] = light[picture[v, u, c]] - line[3 * u + c]

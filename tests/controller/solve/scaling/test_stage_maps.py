@@ -195,41 +195,45 @@ def test_the_processor_leaves_room_for_other_light_as_the_reference_does(
             assert np.abs(made.astype(int) - reference)[lit].mean() <= 0.75
 
 
+def shown(stage: Stage, indirect: IndirectLight, target: ByteImage, brightness: float) -> tuple[FloatImage, FloatImage]:
+    """(rows, columns, 3): what is seen of a live picture whose maps know ``indirect`` light, and whose do not."""
+    calibration, transport, base = stage
+    radiometries = [part.radiometry for part in calibration.projectors]
+    found = []
+    for known in (indirect, None):
+        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
+        direct = seen(stage, compensate(maps, target, brightness))
+        found.append(direct + indirect.forward(direct) + calibration.black)
+    return found[0], found[1]
+
+
 def test_a_live_picture_with_its_indirect_light_is_as_bright_as_wanted() -> None:
     stage = solved("white")
-    calibration, transport, base = stage
-    indirect = thrown_back(stage)
-    radiometries = [part.radiometry for part in calibration.projectors]
+    _, transport, _ = stage
     target, brightness = wanted(stage)
     light = light_table()[target] * np.float32(brightness)
     mask = transport.object_mask & (0.7 * transport.reach() > light).all(axis=2)
-    away = {}
-    for name, known in (("known", indirect), ("unknown", None)):
-        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
-        direct = seen(stage, compensate(maps, target, brightness))
-        whole = direct + indirect.forward(direct) + calibration.black
-        away[name] = abs(float(whole[mask].mean() / light[mask].mean()) - 1)
-    assert away["known"] < 0.02
-    assert away["unknown"] > 4 * away["known"]
+    known, unknown = (
+        abs(float(whole[mask].mean() / light[mask].mean()) - 1)
+        for whole in shown(stage, thrown_back(stage), target, brightness)
+    )
+    assert known < 0.02
+    assert unknown > 4 * known
 
 
 def test_a_live_picture_on_paint_that_changes_colours_has_the_wanted_ones() -> None:
     stage = solved("white")
-    calibration, transport, base = stage
-    indirect = painted(stage, 0.3)  # all of it can be made up for
-    radiometries = [part.radiometry for part in calibration.projectors]
+    _, transport, _ = stage
     target, brightness = wanted(stage)
     target[..., 0], target[..., 2] = 200, 90
     light = light_table()[target] * np.float32(brightness)
     mask = transport.object_mask & (0.5 * transport.reach() > light).all(axis=2)
-    away = {}
-    for name, known in (("known", indirect), ("unknown", None)):
-        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
-        direct = seen(stage, compensate(maps, target, brightness))
-        whole = direct + indirect.forward(direct) + calibration.black
-        away[name] = float(np.median(np.abs(whole[mask] / light[mask] - 1)))
-    assert away["known"] < 0.03
-    assert away["unknown"] > 3 * away["known"]
+    mild = painted(stage, 0.3)  # all of it can be made up for
+    known, unknown = (
+        float(np.median(np.abs(whole[mask] / light[mask] - 1))) for whole in shown(stage, mild, target, brightness)
+    )
+    assert known < 0.03
+    assert unknown > 3 * known
 
 
 def test_a_picture_of_another_size_is_refused_with_both_sizes(stage: Stage) -> None:
