@@ -12,8 +12,9 @@ from benchmarks import Timing
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.equations import build_problem, initial_point, objective_of
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, initial_point, objective_of
+from controller.solve.bounded.solver import SMOOTHNESS
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes
 

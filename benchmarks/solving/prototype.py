@@ -31,9 +31,9 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.equations import smoothness_term
 from controller.solve.bounded.problem import Problem
 from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS
-from controller.solve.bounded.solver import smoothness_term
 from controller.transport import LightTransport, build_transport
 from controller.transport.camera_box import CameraBox
 from controller.transport.planes import plane_image

@@ -20,7 +20,8 @@ from benchmarks.lab.synthetic import crop_calibration, synthetic_calibration, sy
 from benchmarks.lab.traced import traced
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
-from controller.solve.bounded.solver import build_problem, initial_point, solve_bounded
+from controller.solve.bounded.equations import build_problem, initial_point
+from controller.solve.bounded.solver import solve_bounded
 from controller.solve.feasibility import choose_exposure, target_radiance
 from controller.solve.regions.box_solvers import BoxProblem, solve_box
 from controller.solve.regions.solver import PHASES, SIZE_PX, Regions, solve_regions

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from controller.capture.profile import CameraNoise, CameraProfile
     from controller.core.errors import VelaturaError
     from controller.solve.appearance import Base
-    from controller.solve.bounded.solver import Solution
+    from controller.solve.bounded.problem import Solution
     from controller.solve.metrics import Comparison
     from controller.transport import LightTransport
     from controller.transport.indirect import IndirectLight

@@ -14,7 +14,8 @@ from controller.calibrate.values import Calibration, Radiometry
 from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.solve import appearance
 from controller.solve.appearance import Base
-from controller.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, Solution, solve_bounded
+from controller.solve.bounded.problem import Solution
+from controller.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, solve_bounded
 from controller.solve.exposed import expose_target
 from controller.solve.feasibility import target_radiance
 from controller.solve.scaling.dither import to_device

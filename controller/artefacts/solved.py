@@ -19,7 +19,7 @@ from controller.core.errors import WorkError
 from controller.core.storage import sha256_of
 
 if TYPE_CHECKING:
-    from controller.solve.bounded.solver import Solution
+    from controller.solve.bounded.problem import Solution
     from controller.solve.targets.values import Target
 
 _SOLUTION = ("objective", "kkt", "iterations", "seconds", "converged")
@@ -46,7 +46,7 @@ class SolvedBase:
     @classmethod
     def read(cls, run: Path, projectors: Sequence[str]) -> Self:
         """The frames in the order of ``projectors``."""
-        from controller.solve.bounded.solver import Solution
+        from controller.solve.bounded.problem import Solution
 
         arrays = load_arrays(npz_path(run, StepKind.BASE))
         frames = tuple(arrays[f"frame-{name}"] for name in projectors)

@@ -19,7 +19,7 @@ import xxhash
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
 from controller.solve.appearance import Base, prepare_base
-from controller.solve.bounded.solver import Solution
+from controller.solve.bounded.problem import Solution
 from controller.solve.drive_levels import DriveLevels
 from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.solve.targets.values import Target

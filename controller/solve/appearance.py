@@ -19,7 +19,8 @@ import numpy as np
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage, Mask, moved_to_file
 from controller.core.channels import largest
-from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, Solution, check_target, solve_bounded
+from controller.solve.bounded.problem import Solution
+from controller.solve.bounded.solver import SMOOTHNESS, TOLERANCE, check_target, solve_bounded
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 from controller.transport.planes import frame_planes, plane_frames, planes_above

@@ -22,7 +22,12 @@ BLOCK_PX: Final = 4
 """Places are blocks of camera pixels, about one and a half metapixels wide; of 2, a sweep less, for twice the time."""
 RIDGE: Final = 1e-4
 """Pull towards equal projectors, of the mean squared light: decides where the light leaves a choice."""
-MOST_STEPS: Final = 60
+MOST_STEPS: Final = 40
+MOST_HALVINGS: Final = 30
+CLOSE: Final = 1e-6
+"""The light may miss its optimum by this part of the root of the pull, a hundredth of all projectors' light."""
+LEVEL: Final = 1e-3
+"""Share of a step's slope that may be left, uphill, at its end."""
 LEAST_DETERMINANT: Final = 1e-3
 """Of the three colours at a place, relative to those of pure primaries."""
 
@@ -114,44 +119,66 @@ def _solve_block(B: Float64, light: Float64, p: Float64) -> None:
     for k in range(0, p.size, 3):
         p[k], p[k + 1], p[k + 2] = min(max(r, 0.0), 1.0), min(max(s, 0.0), 1.0), min(max(t, 0.0), 1.0)
     if size > 0 and (min(r, s, t) < 0 or max(r, s, t) > 1):
-        _active_set(B, light, RIDGE * size, p)
+        _shared_out(B, light, RIDGE * size, p)
 
 
 @compiled()
-def _active_set(B: Float64, light: Float64, ridge: float, p: Float64) -> None:
-    """min |B p - light|^2 + ridge |p - start|^2 in the unit box, from ``p``: active sets, exact but for the cap."""
-    n = p.size
-    H = B.T @ B + ridge * np.eye(n)
+def _shared_out(B: Float64, light: Float64, ridge: float, p: Float64) -> None:
+    """Write min |B p - light|^2 + ridge |p - start|^2 in the unit box to ``p``, which holds the start.
+
+    With y = (B p - light) / ridge, the best p is start - B' y, bounds kept. So there are three unknowns, however many
+    projectors there are: Newton's method on ridge y = B p(y) - light, the gradient of a convex function of y. A step
+    is halved until that function still falls at its end.
+    """
     start = p.copy()
-    fixed = np.zeros(n, np.bool_)
+    y, gradient, step = np.zeros(3), np.empty(3), np.empty(3)
+    _dual(B, light, ridge, start, y, p, gradient)
+    close = CLOSE * ridge**0.5
     for _ in range(MOST_STEPS):
-        gradient = B.T @ (B @ p - light) + ridge * (p - start)
-        free = np.flatnonzero(~fixed)
-        direction = np.zeros(n)
-        if free.size > 0:
-            part = np.empty((free.size, free.size))
-            for i in range(free.size):
-                for j in range(free.size):
-                    part[i, j] = H[free[i], free[j]]
-            direction[free] = -np.linalg.solve(part, gradient[free])
-        length, stop = 1.0, -1
-        for k in range(free.size):
-            i = int(free[k])
-            d = direction[i]
-            room = (1 - p[i]) / d if d > 1e-12 else (p[i] / -d if d < -1e-12 else 1.0)
-            if room < length:
-                length, stop = room, i
-        p += length * direction
-        if stop >= 0:
-            p[stop] = 1.0 if direction[stop] > 0 else 0.0
-            fixed[stop] = True
-            continue
-        gradient = B.T @ (B @ p - light) + ridge * (p - start)
-        worst, most = -1, 1e-9 * ridge
-        for i in range(n):
-            inward = gradient[i] if p[i] > 0.5 else -gradient[i]
-            if fixed[i] and inward > most:
-                worst, most = i, inward
-        if worst < 0:
+        if max(abs(gradient[0]), abs(gradient[1]), abs(gradient[2])) < close:
             return
-        fixed[worst] = False
+        _newton_step(B, ridge, start, y, gradient, step)
+        slope = gradient[0] * step[0] + gradient[1] * step[1] + gradient[2] * step[2]
+        if not slope < 0:
+            return
+        length = 1.0
+        for _ in range(MOST_HALVINGS):
+            ahead = y + length * step
+            _dual(B, light, ridge, start, ahead, p, gradient)
+            if gradient[0] * step[0] + gradient[1] * step[1] + gradient[2] * step[2] <= -LEVEL * slope:
+                break
+            length /= 2
+        y[:] = ahead
+
+
+@compiled()
+def _dual(B: Float64, light: Float64, ridge: float, start: Float64, y: Float64, p: Float64, gradient: Float64) -> None:
+    """Write start - B' y in the unit box to ``p``, and ridge y + light - B p to ``gradient``."""
+    for c in range(3):
+        gradient[c] = ridge * y[c] + light[c]
+    for k in range(p.size):
+        p[k] = min(max(start[k] - B[0, k] * y[0] - B[1, k] * y[1] - B[2, k] * y[2], 0.0), 1.0)
+        for c in range(3):
+            gradient[c] -= B[c, k] * p[k]
+
+
+@compiled()
+def _newton_step(B: Float64, ridge: float, start: Float64, y: Float64, gradient: Float64, step: Float64) -> None:
+    """Write -(ridge I + B_f B_f')^-1 gradient, f the numbers that are off their bounds, to ``step``."""
+    a, b, c, d, e, f = ridge, 0.0, 0.0, ridge, 0.0, ridge
+    for k in range(start.size):
+        u, v, w = B[0, k], B[1, k], B[2, k]
+        if 0 < start[k] - u * y[0] - v * y[1] - w * y[2] < 1:
+            a, b, c, d, e, f = a + u * u, b + u * v, c + u * w, d + v * v, e + v * w, f + w * w
+    # Cholesky's factors: the matrix is positive definite
+    g = a**0.5
+    h, i = b / g, c / g
+    j = (d - h * h) ** 0.5
+    k1 = (e - h * i) / j
+    m = (f - i * i - k1 * k1) ** 0.5
+    r = -gradient[0] / g
+    s = (-gradient[1] - h * r) / j
+    t = (-gradient[2] - i * r - k1 * s) / m
+    step[2] = t / m
+    step[1] = (s - k1 * step[2]) / j
+    step[0] = (r - h * step[1] - i * step[2]) / g

@@ -1,7 +1,8 @@
-"""The data of one bounded solve, as the solver, its sweeps and the regions share it."""
+"""What a bounded solve is given, its equations as sweeps and regions share them, and its result."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,3 +40,35 @@ class Problem:
     def target(self) -> FloatImage:
         """(3, camera rows, columns): the light to be made. A new array each time: a sweep does not need it."""
         return planes_above(self.picture, self.black)
+
+
+@dataclass(frozen=True, slots=True)
+class SolveInput:
+    """What an engine is asked to solve; ``solver.solve_bounded`` says what each means, and has checked it."""
+
+    transport: LightTransport
+    target: FloatImage
+    black: FloatImage
+    smoothness: float
+    weights: FloatImage | None
+    start: Sequence[FloatImage] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Result of a solve.
+
+    ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
+    ``light`` (camera rows, columns, 3) float32: T p, the frames' light without the black image
+    ``objective``: weighted squared residual plus smoothness, in camera units squared
+    ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
+    ``converged``: the KKT residual fell below the tolerance before the cap on iterations
+    """
+
+    frames: tuple[FloatImage, ...]
+    light: FloatImage
+    objective: float
+    kkt: float
+    iterations: int
+    seconds: float
+    converged: bool

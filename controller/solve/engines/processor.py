@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from typing import Protocol
 
 import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.solve.bounded.equations import build_problem, initial_point, objective_of
 from controller.solve.bounded.gradient import scale_base
-from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.problem import Solution, SolveInput
 from controller.transport import LightTransport
+from controller.transport.planes import frame_planes, plane_frames, plane_image
 
 
 class Engine(Protocol):
@@ -21,11 +24,8 @@ class Engine(Protocol):
 
     name: str
 
-    def descend(self, problem: Problem, x: FloatImage, control: IterationControl) -> tuple[FloatImage, float, int]:
-        """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps.
-
-        Raises WorkError("solve-cancelled").
-        """
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
+        """What ``solver.solve_bounded`` finds. Raises WorkError("solve-cancelled")."""
 
     def scaled(
         self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage
@@ -42,9 +42,21 @@ class Processor:
 
     name = "processor"
 
-    def descend(self, problem: Problem, x: FloatImage, control: IterationControl) -> tuple[FloatImage, float, int]:
-        """As ``Engine.descend``."""
-        return block_coordinate_descent(problem, x, control)
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
+        """As ``Engine.solve``."""
+        began_s = time.perf_counter()
+        transport = given.transport
+        problem = build_problem(transport, given.target, given.black, given.smoothness, given.weights)
+        x = initial_point(problem) if given.start is None else np.clip(frame_planes(given.start), 0, 1)
+        x[problem.majoriser == 0] = 0
+        x, kkt, iterations = block_coordinate_descent(problem, x, control)
+        light = transport.forward_planes(x)
+        objective = objective_of(problem, x, light)
+        del problem
+        frames, seen = tuple(plane_frames(x, transport.sizes)), plane_image(light)
+        return Solution(
+            frames, seen, objective, kkt, iterations, time.perf_counter() - began_s, kkt <= control.tolerance
+        )
 
     def scaled(
         self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage

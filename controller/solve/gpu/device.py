@@ -26,6 +26,8 @@ MOST_GROUPS: Final = 65535
 STORAGE_BUFFERS: Final = 8
 """Of one kernel, of any device."""
 SMALLEST_BYTES: Final = 16
+CHUNK_BYTES: Final = 1 << 24
+CHUNKS: Final = 2
 SOFTWARE: Final = "CPU"
 """wgpu's name for the kind of adapter that is a program, such as Mesa's lavapipe."""
 
@@ -81,6 +83,7 @@ class Device:
             self._device = found.adapter.request_device_sync(
                 required_limits={**limits, "max-storage-buffers-per-shader-stage": STORAGE_BUFFERS}
             )
+        self._chunks: dict[int, list[Buffer]] = {}
 
     def close(self) -> None:
         """Give the device back. All that uses it afterwards raises DeviceRefused."""
@@ -105,21 +108,59 @@ class Device:
     def uniform(self, values: Array) -> Buffer:
         """A buffer of constants, of a kernel's structure."""
         with _refusals("hold constants"):
-            return self._device.create_buffer_with_data(data=values.tobytes(), usage=wgpu.BufferUsage.UNIFORM)
+            return self._device.create_buffer_with_data(
+                data=values.tobytes(), usage=wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST
+            )
 
     def write(self, buffer: Buffer, values: Array) -> None:
         """Put values to the beginning of a buffer."""
-        if values.size:
-            flat = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-            if flat.nbytes % 4:
-                flat = np.concatenate([flat, np.zeros(-flat.nbytes % 4, np.uint8)])
-            with _refusals("take values"):
+        if not values.size:
+            return
+        flat = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+        if flat.nbytes % 4:
+            flat = np.concatenate([flat, np.zeros(-flat.nbytes % 4, np.uint8)])
+        with _refusals("take values"):
+            if flat.nbytes < CHUNK_BYTES:
                 self._device.queue.write_buffer(buffer, 0, flat)
+                return
+            for number, begin in enumerate(range(0, flat.nbytes, CHUNK_BYTES)):
+                part = flat[begin : begin + CHUNK_BYTES]
+                chunk = self._chunk(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC, number)
+                # waits until the chunk's last content was copied
+                chunk.map_sync(wgpu.MapMode.WRITE)
+                chunk.write_mapped(part)
+                chunk.unmap()
+                self._copy(chunk, 0, buffer, begin, part.nbytes)
 
     def read(self, buffer: Buffer, count: int) -> npt.NDArray[np.float32]:
         """The first ``count`` float32 of a buffer, after all that was submitted."""
+        found = np.empty(count, np.float32)
+        flat = found.view(np.uint8)
+        parts = [flat[begin : begin + CHUNK_BYTES] for begin in range(0, flat.nbytes, CHUNK_BYTES)]
+        usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
         with _refusals("give its result"):
-            return np.frombuffer(self._device.queue.read_buffer(buffer, 0, 4 * count), np.float32)
+            # the next chunks are copied while one is read
+            for step in range(len(parts) + CHUNKS - 1):
+                if step < len(parts):
+                    self._copy(buffer, step * CHUNK_BYTES, self._chunk(usage, step), 0, parts[step].nbytes)
+                number = step - CHUNKS + 1
+                if number >= 0:
+                    chunk = self._chunk(usage, number)
+                    chunk.map_sync(wgpu.MapMode.READ)
+                    parts[number][:] = chunk.read_mapped(0, parts[number].nbytes, copy=False)
+                    chunk.unmap()
+        return found
+
+    def _chunk(self, usage: int, number: int) -> Buffer:
+        """One of a few buffers that this program and the device both see, in turn. They stay: making them is slow."""
+        if usage not in self._chunks:
+            self._chunks[usage] = [self._device.create_buffer(size=CHUNK_BYTES, usage=usage) for _ in range(CHUNKS)]
+        return self._chunks[usage][number % CHUNKS]
+
+    def _copy(self, source: Buffer, at: int, to: Buffer, begin: int, size: int) -> None:
+        encoder = self._device.create_command_encoder()
+        encoder.copy_buffer_to_buffer(source, at, to, begin, size)
+        self._device.queue.submit([encoder.finish()])
 
     # work
 
@@ -144,7 +185,7 @@ class Device:
             bound = self._device.create_bind_group(layout=kernel.get_bind_group_layout(0), entries=entries)
         return Work(kernel, bound, spread(threads) if isinstance(threads, int) else threads)
 
-    def submit(self, steps: Sequence[Work | Copy | Clear]) -> None:
+    def submit(self, steps: Sequence[Step]) -> None:
         """Begin the steps, one after the other."""
         with _refusals("do its work"):
             encoder = self._device.create_command_encoder()
@@ -216,6 +257,9 @@ class Clear:
     """Zeros to a buffer."""
 
     buffer: Buffer
+
+
+Step = Work | Copy | Clear
 
 
 def spread(threads: int) -> tuple[int, int]:

@@ -69,7 +69,7 @@ def bands_of(windows: Windows, n: int, *, small: bool, tables: tuple[Profiles, S
     rows, columns = (int(side) for side in windows.size[n])
     places = _places(windows, n, small)
     highest = LANES if small else _highest(windows, tables[0], places.e)
-    even = even_gains(windows, tables[1])
+    even = even_gains(windows, tables[1], (n, n + 1))
     per_row = np.bincount(places.row + MARGIN, minlength=rows + MARGIN)
     found = []
     for begin, end in _cut(per_row, rows, highest, most // RECORD_BYTES):

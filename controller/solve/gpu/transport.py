@@ -92,7 +92,10 @@ class DeviceTransport:
         self._per_sum = windowed.per_sum
         self._camera = device.uniform(self._camera_values(windowed.colours))
         self._on_edges = held.put(on_edges.astype(np.uint32), "edges")
-        self._terms = [self._term(n, term, on_edges) for n, term in enumerate(terms)]
+        self._terms = {
+            absolute: [self._term(n, term, on_edges, absolute) for n, term in enumerate(terms)]
+            for absolute in (False, True)
+        }
 
     def _copied(self, windowed: WindowTransport, n: int) -> list[_Windows]:
         tables = windowed.table, windowed.small
@@ -114,8 +117,8 @@ class DeviceTransport:
 
     # work
 
-    def forward(self, n: int, sensor: Buffer) -> list[Work]:
-        """Adds T_n p_n to ``sensor``; ``shown`` holds the mixed frame M p_n."""
+    def forward(self, n: int, sensor: Buffer, *, absolute: bool = False) -> list[Work]:
+        """Adds T_n p_n to ``sensor``; ``shown`` holds the mixed frame M p_n. ``absolute``: with magnitudes in T."""
         work = []
         for part in self._windows[n]:
             begin, end = part.own
@@ -125,19 +128,24 @@ class DeviceTransport:
             kernel = self.device.kernel("band", f"{kind}_shares", f"forward_{kind}")
             bound = [self._band(n, part, _IDENTITY), part.records, part.first, *self._tables[part.small]]
             work.append(self.device.work(kernel, [*bound, self.shown, sensor], (-(-part.most // GROUP), end - begin)))
-        if self._terms and self._terms[n].rows:
-            term = self._terms[n]
+        terms = self._terms[absolute]
+        if terms and terms[n].rows:
+            term = terms[n]
             kernel = self.device.kernel("term", "edge_forward")
             work.append(
                 self.device.work(kernel, [term.values, *term.by_row, term.slots, self.shown, sensor], term.rows)
             )
         return work
 
-    def adjoint(self, n: int, out: Buffer) -> list[Work]:
-        """Writes T_n' r to ``out`` (3, pixels of n); ``collect`` has brought r, in ``residual``, to the sites."""
-        work = self._gather(n, self.mixing[n], out, even=False)
-        if self._terms and self._terms[n].columns:
-            term = self._terms[n]
+    def adjoint(self, n: int, out: Buffer, *, absolute: bool = False) -> list[Work]:
+        """Writes T_n' r to ``out`` (3, pixels of n); ``collect`` has brought r, in ``residual``, to the sites.
+
+        ``absolute``: with magnitudes in T.
+        """
+        mixing, terms = self.mixing[n], self._terms[absolute]
+        work = self._gather(n, abs(mixing) if absolute else mixing, out, even=False)
+        if terms and terms[n].columns:
+            term = terms[n]
             kernel = self.device.kernel("term", "edge_adjoint")
             bound = [term.values, *term.by_column, term.own, term.camera, self.residual, out]
             work.append(self.device.work(kernel, bound, term.columns))
@@ -173,14 +181,27 @@ class DeviceTransport:
 
     def residual_of(self, sensor: Buffer, wanted: Buffer, weights: Buffer) -> list[Work]:
         """Writes w (D s - wanted) to ``residual``, and what ``adjoint`` needs of it."""
+        return self._picture(sensor, wanted, weights) + self.collect()
+
+    def counted_of(self, sensor: Buffer, weights: Buffer) -> list[Work]:
+        """Writes w D s to ``residual``, and what ``adjoint`` needs of it."""
+        return self._picture(sensor, None, weights) + self.collect()
+
+    def picture_of(self, sensor: Buffer) -> list[Work]:
+        """Writes the camera's picture D s to ``residual``, everywhere."""
+        return self._picture(sensor, None, None)
+
+    def _picture(self, sensor: Buffer, wanted: Buffer | None, weights: Buffer | None) -> list[Work]:
         name = "residual_mosaic" if self.mosaic else "residual_plain"
-        pixels = self.rows * self.columns
-        bound = [self._camera, sensor, wanted, weights, self.residual]
-        work = [self.device.work(self.device.kernel("camera", name), bound, pixels)]
+        less = "less_wanted" if wanted is not None else "less_nothing"
+        times = "times_weight" if weights is not None else "times_one"
+        given = {1: sensor, 2: wanted, 3: weights, 4: self.residual}
+        bound = {0: self._camera, **{number: buffer for number, buffer in given.items() if buffer is not None}}
+        work = [self.device.work(self.device.kernel("camera", less, times, name), bound, self.rows * self.columns)]
         if self.edges:
-            bound = [self._camera, sensor, weights, self._on_edges, self.residual]
-            work.append(self.device.work(self.device.kernel("camera", "edge_residual"), bound, self.edges))
-        return work + self.collect()
+            bound = {**bound, 2: self._on_edges}
+            work.append(self.device.work(self.device.kernel("camera", times, "edge_residual"), bound, self.edges))
+        return work
 
     def collect(self) -> list[Work]:
         """Brings the picture in ``residual`` to the sites: D'."""
@@ -211,14 +232,15 @@ class DeviceTransport:
         numbers = [self.rows, self.columns, self.rows * self.columns, self.sites, *four, self.edges, 0, 0, 0]
         return np.array(numbers, np.uint32)
 
-    def _term(self, n: int, term: EdgeTerm, on_edges: npt.NDArray[np.int64]) -> _Term:
-        rows = sp.csr_matrix(term.differences)
+    def _term(self, n: int, term: EdgeTerm, on_edges: npt.NDArray[np.int64], absolute: bool) -> _Term:
+        rows = sp.csr_matrix(abs(term.differences) if absolute else term.differences)
+        mixing = abs(self.mixing[n]) if absolute else self.mixing[n]
         columns = sp.csc_matrix(rows)
         own = np.flatnonzero(np.diff(columns.indptr))
         first = np.append(columns.indptr[own], columns.indptr[-1])
         pixels = self.sizes[n][0] * self.sizes[n][1]
         count, camera = rows.shape[0], self.rows * self.columns
-        values = constants([count, len(own), pixels, camera, self.sites, self.edges], self.mixing[n])
+        values = constants([count, len(own), pixels, camera, self.sites, self.edges], mixing)
 
         def put(array: npt.NDArray[Any], kind: type[np.generic]) -> Buffer:
             return self._held.put(array.astype(kind), "edges")

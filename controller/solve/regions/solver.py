@@ -21,8 +21,9 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, check_target, initial_point, objective_of
+from controller.solve.bounded.equations import build_problem, initial_point, objective_of
+from controller.solve.bounded.problem import Problem, SolveInput
+from controller.solve.bounded.solver import SMOOTHNESS, check_input
 from controller.solve.regions.box_solvers import BoxProblem, BoxSolver, solve_box
 from controller.solve.regions.equations import Pixels, box_problem, channel_groups
 from controller.transport import LightTransport
@@ -147,7 +148,7 @@ def solve_regions(
     WorkError   "solve-cancelled", "region-unsolved"
     """
     began = time.perf_counter()
-    check_target(transport, target)
+    check_input(SolveInput(transport, target, black, smoothness, weights, None))
     problem = build_problem(transport, target, black, smoothness, weights)
     regions = Regions(problem, size_px=size_px, overlap=overlap)
     x = initial_point(problem)

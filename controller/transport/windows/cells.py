@@ -122,10 +122,14 @@ def _spread_other(
 
 
 @compiled(parallel=True)
-def even_gains(windows: Windows, small: SmallProfiles) -> FloatImage:
-    """(windows,): what takes the place of gains so that each window's shares sum to 1, white light left out."""
+def even_gains(windows: Windows, small: SmallProfiles, projectors: tuple[int, int]) -> FloatImage:
+    """(windows,): what takes the place of gains so that each window's shares sum to 1, white light left out.
+
+    Only those of ``projectors``, from one up to, not including, another, are written.
+    """
     even = np.empty(windows.gain.size, np.float32)
-    for i in prange(windows.first.size - 1):
+    begin, end = SORTS * windows.cell_first[projectors[0]], SORTS * windows.cell_first[projectors[1]]
+    for i in prange(begin, end):
         for e in range(windows.first[i], windows.first[i + 1]):
             total = np.float32(1)
             if i % SORTS == SKEWED:

@@ -119,7 +119,7 @@ class WindowTransport(LightTransport):
     def _sums(self, image: FloatImage, projectors: tuple[int, int]) -> FloatImage:
         out = np.zeros((3, self.pixels), np.float32)
         plain = np.broadcast_to(np.eye(3, dtype=np.float32), self.mixing.shape).copy()
-        even = self.windows._replace(gain=even_gains(self.windows, self.small))
+        even = self.windows._replace(gain=even_gains(self.windows, self.small, projectors))
         self._transposed(image, plain, even, projectors, out)
         return out
 

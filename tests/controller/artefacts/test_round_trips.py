@@ -24,7 +24,7 @@ from controller.artefacts.solved import Solved, SolvedBase, is_solved, read_solv
 from controller.calibrate.geometry.values import Reconstruction
 from controller.calibrate.values import Geometry, Pinhole
 from controller.core.arrays import load_arrays, save_arrays
-from controller.solve.bounded.solver import Solution
+from controller.solve.bounded.problem import Solution
 from controller.steps.modes import DotOptions, mode_step
 from controller.transport.edge_terms import EdgedTransport, EdgeTerm
 from tests.controller.artefacts.names import projectors

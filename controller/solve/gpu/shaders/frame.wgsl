@@ -8,6 +8,8 @@ struct Frame {
   strength_per_step: f32,
   // share of white that only greys get
   segment: f32,
+  // light under a pixel up to which it counts as in shadow
+  faint: f32,
   // rows: camera channel by projector channel, or its inverse
   matrix: array<vec4<f32>, 3>,
 }

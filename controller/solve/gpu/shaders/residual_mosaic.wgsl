@@ -1,14 +1,12 @@
 // Writes weights (D s - target): D makes a picture of a colour camera's sites.
 @group(0) @binding(1) var<storage, read> sensor: array<f32>;
-@group(0) @binding(2) var<storage, read> wanted: array<f32>;
-@group(0) @binding(3) var<storage, read> weights: array<f32>;
 @group(0) @binding(4) var<storage, read_write> residual: array<f32>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
   let at = index_of(id, groups);
   if (at >= camera.pixels) { return; }
-  let weight = weights[at];
+  let weight = weight_at(at);
   var picture = vec3<f32>(0.0);
   if (weight > 0.0) {
     let y = i32(at) / camera.columns;
@@ -26,6 +24,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
   }
   for (var c = 0u; c < 3u; c++) {
     let i = at + c * camera.pixels;
-    residual[i] = weight * (picture[c] - wanted[i]);
+    residual[i] = weight * (picture[c] - wanted_at(i));
   }
 }

@@ -1,7 +1,5 @@
 // Writes weights (s - target): each pixel has three sites.
 @group(0) @binding(1) var<storage, read> sensor: array<f32>;
-@group(0) @binding(2) var<storage, read> wanted: array<f32>;
-@group(0) @binding(3) var<storage, read> weights: array<f32>;
 @group(0) @binding(4) var<storage, read_write> residual: array<f32>;
 
 @compute @workgroup_size(64)
@@ -10,6 +8,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
   if (at >= camera.pixels) { return; }
   for (var c = 0u; c < 3u; c++) {
     let i = at + c * camera.pixels;
-    residual[i] = weights[at] * (sensor[i] - wanted[i]);
+    residual[i] = weight_at(at) * (sensor[i] - wanted_at(i));
   }
 }

@@ -10,8 +10,6 @@
 @group(0) @binding(7) var<storage, read_write> partials: array<vec2<f32>>;
 @group(0) @binding(8) var<storage, read> state: State;
 
-var<workgroup> sums: array<vec2<f32>, 64>;
-
 fn smooth_gradient(c: u32, at: u32, row: u32, column: u32) -> f32 {
   let i = c * frame.pixels + at;
   let here = y[i];
@@ -89,10 +87,6 @@ fn main(
       shown[c * frame.pixels + at] = light[c];
     }
   }
-  sums[lane] = own;
-  for (var half = 32u; half > 0u; half /= 2u) {
-    workgroupBarrier();
-    if (lane < half) { sums[lane] += sums[lane + half]; }
-  }
-  if (lane == 0u) { partials[frame.partials + group.x + group.y * groups.x] = sums[0]; }
+  let all = add_up(own, lane);
+  if (lane == 0u) { partials[frame.partials + group.x + group.y * groups.x] = all; }
 }

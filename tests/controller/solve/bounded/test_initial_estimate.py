@@ -12,7 +12,8 @@ from scipy.optimize import lsq_linear
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.solve.bounded.descent import IterationControl, block_coordinate_descent
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, initial_point
+from controller.solve.bounded.equations import build_problem, initial_point
+from controller.solve.bounded.solver import SMOOTHNESS
 from controller.transport import LightTransport, build_transport
 from controller.transport.planes import plane_frames
 

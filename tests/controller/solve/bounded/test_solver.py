@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 
 from controller.calibrate.values import Calibration, Metapixels
 from controller.core.errors import UsageError, WorkError
+from controller.solve.bounded.equations import build_problem, smoothness_term
+from controller.solve.bounded.problem import Solution
 from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS, squared_edge_weights
-from controller.solve.bounded.solver import SMOOTHNESS, Solution, build_problem, smoothness_term, solve_bounded
+from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.transport import LightTransport, build_transport
 from controller.transport.planes import frame_planes, image_planes, plane_frames
 from tests.controller.solve.bounded.smoothness_reference import smoothness_weights

@@ -12,8 +12,9 @@ import scipy.sparse as sp
 from benchmarks.lab.synthetic import crop_calibration, synthetic_calibration
 from controller.calibrate.values import Calibration, PhaseMap
 from controller.core.arrays import Float64, FloatImage
+from controller.solve.bounded.equations import build_problem
 from controller.solve.bounded.problem import Problem
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, solve_bounded
+from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.transport import LightTransport, build_transport
 from controller.transport.camera_box import CameraBox
 

@@ -12,7 +12,8 @@ from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image, scale_frames, solve_base
-from controller.solve.bounded.solver import SMOOTHNESS, build_problem, solve_bounded
+from controller.solve.bounded.equations import build_problem
+from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.solve.gpu.device import Device
 from controller.solve.gpu.engine import GpuEngine
 from controller.transport import LightTransport, build_transport

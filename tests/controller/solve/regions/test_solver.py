@@ -15,7 +15,8 @@ from benchmarks.lab.synthetic import crop_calibration, synthetic_calibration
 from controller.calibrate.values import Calibration
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.solve.bounded.solver import build_problem, solve_bounded
+from controller.solve.bounded.equations import build_problem
+from controller.solve.bounded.solver import solve_bounded
 from controller.solve.regions.box_solvers import SOLVERS, BoxProblem, solve_box
 from controller.solve.regions.solver import Regions, solve_regions
 from controller.transport import LightTransport, build_transport

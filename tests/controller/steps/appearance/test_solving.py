@@ -13,7 +13,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.solve.bounded.descent import IterationControl
-from controller.solve.bounded.problem import Problem
+from controller.solve.bounded.problem import Solution, SolveInput
 from controller.solve.engines.processor import Processor
 from controller.solve.request import SolveOptions
 from controller.solve.targets.values import Target
@@ -30,9 +30,9 @@ class Watched(Processor):
     def __init__(self) -> None:
         self.did: list[str] = []
 
-    def descend(self, problem: Problem, x: FloatImage, control: IterationControl) -> tuple[FloatImage, float, int]:
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         self.did.append("solve")
-        return super().descend(problem, x, control)
+        return super().solve(given, control)
 
     def scaled(
         self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage
