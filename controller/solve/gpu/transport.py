@@ -15,7 +15,7 @@ import scipy.sparse as sp
 
 from controller.core.arrays import FloatImage
 from controller.solve.gpu.device import GROUP, Buffer, Device, DeviceRefused, Held, Work
-from controller.solve.gpu.records import BLOCK, bands_of, place_columns, reach_of
+from controller.solve.gpu.records import BLOCK, RECORD_BYTES, bands_of, place_columns, reach_of
 from controller.transport import LightTransport
 from controller.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.transport.windows.transport import WindowTransport
@@ -35,6 +35,7 @@ class _Windows:
     most: int
     small: bool
     records: Buffer
+    shapes: Buffer
     first: Buffer
     even: Buffer
 
@@ -84,6 +85,8 @@ class DeviceTransport:
             False: [held.put(table.table, "tables"), held.put(kinds, "tables")],
         }
         self._windows = [self._copied(windowed, n) for n in range(len(self.sizes))]
+        most = max(part.records.size for parts in self._windows for part in parts)
+        self._weighed = held.room(most // RECORD_BYTES * 4, "windows")
         self._reach = [held.put(reach_of(windowed.windows, n, table), "reaches") for n in range(len(self.sizes))]
         largest = max(rows * columns for rows, columns in self.sizes)
         self.shown = held.room(12 * largest, "frames")
@@ -104,7 +107,7 @@ class DeviceTransport:
             for band in bands_of(windowed.windows, n, small=small, tables=tables, most=self._band_bytes):
                 # all rows get something of the small windows, if only zeros
                 if small or len(band.records):
-                    buffers = [self._held.put(part, "windows") for part in (band.records, band.first, band.even)]
+                    buffers = [self._held.put(part, "windows") for part in (band.records, band.records[:, 2:], band.first, band.even)]
                     of_rows = band.first[:: place_columns(self.sizes[n][1])].astype(np.int64)
                     most = int(np.diff(of_rows[band.own[0] : band.own[1] + 1]).max(initial=0))
                     found.append(_Windows(band.rows, band.place_row, band.own, most, small, *buffers))
@@ -125,7 +128,7 @@ class DeviceTransport:
             if not part.most:
                 continue
             kind = "small" if part.small else "other"
-            kernel = self.device.kernel("band", f"{kind}_shares", f"forward_{kind}")
+            kernel = self.device.kernel("band", "records", f"{kind}_shares", f"forward_{kind}")
             bound = [self._band(n, part, _IDENTITY), part.records, part.first, *self._tables[part.small]]
             work.append(self.device.work(kernel, [*bound, self.shown, sensor], (-(-part.most // GROUP), end - begin)))
         terms = self._terms[absolute]
@@ -166,14 +169,15 @@ class DeviceTransport:
         work = []
         for part in self._windows[n]:
             kind = "small" if part.small else "other"
-            gain = "even_gain" if even else "own_gain"
-            kernel = self.device.kernel("band", gain, f"{kind}_shares", f"adjoint_{kind}")
-            bound = [self._band(n, part, mixing), part.records, part.first, *self._tables[part.small], self._sites, out]
+            weigh = self.device.kernel("records", "even_gain" if even else "own_gain", "weigh")
+            given = {1: part.records, 5: self._sites, 6: self._weighed, **({8: part.even} if even else {})}
+            work.append(self.device.work(weigh, given, part.records.size // RECORD_BYTES))
+            kernel = self.device.kernel("band", "shapes", f"{kind}_shares", f"adjoint_{kind}")
+            tables = self._tables[part.small]
+            bound = [self._band(n, part, mixing), part.shapes, part.first, *tables, self._weighed, out]
             numbered = dict(enumerate(bound))
             if not part.small:
                 numbered[7] = self._reach[n]
-            if even:
-                numbered[8] = part.even
             begin, end = part.rows
             groups = -(-self.sizes[n][1] // SQUARE), -(-(end - begin) // SQUARE)
             work.append(self.device.work(kernel, numbered, groups))

@@ -1,5 +1,4 @@
 // Adds to T' r what each projector pixel gathers from the larger windows that cover it.
-@group(0) @binding(5) var<storage, read> values: array<f32>;
 @group(0) @binding(6) var<storage, read_write> result: array<f32>;
 // how far windows may begin from the pixels of a block of 8 x 8: rows above, columns to the left, to the right
 @group(0) @binding(7) var<storage, read> reach: array<u32>;
@@ -19,7 +18,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = (top - band.place_row) * band.place_columns;
     let end = first[row + to_right];
     for (var e = first[row + from_left]; e < end; e++) {
-      let w = records[e];
+      let w = shape_of(e);
       let high = high_of(w);
       let j = y - top;
       if (j >= high.y) { continue; }
@@ -28,7 +27,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
       let i = x - left_of(w) - (at >> PHASE_BITS);
       if (i < 0 || i >= wide.y) { continue; }
       let share = table[wide.x + (at & (PHASES - 1)) * wide.y + i] * row_share(w, high, j);
-      sums += coloured(w, share * gain_of(e, w) * values[w.x]);
+      sums += coloured(w, share * weighed[e]);
     }
   }
   let at = u32(y * band.columns + x);

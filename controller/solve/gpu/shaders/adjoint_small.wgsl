@@ -1,5 +1,4 @@
 // Writes T' r: each projector pixel gathers from the small windows that cover it.
-@group(0) @binding(5) var<storage, read> values: array<f32>;
 @group(0) @binding(6) var<storage, read_write> result: array<f32>;
 
 @compute @workgroup_size(8, 8)
@@ -12,8 +11,8 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = (top - band.place_row) * band.place_columns + x + MARGIN;
     let end = first[row + 1];
     for (var e = first[row - 3]; e < end; e++) {
-      let w = records[e];
-      sums += coloured(w, share(w, x - left_of(w), y - top) * gain_of(e, w) * values[w.x]);
+      let w = shape_of(e);
+      sums += coloured(w, share(w, x - left_of(w), y - top) * weighed[e]);
     }
   }
   let at = u32(y * band.columns + x);

@@ -19,7 +19,6 @@ const PHASES: i32 = 256;
 const SHEAR_BITS: u32 = 6u;
 
 @group(0) @binding(0) var<uniform> band: Band;
-@group(0) @binding(1) var<storage, read> records: array<vec4<u32>>;
 @group(0) @binding(2) var<storage, read> first: array<u32>;
 
 fn left_of(w: vec4<u32>) -> i32 { return i32(w.w & 0xffffu) - MARGIN; }
