@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
+from hal.runtime.compute import usable_cpus
 
+_PART: Final = 1 << 22
+_MOST_THREADS: Final = 8
 CAMERA_SIZE = "Make it as large as this stage's camera image."
 
 
@@ -26,9 +32,17 @@ def check_image(what: str, image: FloatImage, shape: tuple[int, ...]) -> None:
 
 
 def all_finite(values: npt.NDArray[np.floating]) -> bool:
-    """Whether none is NaN or infinite. A sum of squares says so in a quarter of the time, where it is finite."""
+    """Whether none is NaN or infinite. A sum of squares says so in a third of the time, where it is finite."""
     flat = values.reshape(-1)
-    return bool(np.isfinite(np.vdot(flat, flat))) or bool(np.isfinite(values).all())
+    parts = (flat[begin : begin + _PART] for begin in range(0, flat.size, _PART))
+    if flat.size <= _PART:
+        return _finite(flat)
+    with ThreadPoolExecutor(min(usable_cpus(), _MOST_THREADS)) as pool:
+        return all(pool.map(_finite, parts))
+
+
+def _finite(flat: npt.NDArray[np.floating]) -> bool:
+    return bool(np.isfinite(np.vdot(flat, flat))) or bool(np.isfinite(flat).all())
 
 
 def not_finite(what: str) -> UsageError:

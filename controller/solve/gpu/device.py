@@ -28,6 +28,8 @@ STORAGE_BUFFERS: Final = 8
 SMALLEST_BYTES: Final = 16
 CHUNK_BYTES: Final = 1 << 24
 CHUNKS: Final = 2
+STRIP_BYTES: Final = 1 << 20
+"""Of an array that is no block of memory, so much is copied at a time: it stays in the processor's cache."""
 SOFTWARE: Final = "CPU"
 """wgpu's name for the kind of adapter that is a program, such as Mesa's lavapipe."""
 
@@ -112,44 +114,55 @@ class Device:
                 data=values.tobytes(), usage=wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST
             )
 
-    def write(self, buffer: Buffer, values: Array) -> None:
-        """Put values to the beginning of a buffer."""
+    def write(self, buffer: Buffer, values: Array, at: int = 0) -> None:
+        """Put values to a buffer, from byte ``at`` on. They may be a part of an array: it is read in place."""
         if not values.size:
             return
-        flat = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-        if flat.nbytes % 4:
-            flat = np.concatenate([flat, np.zeros(-flat.nbytes % 4, np.uint8)])
+        if values.nbytes < CHUNK_BYTES:
+            flat = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+            if flat.nbytes % 4:
+                flat = np.concatenate([flat, np.zeros(-flat.nbytes % 4, np.uint8)])
+            with _refusals("take values"):
+                self._device.queue.write_buffer(buffer, at, flat)
+            return
+        usage = wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC
+        rows = values.reshape(-1, 1) if values.flags.c_contiguous else values
         with _refusals("take values"):
-            if flat.nbytes < CHUNK_BYTES:
-                self._device.queue.write_buffer(buffer, 0, flat)
-                return
-            for number, begin in enumerate(range(0, flat.nbytes, CHUNK_BYTES)):
-                part = flat[begin : begin + CHUNK_BYTES]
-                chunk = self._chunk(wgpu.BufferUsage.MAP_WRITE | wgpu.BufferUsage.COPY_SRC, number)
+            for number, part in enumerate(_strips(rows, CHUNK_BYTES)):
+                chunk = self._chunk(usage, number)
                 # waits until the chunk's last content was copied
                 chunk.map_sync(wgpu.MapMode.WRITE)
-                chunk.write_mapped(part)
+                done = 0
+                for strip in _strips(part, STRIP_BYTES):
+                    chunk.write_mapped(np.ascontiguousarray(strip).reshape(-1).view(np.uint8), done)
+                    done += strip.nbytes
                 chunk.unmap()
-                self._copy(chunk, 0, buffer, begin, part.nbytes)
+                self._copy(chunk, 0, buffer, at, done)
+                at += done
 
     def read(self, buffer: Buffer, count: int) -> npt.NDArray[np.float32]:
         """The first ``count`` float32 of a buffer, after all that was submitted."""
-        found = np.empty(count, np.float32)
-        flat = found.view(np.uint8)
-        parts = [flat[begin : begin + CHUNK_BYTES] for begin in range(0, flat.nbytes, CHUNK_BYTES)]
+        found = np.empty((count, 1), np.float32)
+        self.read_into(found, buffer)
+        return found[:, 0]
+
+    def read_into(self, out: npt.NDArray[np.float32], buffer: Buffer) -> None:
+        """Write the first numbers of a buffer to ``out``, which may be a part of an array."""
+        parts = list(_strips(out, CHUNK_BYTES))
+        begins = np.cumsum([0, *(part.nbytes for part in parts)]).tolist()
         usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
         with _refusals("give its result"):
             # the next chunks are copied while one is read
             for step in range(len(parts) + CHUNKS - 1):
                 if step < len(parts):
-                    self._copy(buffer, step * CHUNK_BYTES, self._chunk(usage, step), 0, parts[step].nbytes)
+                    self._copy(buffer, begins[step], self._chunk(usage, step), 0, parts[step].nbytes)
                 number = step - CHUNKS + 1
                 if number >= 0:
-                    chunk = self._chunk(usage, number)
+                    chunk, part = self._chunk(usage, number), parts[number]
                     chunk.map_sync(wgpu.MapMode.READ)
-                    parts[number][:] = chunk.read_mapped(0, parts[number].nbytes, copy=False)
+                    found = np.frombuffer(chunk.read_mapped(0, part.nbytes, copy=False), np.float32)
+                    part[...] = found.reshape(part.shape)
                     chunk.unmap()
-        return found
 
     def _chunk(self, usage: int, number: int) -> Buffer:
         """One of a few buffers that this program and the device both see, in turn. They stay: making them is slow."""
@@ -260,6 +273,13 @@ class Clear:
 
 
 Step = Work | Copy | Clear
+
+
+def _strips(values: Array, most_bytes: int) -> Iterator[Array]:
+    """Parts of the first axis, of at most so many bytes, but a row at least."""
+    rows = max(most_bytes // max(values[:1].nbytes, 1), 1)
+    for begin in range(0, len(values), rows):
+        yield values[begin : begin + rows]
 
 
 def spread(threads: int) -> tuple[int, int]:

@@ -79,13 +79,13 @@ class DeviceEquations:
         """Put the equations of a solve in place of the last one's."""
         device, transport = self.device, self.transport
         if self._black is not given.black:
-            device.write(self._black_there, np.asarray(given.black, np.float32))
+            device.write(self._black_there, np.asarray(given.black, np.float32)[self._window])
             self._black = given.black
-        device.write(transport.residual, np.asarray(given.target, np.float32))
+        device.write(transport.residual, np.asarray(given.target, np.float32)[self._window])
         if given.weights is None:
             device.submit([Copy(self._mask, self.weights)])
         else:
-            device.write(self.weights, np.asarray(given.weights, np.float32))
+            device.write(self.weights, np.asarray(given.weights, np.float32)[self._window])
         device.submit(self._build)
         squares = self._sum(self._camera_sums, self._camera_pixels)
         lit = sum(self._sum(one.sums, one.pixels) for one in self.projectors)
@@ -122,16 +122,19 @@ class DeviceEquations:
         """(rows, columns, 3): what is in the transport's ``residual``. Overwrites what is wanted."""
         transport = self.transport
         self.device.submit([self._over_camera("join_planes", bound=[transport.residual, self.wanted])])
-        return self.device.read(self.wanted, 3 * self._camera_pixels).reshape(transport.rows, transport.columns, 3)
+        found = np.zeros((*transport.source.camera_shape, 3), np.float32)
+        self.device.read_into(found[self._window], self.wanted)
+        return found
 
     # what is there
 
     def _make_room(self) -> None:
         held, transport, source = self._held, self.transport, self.transport.source
+        self._window = transport.box.window
         self._camera_pixels = pixels = transport.rows * transport.columns
         self.wanted, self._black_there = (held.room(12 * pixels, "camera pictures") for _ in range(2))
         self.weights = held.room(4 * pixels, "weights")
-        self._mask = held.put(source.object_mask.astype(np.float32), "weights")
+        self._mask = held.put(source.object_mask[self._window].astype(np.float32), "weights")
         self.light, self._reach = (held.room(4 * transport.sensor_count, "camera samples") for _ in range(2))
         self._camera_sums = held.room(8 * int(np.prod(spread(pixels))), "sums")
         numbers = [transport.columns, transport.rows, pixels, 0, 0, 0, 0, 0]

@@ -35,15 +35,18 @@ class DeviceScaling:
         Raises DeviceRefused.
         """
         transport = self._transport
-        transport.device.write(transport.residual, light)
+        _write_planes(transport, transport.residual, light)
         transport.device.submit(self._work)
         parts = [transport.device.read(buffer, 3 * pixels).reshape(3, pixels) for buffer, pixels in self._frames]
         return np.concatenate(parts, axis=1)
 
     def _prepared(self, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage) -> list[Work]:
         transport, device = self._transport, self._transport.device
-        bound = [transport.residual, self._held.put(inverse, "base image")]
-        work = [device.work(device.kernel("divide_by_base"), bound, inverse.size), *transport.collect()]
+        values_count = 3 * transport.rows * transport.columns
+        image = self._held.room(4 * values_count, "base image")
+        _write_planes(transport, image, inverse)
+        bound = [transport.residual, image]
+        work = [device.work(device.kernel("divide_by_base"), bound, values_count), *transport.collect()]
         for n, (rows, columns) in enumerate(transport.sizes):
             pixels, span = rows * columns, transport.source.span(n)
             frames = self._held.room(12 * pixels, "frames")
@@ -57,3 +60,9 @@ class DeviceScaling:
             )
             self._frames.append((frames, pixels))
         return work
+
+
+def _write_planes(transport: DeviceTransport, to: Buffer, planes: FloatImage) -> None:
+    """Write what the transport's box has of (3, rows, columns)."""
+    for c, plane in enumerate(planes):
+        transport.device.write(to, plane[transport.box.window], 4 * c * transport.rows * transport.columns)

@@ -6,6 +6,7 @@ depth edge. Products have the windows and tables of ``transport.windows``; nothi
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,9 +15,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.core.arrays import FloatImage
+from controller.solve.bounded.initial_estimate import BLOCK_PX
 from controller.solve.gpu.device import GROUP, Buffer, Device, DeviceRefused, Held, Work
 from controller.solve.gpu.records import BLOCK, RECORD_BYTES, bands_of, place_columns, reach_of
 from controller.transport import LightTransport
+from controller.transport.camera_box import CameraBox
 from controller.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.transport.windows.transport import WindowTransport
 
@@ -71,10 +74,12 @@ class DeviceTransport:
         held = self._held
         self.device, self.source = device, transport
         self.sizes, self.mixing = transport.sizes, transport.mixing
-        self.rows, self.columns = transport.camera_shape
+        self.box = box = _box_of(transport, windowed)
+        self.rows, self.columns = box.bottom - box.top, box.right - box.left
         self.mosaic = windowed.colours.size > 0
         pixels = self.rows * self.columns
         self.sites = pixels if self.mosaic else 3 * pixels
+        terms = tuple(dataclasses.replace(term, camera=self._inside(term.camera)) for term in terms)
         on_edges = np.unique(np.concatenate([np.zeros(0, np.int64), *(term.camera for term in terms)]))
         self.edges = len(on_edges)
         self.sensor_count = self.sites + 3 * self.edges
@@ -107,11 +112,19 @@ class DeviceTransport:
             for band in bands_of(windowed.windows, n, small=small, tables=tables, most=self._band_bytes):
                 # all rows get something of the small windows, if only zeros
                 if small or len(band.records):
+                    band.records[:, 0] = self._inside(band.records[:, 0])
                     buffers = [self._held.put(part, "windows") for part in (band.records, band.records[:, 2:], band.first, band.even)]
                     of_rows = band.first[:: place_columns(self.sizes[n][1])].astype(np.int64)
                     most = int(np.diff(of_rows[band.own[0] : band.own[1] + 1]).max(initial=0))
                     found.append(_Windows(band.rows, band.place_row, band.own, most, small, *buffers))
         return found
+
+    def _inside(self, sites: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """Sites of the camera, row by row, by their numbers in the box; of three colours, one plane after the other."""
+        rows, columns = self.source.camera_shape
+        plane, place = np.divmod(sites.astype(np.int64), rows * columns)
+        y, x = np.divmod(place, columns)
+        return np.asarray((plane * self.rows + y - self.box.top) * self.columns + x - self.box.left)
 
     @property
     def bands(self) -> int:
@@ -256,6 +269,23 @@ class DeviceTransport:
             [put(first, np.uint32), put(columns.indices, np.uint32), put(columns.data, np.float32), white],
             put(np.searchsorted(on_edges, term.camera), np.uint32), put(own, np.uint32), put(term.camera, np.uint32),
         )  # fmt: skip
+
+
+def _box_of(transport: LightTransport, windowed: WindowTransport) -> CameraBox:
+    """The camera pixels that solves are about: the object and all that is lit, with dark pixels around.
+
+    It begins at a block of the initial estimate, and so at the same colour of the mosaic as the picture does.
+    """
+    rows, columns = transport.camera_shape
+    seen = transport.object_mask.copy()
+    seen.reshape(-1)[windowed.windows.site % (rows * columns)] = True
+    ends = []
+    for axis, most in ((1, rows), (0, columns)):
+        found = np.flatnonzero(seen.any(axis=axis))
+        begin, end = (int(found[0]), int(found[-1]) + 1) if found.size else (0, most)
+        ends.append((max(begin // BLOCK_PX - 1, 0) * BLOCK_PX, min((end // BLOCK_PX + 2) * BLOCK_PX, most)))
+    (top, bottom), (left, right) = ends
+    return CameraBox(top, left, bottom, right)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

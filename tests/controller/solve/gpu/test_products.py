@@ -29,19 +29,22 @@ def forward(there: DeviceTransport, p: FloatImage) -> FloatImage:
     device, source = there.device, there.source
     sensor = device.room(4 * there.sensor_count, "camera samples")
     wanted, weights = (device.room(4 * count * there.rows * there.columns, "pictures") for count in (3, 1))
-    device.write(weights, np.ones(source.camera_shape, np.float32))
+    device.write(weights, np.ones((there.rows, there.columns), np.float32))
     device.submit([Clear(sensor)])
     for n, M in enumerate(source.mixing):
         device.write(there.shown, M @ p[:, source.span(n)])
         device.submit(there.forward(n, sensor))
     device.submit(there.residual_of(sensor, wanted, weights))
-    return device.read(there.residual, 3 * there.rows * there.columns).reshape(3, *source.camera_shape)
+    light = np.zeros((3, *source.camera_shape), np.float32)
+    seen = device.read(there.residual, 3 * there.rows * there.columns).reshape(3, there.rows, there.columns)
+    light[:, *there.box.window] = seen
+    return light
 
 
 def backward(there: DeviceTransport, r: FloatImage, *, sums: bool = False) -> FloatImage:
     """T' r (3, pixels), or the sums under metapixels."""
     device, source = there.device, there.source
-    device.write(there.residual, r)
+    device.write(there.residual, np.ascontiguousarray(r[:, *there.box.window]))
     device.submit(there.collect())
     parts = []
     for n, (rows, columns) in enumerate(source.sizes):
