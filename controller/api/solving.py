@@ -98,8 +98,8 @@ def solve(
 
     Returns
     -------
-    ``Solution``: ``frames``, one (rows, columns, 3) float32 linear image a projector, 0 to 1; ``light`` (camera rows,
-    columns, 3) float32, T p; ``objective``, ``kkt``, ``iterations``, ``seconds``, ``converged``
+    ``Solution``: ``frames``, one (rows, columns, 3) float32 linear image a projector, 0 to 1, whose light is
+    ``transport.forward(frames)``; ``objective``, ``kkt``, ``iterations``, ``seconds``, ``converged``
 
     Errors: ``image-wrong-size``, ``target-not-finite``, ``solve-arguments``.
     """

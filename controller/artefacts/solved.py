@@ -27,7 +27,7 @@ _SOLUTION = ("objective", "kkt", "iterations", "seconds", "converged")
 
 @dataclass(frozen=True, slots=True)
 class SolvedBase:
-    """``base.npz`` and ``base.json``: the image (camera rows, columns, 3), linear light, and the frames that show it.
+    """``base.npz`` and ``base.json``: the image (camera rows, columns, 3) and the frames that show it.
 
     ``solution.frames``: (rows, columns, 3) linear light in [0, 1] of each projector
     """
@@ -39,7 +39,7 @@ class SolvedBase:
         """``projectors``: in the order of the solution's frames."""
         frames = dict(zip((f"frame-{name}" for name in projectors), self.solution.frames, strict=True))
         arrays = npz_path(run, StepKind.BASE)
-        save_arrays(arrays, {"image": self.image, "light": self.solution.light, **frames})
+        save_arrays(arrays, {"image": self.image, **frames})
         figures = {key: getattr(self.solution, key) for key in _SOLUTION}
         return [arrays, write_json(json_path(run, StepKind.BASE), figures)]
 
@@ -50,7 +50,7 @@ class SolvedBase:
 
         arrays = load_arrays(npz_path(run, StepKind.BASE))
         frames = tuple(arrays[f"frame-{name}"] for name in projectors)
-        return cls(arrays["image"], Solution(frames=frames, light=arrays["light"], **read_base_figures(run)))
+        return cls(arrays["image"], Solution(frames=frames, **read_base_figures(run)))
 
 
 def has_base(run: Path) -> bool:

@@ -61,11 +61,10 @@ class Base:
     def in_files(self, folder: Path) -> Base:
         """The same; what is large need not stay in memory, but in nameless files of ``folder``."""
         frames = tuple(moved_to_file(frame, folder) for frame in self.solution.frames)
-        light, image, inverse, coverage, mixed = (
-            moved_to_file(one, folder)
-            for one in (self.solution.light, self.image, self.inverse, self.coverage, self.mixed)
+        image, inverse, coverage, mixed = (
+            moved_to_file(one, folder) for one in (self.image, self.inverse, self.coverage, self.mixed)
         )
-        solution = dataclasses.replace(self.solution, frames=frames, light=light)
+        solution = dataclasses.replace(self.solution, frames=frames)
         return Base(image, solution, inverse, coverage, mixed)
 
 

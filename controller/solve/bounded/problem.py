@@ -59,14 +59,12 @@ class Solution:
     """Result of a solve.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
-    ``light`` (camera rows, columns, 3) float32: T p, the frames' light without the black image
     ``objective``: weighted squared residual plus smoothness, in camera units squared
     ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
     ``converged``: the KKT residual fell below the tolerance before the cap on iterations
     """
 
     frames: tuple[FloatImage, ...]
-    light: FloatImage
     objective: float
     kkt: float
     iterations: int

@@ -13,7 +13,7 @@ from controller.solve.bounded.equations import build_problem, initial_point, obj
 from controller.solve.bounded.gradient import scale_base
 from controller.solve.bounded.problem import Solution, SolveInput
 from controller.transport import LightTransport
-from controller.transport.planes import frame_planes, plane_frames, plane_image
+from controller.transport.planes import frame_planes, plane_frames
 
 
 class Engine(Protocol):
@@ -50,13 +50,10 @@ class Processor:
         x = initial_point(problem) if given.start is None else np.clip(frame_planes(given.start), 0, 1)
         x[problem.majoriser == 0] = 0
         x, kkt, iterations = block_coordinate_descent(problem, x, control)
-        light = transport.forward_planes(x)
-        objective = objective_of(problem, x, light)
+        objective = objective_of(problem, x, transport.forward_planes(x))
         del problem
-        frames, seen = tuple(plane_frames(x, transport.sizes)), plane_image(light)
-        return Solution(
-            frames, seen, objective, kkt, iterations, time.perf_counter() - began_s, kkt <= control.tolerance
-        )
+        frames = tuple(plane_frames(x, transport.sizes))
+        return Solution(frames, objective, kkt, iterations, time.perf_counter() - began_s, kkt <= control.tolerance)
 
     def scaled(
         self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage

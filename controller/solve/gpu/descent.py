@@ -116,9 +116,8 @@ def solve_there(
     done, kkt = _swept_until(descent, control)
     descent.see()
     objective = equations.objective()
-    picture = equations.picture()
     frames = equations.frames()
-    return Solution(frames, picture, objective, kkt, done, time.perf_counter() - began_s, kkt <= control.tolerance)
+    return Solution(frames, objective, kkt, done, time.perf_counter() - began_s, kkt <= control.tolerance)
 
 
 def _swept_until(descent: DeviceDescent, control: IterationControl) -> tuple[int, float]:

@@ -142,27 +142,21 @@ class Device:
 
     def read(self, buffer: Buffer, count: int) -> npt.NDArray[np.float32]:
         """The first ``count`` float32 of a buffer, after all that was submitted."""
-        found = np.empty((count, 1), np.float32)
-        self.read_into(found, buffer)
-        return found[:, 0]
-
-    def read_into(self, out: npt.NDArray[np.float32], buffer: Buffer) -> None:
-        """Write the first numbers of a buffer to ``out``, which may be a part of an array."""
+        out = np.empty(count, np.float32)
         parts = list(_strips(out, CHUNK_BYTES))
-        begins = np.cumsum([0, *(part.nbytes for part in parts)]).tolist()
         usage = wgpu.BufferUsage.MAP_READ | wgpu.BufferUsage.COPY_DST
         with _refusals("give its result"):
-            # the next chunks are copied while one is read
+            # the next chunk is copied while one is read
             for step in range(len(parts) + CHUNKS - 1):
                 if step < len(parts):
-                    self._copy(buffer, begins[step], self._chunk(usage, step), 0, parts[step].nbytes)
+                    self._copy(buffer, step * CHUNK_BYTES, self._chunk(usage, step), 0, parts[step].nbytes)
                 number = step - CHUNKS + 1
                 if number >= 0:
                     chunk, part = self._chunk(usage, number), parts[number]
                     chunk.map_sync(wgpu.MapMode.READ)
-                    found = np.frombuffer(chunk.read_mapped(0, part.nbytes, copy=False), np.float32)
-                    part[...] = found.reshape(part.shape)
+                    part[:] = np.frombuffer(chunk.read_mapped(0, part.nbytes, copy=False), np.float32)
                     chunk.unmap()
+        return out
 
     def _chunk(self, usage: int, number: int) -> Buffer:
         """One of a few buffers that this program and the device both see, in turn. They stay: making them is slow."""

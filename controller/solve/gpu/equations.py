@@ -118,14 +118,6 @@ class DeviceEquations:
         sizes = zip(self.projectors, self.transport.sizes, strict=True)
         return tuple(self.device.read(one.step, 3 * one.pixels).reshape(*size, 3) for one, size in sizes)
 
-    def picture(self) -> FloatImage:
-        """(rows, columns, 3): what is in the transport's ``residual``. Overwrites what is wanted."""
-        transport = self.transport
-        self.device.submit([self._over_camera("join_planes", bound=[transport.residual, self.wanted])])
-        found = np.zeros((*transport.source.camera_shape, 3), np.float32)
-        self.device.read_into(found[self._window], self.wanted)
-        return found
-
     # what is there
 
     def _make_room(self) -> None:

@@ -113,7 +113,10 @@ class DeviceTransport:
                 # all rows get something of the small windows, if only zeros
                 if small or len(band.records):
                     band.records[:, 0] = self._inside(band.records[:, 0])
-                    buffers = [self._held.put(part, "windows") for part in (band.records, band.records[:, 2:], band.first, band.even)]
+                    buffers = [
+                        self._held.put(part, "windows")
+                        for part in (band.records, band.records[:, 2:], band.first, band.even)
+                    ]
                     of_rows = band.first[:: place_columns(self.sizes[n][1])].astype(np.int64)
                     most = int(np.diff(of_rows[band.own[0] : band.own[1] + 1]).max(initial=0))
                     found.append(_Windows(band.rows, band.place_row, band.own, most, small, *buffers))

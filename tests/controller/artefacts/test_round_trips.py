@@ -110,7 +110,7 @@ def test_frames_are_found_by_projector_in_any_order(names: list[str]) -> None:
         linear = {name: image(n / 10) for n, name in enumerate(names)}
         solved = Solved(frames, linear, image(5), np.ones((2, 3), bool), {"exposure": 2.0, "title": "Gold"})
         solved.write(run, "gold")
-        solution = Solution(frames=tuple(linear.values()), light=image(7), objective=1.0, kkt=0.1, iterations=3,
+        solution = Solution(frames=tuple(linear.values()), objective=1.0, kkt=0.1, iterations=3,
                             seconds=0.5, converged=True)  # fmt: skip
         SolvedBase(image(6), solution).write(run, names)
         for order in (names, names[::-1]):

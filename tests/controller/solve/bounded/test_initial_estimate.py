@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from controller.calibrate.values import Calibration
@@ -56,6 +58,36 @@ def test_light_beyond_reach_is_met_as_nearly_as_an_exact_solver_meets_it(
     p = np.concatenate([one[6, 8] for one in found]).astype(np.float64)
     exact = lsq_linear(B, light.astype(np.float64), (0, 1), tol=1e-12)
     assert ((B @ p - light) ** 2).sum() == pytest.approx(2 * exact.cost, rel=1e-2, abs=1e-7)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
+@given(
+    of_reach=st.tuples(*[st.floats(0, 2.5)] * 3),
+    white=st.tuples(*[st.sampled_from([0.0, 0.003, 0.1, 0.5, 1.0])] * 3),
+    spill=st.floats(0, 0.3),
+)
+def test_any_light_is_met_as_nearly_as_an_exact_solver_meets_it(
+    stage: Stage, of_reach: tuple[float, ...], white: tuple[float, ...], spill: float
+) -> None:
+    """Projectors of other colours, hardly any light, far beyond reach, dark."""
+    calibration = stage(spill=spill, projector=(12, 16), camera=(36, 48))
+    colours = np.array([[0.5, 0.4, 0.3], white], np.float32)
+    parts = tuple(
+        dataclasses.replace(part, white=np.broadcast_to(colour, part.white.shape).copy())
+        for part, colour in zip(calibration.projectors, colours, strict=True)
+    )
+    calibration = dataclasses.replace(calibration, projectors=parts, black=np.zeros_like(calibration.black))
+    transport = build_transport(calibration)
+    seen = transport.reach()[18, 24]
+    light = np.array(of_reach, np.float32) * seen
+    found = guessed(calibration, transport, np.broadcast_to(light, (36, 48, 3)).copy())
+    lit = [np.diag(colours[n].astype(np.float64)) @ transport.mixing[n].astype(np.float64) for n in range(2)]
+    B = np.hstack([one * float(transport.lit[n, 18, 24]) for n, one in enumerate(lit)])
+    p = np.concatenate([one[6, 8] for one in found]).astype(np.float64)
+    exact = lsq_linear(B, light.astype(np.float64), (0, 1), tol=1e-12)
+    # the pull towards alike projectors is a ten-thousandth of their light, squared
+    pull = 1e-4 * float((seen.astype(np.float64) ** 2).mean()) * len(p)
+    assert ((B @ p - light) ** 2).sum() <= 2 * exact.cost * 1.01 + pull
 
 
 def test_one_projector_gives_what_another_would_spill(stage: Stage) -> None:

@@ -129,10 +129,9 @@ def test_a_reachable_target_is_reached(stage: Stage) -> None:
     smooth = np.repeat((0.4 + 0.2 * np.sin(x / 5) * np.cos(y / 4))[..., None], 3, -1).astype(np.float32)
     target = transport.forward([smooth, smooth]) + calibration.black
     solution = solve_bounded(transport, target, calibration.black)
-    error = (solution.light + calibration.black - target)[transport.object_mask]
+    error = (transport.forward(solution.frames) + calibration.black - target)[transport.object_mask]
     assert solution.converged
     assert np.sqrt((error**2).mean()) < 0.01 * target.max()
-    np.testing.assert_allclose(solution.light, transport.forward(solution.frames), atol=1e-6)
 
 
 def test_a_target_brighter_than_reachable_gives_white_within_bounds(stage: Stage) -> None:

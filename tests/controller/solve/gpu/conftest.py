@@ -9,6 +9,8 @@ import numba
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from controller.calibrate.values import PhaseMap
 from controller.core.arrays import FloatImage
@@ -17,6 +19,11 @@ from controller.transport import LightTransport, build_transport
 from controller.transport.edge_terms import EdgeTerm, with_terms
 from tests.controller.transport.conftest import random_calibration
 from tests.controller.transport.windows.test_transport import RGGB, mapped
+
+few = settings(
+    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+stages = given(seed=st.integers(0, 2**20), mosaic=st.booleans(), edges=st.booleans())
 
 
 def opened() -> Device:

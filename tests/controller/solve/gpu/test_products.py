@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.core.arrays import FloatImage
-from controller.solve.gpu.device import Clear, Device, DeviceRefused
+from controller.solve.gpu.device import CHUNK_BYTES, Clear, Device, DeviceRefused
 from controller.solve.gpu.transport import DeviceTransport
 from controller.transport import LightTransport, build_transport
 from controller.transport.windows.sample_kernels import SORTS
 from controller.transport.windows.transport import WindowTransport
 from tests.controller.solve.conftest import plane_calibration
-from tests.controller.solve.gpu.conftest import any_windows
+from tests.controller.solve.gpu.conftest import any_windows, few, stages
 
 SINGLE = 3e-6
 """Of the largest value: sums of hundreds of products in single precision, in two orders."""
-few = settings(
-    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
-stages = given(seed=st.integers(0, 2**20), mosaic=st.booleans(), edges=st.booleans())
 
 
 def forward(there: DeviceTransport, p: FloatImage) -> FloatImage:
@@ -121,6 +117,19 @@ def test_windows_in_bands_for_devices_with_small_buffers_give_the_same(device: D
     assert cut.bands > whole.bands + 3
     whole.free()
     cut.free()
+
+
+@pytest.mark.parametrize("rows", [3, 2 * CHUNK_BYTES // 9000 + 5])
+def test_parts_of_arrays_reach_the_device_and_come_back(device: Device, rows: int) -> None:
+    """Of any size: large ones go piece by piece."""
+    whole = np.random.default_rng(1).random((rows, 1500, 3), np.float32)
+    part = whole[:, 11:1411]
+    buffer = device.room(whole.nbytes, "camera pictures")
+    device.write(buffer, part, 16)
+    np.testing.assert_array_equal(device.read(buffer, part.size + 4)[4:], part.ravel())
+    device.write(buffer, whole)
+    np.testing.assert_array_equal(device.read(buffer, whole.size), whole.ravel())
+    buffer.destroy()
 
 
 def test_a_buffer_beyond_the_device_s_limit_is_refused_in_words(device: Device) -> None:

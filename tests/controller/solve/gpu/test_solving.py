@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from controller.solve.gpu.engine import GpuEngine
 from controller.transport import LightTransport, build_transport
 from controller.transport.planes import frame_planes
 from tests.controller.solve.bounded.test_solver_oracle import bent, exact, unreachable_in_parts
-from tests.controller.solve.gpu.conftest import any_windows, opened
+from tests.controller.solve.gpu.conftest import any_windows, few, opened, stages
 
 
 @pytest.fixture
@@ -65,6 +66,67 @@ def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, ed
     planes = frame_planes(there.frames)
     assert planes.min() >= 0
     assert planes.max() <= 1
+
+
+@few
+@stages
+def test_a_solve_starts_where_the_processor_s_does(device: Device, seed: int, mosaic: bool, edges: bool) -> None:
+    """Within reach and beyond, dark pixels too."""
+    transport = any_windows(seed, mosaic=mosaic, edges=edges, segment=0.0)
+    rng = np.random.default_rng(seed)
+    black = np.full((*transport.camera_shape, 3), 0.001, np.float32)
+    target = black + transport.reach() * rng.uniform(0, 1.6, 3).astype(np.float32)
+    there, here = (
+        solve_bounded(transport, target, black, tolerance=0, most_iterations=0, engine=which)
+        for which in (GpuEngine(device, _only_memory), None)
+    )
+    np.testing.assert_allclose(frame_planes(there.frames), frame_planes(here.frames), atol=2e-3)
+    assert there.objective == pytest.approx(here.objective, rel=1e-3)
+
+
+def test_each_solve_has_its_own_black_weights_start_and_smoothness(engine: GpuEngine) -> None:
+    """What stays on the device from solve to solve is only what they share."""
+    transport = any_windows(4, mosaic=True)
+    rng = np.random.default_rng(4)
+    shape = transport.camera_shape
+    asked = [
+        {
+            "black": np.full((*shape, 3), black, np.float32),
+            "weights": rng.uniform(0.2, 2, shape).astype(np.float32) if weighted else None,
+            "start": [np.full((*size, 3), 0.2, np.float32) for size in transport.sizes] if started else None,
+            "smoothness": smoothness,
+        }
+        for black, weighted, started, smoothness in (
+            (0.0, False, False, 1e-3),
+            (0.02, True, False, 1e-2),
+            (0.02, False, True, 1e-4),
+            (0.0, True, True, 1e-3),
+            (0.0, False, False, 1e-3),
+        )
+    ]
+    target = transport.reach() * np.float32(0.7)
+    for one in asked:
+        there, here = (
+            solve_bounded(transport, target, tolerance=0, most_iterations=6, engine=which, **one)  # type: ignore[arg-type]
+            for which in (engine, None)
+        )
+        assert there.objective == pytest.approx(here.objective, rel=1e-4)
+        np.testing.assert_allclose(frame_planes(there.frames), frame_planes(here.frames), atol=2e-3)
+
+
+def test_pixels_beside_the_object_stay_dark(engine: GpuEngine) -> None:
+    transport = any_windows(6, mosaic=True)
+    beside = np.zeros(transport.pixels, np.bool_)
+    beside[::7] = True
+    transport = dataclasses.replace(transport, beside=beside)
+    black = np.zeros((*transport.camera_shape, 3), np.float32)
+    target = 0.6 * transport.reach()
+    there, here = (
+        solve_bounded(transport, target, black, tolerance=0, most_iterations=8, engine=which)
+        for which in (engine, None)
+    )
+    assert (frame_planes(there.frames)[:, beside] == 0).all()
+    assert there.objective == pytest.approx(here.objective, rel=1e-4)
 
 
 @pytest.mark.parametrize("sweeps", [3, 53])
