@@ -14,7 +14,7 @@ import numpy as np
 from controller.core.errors import WorkError
 from controller.solve.bounded.descent import MOST_GROWTH, OVERRELAXATION, RECOMPUTE_EVERY, IterationControl
 from controller.solve.bounded.problem import Solution, SolveInput
-from controller.solve.gpu.device import Clear, Copy, Held, Step, spread
+from controller.solve.gpu.device import Clear, Copy, Held, Step, groups_of
 from controller.solve.gpu.equations import DeviceEquations
 
 MOST_AHEAD: Final = 16
@@ -32,7 +32,7 @@ class DeviceDescent:
         """Make room. Raises DeviceRefused."""
         self._equations, self._transport, self._device = equations, equations.transport, equations.device
         self._held = Held(self._device)
-        groups = sum(int(np.prod(spread(one.pixels))) for one in equations.projectors)
+        groups = sum(groups_of(one.pixels) for one in equations.projectors)
         try:
             self._partials = self._held.room(8 * groups, "sums")
             self._state = self._held.room(4 * _STATE_SIZE, "sums")

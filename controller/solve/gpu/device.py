@@ -283,6 +283,12 @@ def spread(threads: int) -> tuple[int, int]:
     return across, -(-groups // across)
 
 
+def groups_of(threads: int) -> int:
+    """How many groups ``spread`` makes; each writes one number where a kernel adds up."""
+    across, down = spread(threads)
+    return across * down
+
+
 @cache
 def _source(name: str) -> str:
     return (resources.files(__package__) / "shaders" / f"{name}.wgsl").read_text("utf-8")

@@ -15,7 +15,7 @@ from controller.core.arrays import FloatImage
 from controller.solve.bounded.initial_estimate import BLOCK_PX
 from controller.solve.bounded.problem import SolveInput
 from controller.solve.bounded.smoothness import EDGE_WEIGHT_STEPS, FAINTEST
-from controller.solve.gpu.device import Array, Buffer, Clear, Copy, Device, Held, Step, Work, spread
+from controller.solve.gpu.device import Array, Buffer, Clear, Copy, Device, Held, Step, Work, groups_of
 from controller.solve.gpu.transport import DeviceTransport, constants
 
 _STRENGTH, _SEGMENT, _FAINT = 4, 5, 6
@@ -128,7 +128,7 @@ class DeviceEquations:
         self.weights = held.room(4 * pixels, "weights")
         self._mask = held.put(source.object_mask[self._window].astype(np.float32), "weights")
         self.light, self._reach = (held.room(4 * transport.sensor_count, "camera samples") for _ in range(2))
-        self._camera_sums = held.room(8 * int(np.prod(spread(pixels))), "sums")
+        self._camera_sums = held.room(8 * groups_of(pixels), "sums")
         numbers = [transport.columns, transport.rows, pixels, 0, 0, 0, 0, 0]
         self._camera = self.device.uniform(constants(numbers, np.eye(3, dtype=np.float32)))
         count = len(transport.sizes)
@@ -152,11 +152,11 @@ class DeviceEquations:
         beside = None
         if source.beside is not None and source.beside[span].any():
             beside = held.put(source.beside[span].astype(np.float32), "frames")
-        first = sum(int(np.prod(spread(r * c))) for r, c in self.transport.sizes[:n])
+        first = sum(groups_of(r * c) for r, c in self.transport.sizes[:n])
         head = constants([columns, rows, pixels, first, 0, 0, 0, 0], self.transport.mixing[n])
         head[_SEGMENT : _SEGMENT + 1] = np.array([source.segment(n)], np.float32).view(np.uint32)
         white = self.device.uniform(constants([columns, rows, pixels, 0, 0, 0, 0, 0], abs(self.transport.mixing[n])))
-        sums = held.room(8 * int(np.prod(spread(pixels))), "sums")
+        sums = held.room(8 * groups_of(pixels), "sums")
         return ProjectorBuffers(
             y, x, step, majoriser, edge_weights, observed, per_sum, beside, sums, self.device.uniform(head), head,
             white, pixels,
@@ -252,5 +252,5 @@ class DeviceEquations:
 
     def _sum(self, sums: Buffer, pixels: int) -> float:
         """What the groups of a kernel over so many pixels have added up."""
-        groups = int(np.prod(spread(pixels)))
+        groups = groups_of(pixels)
         return float(self.device.read(sums, 2 * groups)[::2].sum(dtype=np.float64))
