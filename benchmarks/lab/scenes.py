@@ -1,4 +1,5 @@
-"""Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust, steps."""
+"""Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust, steps, a bust in a
+niche, a vase between walls."""
 
 from __future__ import annotations
 
@@ -76,8 +77,48 @@ def steps() -> Part:
     return _together(*parts)
 
 
+def niche() -> Part:
+    """A bust in a niche with a half dome: orange and red walls around it, blue and white above."""
+    radius, high = 0.11, 0.20
+    turn, height = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 2 * GRID), np.linspace(0, high, GRID))
+    wall = np.stack((radius * np.sin(turn), height, -radius * np.cos(turn)), axis=-1)
+    marked = (np.floor(turn / (np.pi / 10)) + np.floor(height / 0.03)) % 2 < 1
+    wall_colours = np.where(marked[..., None], (0.75, 0.20, 0.12), (0.85, 0.50, 0.20))
+    turn, tilt = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 2 * GRID), np.linspace(0, 0.98 * np.pi / 2, GRID))
+    level = radius * np.cos(tilt)
+    dome = np.stack((level * np.sin(turn), high + radius * np.sin(tilt), -level * np.cos(turn)), axis=-1)
+    marked = (np.floor(turn / (np.pi / 8)) + np.floor(tilt / 0.3)) % 2 < 1
+    dome_colours = np.where(marked[..., None], (0.20, 0.30, 0.70), (0.70, 0.70, 0.75))
+    floor = _plane(
+        np.array([-radius, 0.0, 0.08]), np.array([2 * radius, 0.0, 0.0]), np.array([0.0, 0.0, -0.19]),
+        (0.7, 0.7, 0.7), (0.3, 0.3, 0.3), 7,
+    )  # fmt: skip
+    head = _standing(bust(200, 240), paint_bust, BUST_AXIS_X)
+    head[0][:] *= 0.7
+    return _together(
+        (wall.reshape(-1, 3), _triangles(*turn.shape), wall_colours.reshape(-1, 3)),
+        (dome.reshape(-1, 3), _triangles(*turn.shape), dome_colours.reshape(-1, 3)),
+        floor, head,
+    )  # fmt: skip
+
+
+def alcove() -> Part:
+    """A vase between a green and a purple wall, a third behind it."""
+    left, right, high = np.array([-0.13, 0.0, -0.10]), np.array([0.13, 0.0, -0.10]), np.array([0.0, 0.22, 0.0])
+    pot = _standing(vase(240, 320), paint_vase, VASE_AXIS_X)
+    pot[0][:] = 0.75 * pot[0]
+    return _together(
+        _plane(left, np.array([-0.05, 0.0, 0.22]), high, (0.10, 0.60, 0.20), (0.60, 0.75, 0.30), 6),
+        _plane(right, np.array([0.05, 0.0, 0.22]), high, (0.70, 0.15, 0.50), (0.75, 0.50, 0.70), 6),
+        _plane(left, right - left, high, (0.60, 0.60, 0.75), (0.30, 0.30, 0.50), 6),
+        _plane(np.array([-0.18, 0.0, 0.12]), np.array([0.36, 0.0, 0.0]), np.array([0.0, 0.0, -0.22]),
+               (0.70, 0.65, 0.50), (0.50, 0.40, 0.30), 5),
+        pot,
+    )  # fmt: skip
+
+
 SCENES: Final[Mapping[str, Callable[[], Part]]] = {
-    "corner": corner, "bowl": bowl, "two-objects": two_objects, "steps": steps,
+    "corner": corner, "bowl": bowl, "two-objects": two_objects, "steps": steps, "niche": niche, "alcove": alcove,
 }  # fmt: skip
 
 
