@@ -161,10 +161,13 @@ class SimulatedWorld(World):
         log = STAGE / "kiosk" / "events.sqlite"
         left = {path: path.read_bytes() for path in (log, log.with_name(f"{log.name}-wal")) if path.is_file()}
         for connection in self._connections:
-            connection.close()
-        for path, content in left.items() if self._connections else ():
-            path.write_bytes(content)
+            # SQLite closes one of another thread only with its last name
+            with contextlib.suppress(sqlite3.ProgrammingError):
+                connection.close()
+        had = bool(self._connections)
         self._connections.clear()
+        for path, content in left.items() if had else ():
+            path.write_bytes(content)
         for line in self.lines.values():
             line.drop()
 

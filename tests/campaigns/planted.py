@@ -4,7 +4,8 @@
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
 the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
-WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet.
+WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet. A search that
+fails does not stop the others; the exit code is 1 then.
 """
 
 from __future__ import annotations
@@ -83,14 +84,20 @@ def main() -> int:
         control = search(None, float(seconds), seeds)
         print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
     bugs = patches(words or [""])
+    failed = 0
     for patch in bugs:
-        one = search(patch, float(seconds), seeds)
+        try:
+            one = search(patch, float(seconds), seeds)
+        except (RuntimeError, subprocess.CalledProcessError) as error:
+            failed += 1
+            print(f"         {patch.stem:42} FAILED: {str(error).strip().splitlines()[-1]}", flush=True)
+            continue
         found += bool(one.how)
         all_s += one.took_s
         print(f"{one.took_s:6.0f} s  {one.bug:42} {one.how or 'NOT FOUND'}", flush=True)
     took_s = time.monotonic() - began_s
     print(f"{found} of {len(bugs)} found in {all_s:.0f} s of a core, {took_s:.0f} s here")
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
