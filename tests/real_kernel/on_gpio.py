@@ -72,18 +72,25 @@ def when_there(board: Board) -> GpioKeys:
 @pytest.fixture(scope="module")
 def keys(board: Board) -> Iterator[GpioKeys]:
     panel = when_there(board)
+    # a key that is down when its line is first read was not pressed since
+    looked(board[0])
     yield panel
     panel.close()
+
+
+def looked(adapter: Cp2112 | Mcp2221) -> None:
+    """Wait until the lines were read several times."""
+    ends, until = in_seconds(PATIENCE_S), adapter.looks + ENOUGH_LOOKS
+    while adapter.looks < until:
+        assert not ends.passed
+        time.sleep(0.01)
 
 
 def press(adapter: Cp2112 | Mcp2221, line: int) -> None:
     """Press a key and let it go, each for so long that its line is read several times."""
     for _ in range(2):
         adapter.levels[line] = not adapter.levels[line]
-        ends, until = in_seconds(PATIENCE_S), adapter.looks + ENOUGH_LOOKS
-        while adapter.looks < until:
-            assert not ends.passed
-            time.sleep(0.01)
+        looked(adapter)
 
 
 @pytest.fixture(scope="class")

@@ -1,1 +1,1 @@
-"""What does the heavy loops of a solve: the processor, or a graphics processor. Entry: `choice.choose_engine`."""
+"""What solves and scales: the processor, or a graphics processor. Entry: `choice.choose_engine`."""

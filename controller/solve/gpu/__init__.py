@@ -1,4 +1,4 @@
-"""The heavy loops of solving and scaling on a graphics processor, by wgpu. Entry: `engine.GpuEngine`.
+"""Solves and scales on a graphics processor, by wgpu. Entry: `engine.GpuEngine`.
 
 Only solve/engines imports it, and only where the extra gpu is installed (docs/decisions/0066).
 """
