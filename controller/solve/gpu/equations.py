@@ -21,6 +21,9 @@ from controller.solve.gpu.transport import DeviceTransport, constants
 _STRENGTH, _SEGMENT, _FAINT = 4, 5, 6
 """Where these are among the constants of a projector's kernels."""
 
+_SUMS = 7
+"""The number of the sums among the buffers of ``sum_pixels``."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectorBuffers:
@@ -102,8 +105,9 @@ class DeviceEquations:
             return
         for one, frame in zip(self.projectors, frames, strict=True):
             self.device.write(one.step, np.asarray(frame, np.float32))
-            bound = [one.step, one.majoriser, one.x]
-            self.device.submit([self._over_pixels(one, "split_frame", bound=bound), Copy(one.x, one.y)])
+            bound = [one.majoriser, one.x, one.step]
+            start = self._over_pixels(one, "given_start", "start_frame", bound=bound)
+            self.device.submit([start, Copy(one.x, one.y)])
 
     def objective(self) -> float:
         """At x, whose picture is in the transport's ``residual``."""
@@ -185,6 +189,16 @@ class DeviceEquations:
     def _over_camera(self, *names: str, bound: Sequence[Buffer]) -> Work:
         return self.device.work(self.device.kernel("frame", *names), [self._camera, *bound], self._camera_pixels)
 
+    def _summed(self, one: ProjectorBuffers | None, name: str, bound: Sequence[Buffer]) -> Work:
+        """A kernel that adds up over a projector's pixels, or over the camera's; ``_sum`` reads it."""
+        values, sums, pixels = (
+            (self._camera, self._camera_sums, self._camera_pixels)
+            if one is None
+            else (one.values, one.sums, one.pixels)
+        )
+        kernel = self.device.kernel("frame", name, "group_sum", "sum_pixels")
+        return self.device.work(kernel, {**dict(enumerate([values, *bound])), _SUMS: sums}, pixels)
+
     def _over_blocks(self, name: str, n: int, bound: Sequence[Buffer], threads: int) -> Work:
         kernel = self.device.kernel("blocks", name)
         return self.device.work(kernel, [self._block_values[n], *bound], threads)
@@ -210,10 +224,9 @@ class DeviceEquations:
             steps.append(self.device.work(kernel, [self._reach, self.light], transport.sensor_count))
             steps += transport.counted_of(self.light, self.weights)
             steps += transport.adjoint(n, one.majoriser, absolute=True)
-            steps.append(self._over_pixels(one, "group_sum", "count_lit", bound=[one.majoriser, one.sums]))
+            steps.append(self._summed(one, "count_lit", [one.majoriser]))
         steps += transport.counted_of(self._reach, self.weights)
-        bound = [transport.residual, self.weights, self._camera_sums]
-        return [*steps, self._over_camera("group_sum", "light_squared", bound=bound)]
+        return [*steps, self._summed(None, "light_squared", [transport.residual, self.weights])]
 
     def _smoothed(self) -> list[Step]:
         """Adds the smoothness to the majoriser, beside dark pixels none."""
@@ -222,8 +235,7 @@ class DeviceEquations:
             if one.beside is not None:
                 steps.append(self._over_pixels(one, "leave_dark", bound=[one.majoriser, one.beside]))
             steps.append(self._over_pixels(one, "dark_edges", bound=[one.majoriser, one.edge_weights]))
-            bound = [one.majoriser, one.edge_weights, one.sums]
-            steps.append(self._over_pixels(one, "group_sum", "smooth_majoriser", bound=bound))
+            steps.append(self._summed(one, "smooth_majoriser", [one.majoriser, one.edge_weights]))
         return steps
 
     def _estimate(self) -> list[Step]:
@@ -238,17 +250,14 @@ class DeviceEquations:
             bound = [self._shown_blocks, transport.residual]
             steps.append(self._over_blocks("upsample", n, bound, self._camera_pixels))
             steps += [*transport.collect(), *transport.sums(n, one.step)]
-            bound = [one.step, one.per_sum, one.majoriser, one.x]
-            steps += [self._over_pixels(one, "estimated_frame", bound=bound), Copy(one.x, one.y)]
+            bound = [one.majoriser, one.x, one.step, one.per_sum]
+            start = self._over_pixels(one, "estimated_start", "start_frame", bound=bound)
+            steps += [start, Copy(one.x, one.y)]
         return steps
 
     def _judged(self) -> list[Step]:
-        bound = [self.transport.residual, self.wanted, self.weights, self._camera_sums]
-        steps: list[Step] = [self._over_camera("group_sum", "misfit", bound=bound)]
-        for one in self.projectors:
-            bound = [one.x, one.edge_weights, one.sums]
-            steps.append(self._over_pixels(one, "group_sum", "roughness", bound=bound))
-        return steps
+        misfit = self._summed(None, "misfit", [self.transport.residual, self.wanted, self.weights])
+        return [misfit, *(self._summed(one, "roughness", [one.x, one.edge_weights]) for one in self.projectors)]
 
     def _sum(self, sums: Buffer, pixels: int) -> float:
         """What the groups of a kernel over so many pixels have added up."""
