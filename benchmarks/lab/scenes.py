@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 
 from controller.core.arrays import Float64
@@ -43,8 +44,7 @@ def bowl() -> Part:
     turn, tilt = np.meshgrid(np.linspace(0, 2 * np.pi, 2 * GRID), np.linspace(0.0, np.deg2rad(75.0), GRID))
     points = 0.15 * np.stack((np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)), axis=-1)
     marked = (np.floor(turn / (np.pi / 6)) + np.floor(tilt / 0.26)) % 2 < 1
-    colours = np.where(marked[..., None], (0.80, 0.62, 0.42), (0.70, 0.72, 0.74))
-    return points.reshape(-1, 3), _triangles(*turn.shape), colours.reshape(-1, 3)
+    return _sheet(points, marked, (0.80, 0.62, 0.42), (0.70, 0.72, 0.74))
 
 
 def two_objects() -> Part:
@@ -81,25 +81,21 @@ def niche() -> Part:
     """A bust in a niche with a half dome: orange and red walls around it, blue and white above."""
     radius, high = 0.11, 0.20
     turn, height = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 2 * GRID), np.linspace(0, high, GRID))
-    wall = np.stack((radius * np.sin(turn), height, -radius * np.cos(turn)), axis=-1)
+    points = np.stack((radius * np.sin(turn), height, -radius * np.cos(turn)), axis=-1)
     marked = (np.floor(turn / (np.pi / 10)) + np.floor(height / 0.03)) % 2 < 1
-    wall_colours = np.where(marked[..., None], (0.75, 0.20, 0.12), (0.85, 0.50, 0.20))
+    wall = _sheet(points, marked, (0.75, 0.20, 0.12), (0.85, 0.50, 0.20))
     turn, tilt = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 2 * GRID), np.linspace(0, 0.98 * np.pi / 2, GRID))
     level = radius * np.cos(tilt)
-    dome = np.stack((level * np.sin(turn), high + radius * np.sin(tilt), -level * np.cos(turn)), axis=-1)
+    points = np.stack((level * np.sin(turn), high + radius * np.sin(tilt), -level * np.cos(turn)), axis=-1)
     marked = (np.floor(turn / (np.pi / 8)) + np.floor(tilt / 0.3)) % 2 < 1
-    dome_colours = np.where(marked[..., None], (0.20, 0.30, 0.70), (0.70, 0.70, 0.75))
+    dome = _sheet(points, marked, (0.20, 0.30, 0.70), (0.70, 0.70, 0.75))
     floor = _plane(
         np.array([-radius, 0.0, 0.08]), np.array([2 * radius, 0.0, 0.0]), np.array([0.0, 0.0, -0.19]),
         (0.7, 0.7, 0.7), (0.3, 0.3, 0.3), 7,
     )  # fmt: skip
     head = _standing(bust(200, 240), paint_bust, BUST_AXIS_X)
     head[0][:] *= 0.7
-    return _together(
-        (wall.reshape(-1, 3), _triangles(*turn.shape), wall_colours.reshape(-1, 3)),
-        (dome.reshape(-1, 3), _triangles(*turn.shape), dome_colours.reshape(-1, 3)),
-        floor, head,
-    )  # fmt: skip
+    return _together(wall, dome, floor, head)
 
 
 def alcove() -> Part:
@@ -134,8 +130,13 @@ def _plane(at: Float64, across: Float64, up: Float64, light: object, dark: objec
     u, v = np.meshgrid(np.linspace(0, 1, GRID), np.linspace(0, 1, GRID))
     points = at + u[..., None] * across + v[..., None] * up
     marked = (np.floor(squares * u) + np.floor(squares * v)) % 2 < 1
+    return _sheet(points, marked, light, dark)
+
+
+def _sheet(points: Float64, marked: npt.NDArray[np.bool_], light: object, dark: object) -> Part:
+    """A surface through (rows, columns, 3) points in two paints: the ``light`` one where it is ``marked``."""
     colours = np.where(marked[..., None], np.asarray(light), np.asarray(dark))
-    return points.reshape(-1, 3), _triangles(GRID, GRID), colours.reshape(-1, 3)
+    return points.reshape(-1, 3), _triangles(*marked.shape), colours.reshape(-1, 3)
 
 
 def _standing(surface: tuple[Float64, object], paint: Callable[[Float64], object], axis_x: float) -> Part:
