@@ -17,7 +17,7 @@ from controller.artefacts.calibration import object_mask, projectors_of
 from controller.artefacts.geometry import read_geometry
 from controller.artefacts.grade import graded
 from controller.calibrate.correspondence import decode as correspondence_decode
-from controller.calibrate.correspondence.colour_alignment import colour_shifts
+from controller.calibrate.correspondence.colour_alignment import colour_shifts, colours_apart
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
 from controller.calibrate.photometry.colour_tiles import KnownIndirect
@@ -141,7 +141,7 @@ def _calibrated(
 ) -> tuple[ProjectorCalibration, npt.NDArray[np.int64] | None]:
     radiometry, plan = measure_response(captures), plan_patterns(captures.projector_px)
     white = np.maximum(captures.pictures["white"] - captures.pictures["black"], 0).astype(np.float32)
-    apart_px = colour_shifts(captures.pictures, plan, white, radiometry.mixing).sure_px
+    apart_px = colour_shifts(colours_apart(captures.pictures, plan, white, radiometry.mixing)).sure_px
     colours = None if apart_px is None else ColourPlaces.of(apart_px, white, radiometry.mixing)
     correspondence = _decoded(captures, colours)
     if not correspondence.valid.any():

@@ -6,12 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from controller.capture.profile import CameraNoise
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
+from controller.core.jit import compiled
 
 __all__ = [
     "BracketChoice",
@@ -89,12 +91,13 @@ def merge_brackets(
         raise UsageError(
             "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
         )
-    counting = _counting(images, exposures_s, noise, rounded)
-    estimate = _weighted(images, exposures_s, counting, None, noise)[0]
-    radiance, weight = _weighted(images, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
+    flat = [np.ascontiguousarray(image, np.float32).reshape(-1) for image in images]
+    counting = _counting(flat, exposures_s, noise, rounded)
+    estimate, _ = _weighted(flat, exposures_s, counting, np.zeros_like(flat[0]), noise)
+    radiance, weight = _weighted(flat, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
     with np.errstate(divide="ignore"):
-        sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.nan)
-    return MergedBracket(radiance, sigma.astype(np.float32))
+        sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.float32(np.nan))
+    return MergedBracket(radiance.reshape(images[0].shape), sigma.reshape(images[0].shape))
 
 
 def _counting(
@@ -105,38 +108,76 @@ def _counting(
     ``rounded``: spread that ``noise`` does not have, of full scale
     """
     still = np.float32(noise.read**2 + rounded**2)
-    counting = [np.isfinite(image) for image in images]
-    total, weights = np.zeros(images[0].shape, np.float32), np.zeros(images[0].shape, np.float32)
+    counting = [np.zeros(image.shape, np.bool_) for image in images]
+    total, weights = np.zeros_like(images[0]), np.zeros_like(images[0])
     for n in sorted(range(len(images)), key=lambda n: exposures_s[n]):
-        seconds = np.float32(exposures_s[n])
-        if np.any(weights):
-            # with weights of t^2, the shorter exposures together are as one of sqrt(sum t^2) seconds
-            longer = np.where(weights > 0, seconds / np.sqrt(np.maximum(weights, np.float32(1e-30))), np.float32(1e15))
-            predicted = total / np.maximum(weights, np.float32(1e-30)) * seconds
-            shot = np.float32(noise.shot) * np.maximum(predicted, 0)
-            spread = np.sqrt((shot / longer + still) * longer**2 + shot + still)
-            counting[n] &= ~(images[n] < (1 - np.float32(FLICKER)) * predicted - np.float32(SPREADS) * spread)
-        total += np.where(counting[n], images[n], 0) * seconds
-        weights += np.where(counting[n], seconds**2, np.float32(0))
+        _count(images[n], np.float32(exposures_s[n]), np.float32(noise.shot), still, total, weights, counting[n])
     return counting
+
+
+@compiled(parallel=True)
+def _count(
+    image: FloatImage,
+    seconds: np.float32,
+    shot: np.float32,
+    still: np.float32,
+    total: FloatImage,
+    weights: FloatImage,
+    counts: Mask,
+) -> None:
+    """One image of ``_counting``; ``total`` and ``weights`` hold the shorter exposures, and then this one, too."""
+    below = np.float32(1) - np.float32(FLICKER)
+    for k in numba.prange(image.size):
+        value, weight = image[k], weights[k]
+        good = bool(np.isfinite(value))
+        if good and weight > 0:
+            # with weights of t^2, the shorter exposures together are as one of sqrt(sum t^2) seconds
+            longer, predicted = seconds / np.sqrt(weight), total[k] / weight * seconds
+            light = shot * max(predicted, np.float32(0))
+            spread = np.sqrt((light / longer + still) * (longer * longer) + light + still)
+            good = not value < below * predicted - np.float32(SPREADS) * spread
+        counts[k] = good
+        if good:
+            total[k] += value * seconds
+            weights[k] += seconds * seconds
 
 
 def _weighted(
     images: Sequence[FloatImage],
     exposures_s: Sequence[float],
     counting: Sequence[Mask],
-    radiance: FloatImage | None,
+    radiance: FloatImage,
     noise: CameraNoise,
 ) -> tuple[FloatImage, FloatImage]:
-    total, weights = np.zeros(images[0].shape, np.float32), np.zeros(images[0].shape, np.float32)
-    for image, exposure_s, measured in zip(images, exposures_s, counting, strict=True):
-        signal = radiance * np.float32(exposure_s) if radiance is not None else np.float32(0)
-        variance = (np.float32(noise.shot) * signal + np.float32(noise.read**2)) / np.float32(exposure_s**2)
-        weight = np.where(measured, 1 / variance, 0).astype(np.float32)
-        total += weight * np.where(measured, image, 0) / np.float32(exposure_s)
-        weights += weight
+    """The mean by the variances that ``radiance`` has, NaN where nothing counts, and the sum of the weights."""
+    total, weights = np.zeros_like(images[0]), np.zeros_like(images[0])
+    shot, read = np.float32(noise.shot), np.float32(noise.read**2)
+    for image, exposure_s, counts in zip(images, exposures_s, counting, strict=True):
+        seconds, square = np.float32(exposure_s), np.float32(exposure_s**2)
+        _weigh(image, counts, radiance, seconds, square, shot, read, total, weights)
     with np.errstate(invalid="ignore"):
-        return np.asarray(total / np.where(weights > 0, weights, np.nan), np.float32), weights
+        total /= weights  # 0 / 0 where nothing counts
+    return total, weights
+
+
+@compiled(parallel=True)
+def _weigh(
+    image: FloatImage,
+    counts: Mask,
+    radiance: FloatImage,
+    seconds: np.float32,
+    square: np.float32,
+    shot: np.float32,
+    read: np.float32,
+    total: FloatImage,
+    weights: FloatImage,
+) -> None:
+    """Add one image of ``_weighted``."""
+    for k in numba.prange(image.size):
+        if counts[k]:
+            weight = square / (shot * (radiance[k] * seconds) + read)
+            total[k] += weight * image[k] / seconds
+            weights[k] += weight
 
 
 @dataclass(frozen=True, slots=True)

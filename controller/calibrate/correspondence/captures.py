@@ -59,5 +59,5 @@ def lit_pixels(white: FloatImage) -> Mask:
     known: Mask = finite(white)
     if not known.any():
         return known
-    bright = np.percentile(white[known][::7], 99, axis=0)
+    bright = np.percentile(white.reshape(-1, 3)[np.flatnonzero(known)[::7]], 99, axis=0)
     return np.asarray(known & every(white > LIT_SHARE * bright) & np.all(bright > 0))

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, coloured
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.capture.patterns import PatternPlan
-from controller.core.arrays import Float64, FloatImage, Mask
-from controller.core.channels import smallest
+from controller.core.arrays import Float64, FloatImage
+from controller.core.channels import every, finite, smallest
 
 FINE: Final = ("blur-x", "blur-y")
 LEAST_CONTRAST: Final = 0.25
@@ -64,8 +64,20 @@ class ColourShifts:
         return np.nan_to_num(self.px) if sure.any() else None
 
 
-def colour_shifts(captures: Captures, plan: PatternPlan, white: FloatImage, mixing: Float64) -> ColourShifts:
-    """How far the colours of a projector lie apart.
+@dataclass(frozen=True, slots=True, eq=False)
+class ColoursApart:
+    """How far the colours lie apart at some camera pixels.
+
+    ``at`` (some,) their flat numbers; ``px`` (2, some, 3): by how many projector pixels each colour lies beside green,
+    along x and y; NaN where a colour shows too little contrast
+    """
+
+    at: npt.NDArray[np.int64]
+    px: Float64
+
+
+def colours_apart(captures: Captures, plan: PatternPlan, white: FloatImage, mixing: Float64) -> ColoursApart:
+    """Measure where the colours of a projector lie.
 
     Parameters
     ----------
@@ -75,13 +87,33 @@ def colour_shifts(captures: Captures, plan: PatternPlan, white: FloatImage, mixi
 
     Raises CalibrationError as ``coloured``.
     """
-    found, errors = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
-    at = _bright(white)
+    light = smallest(white)
+    at = np.flatnonzero(light > FAINTEST * np.nanpercentile(light, 99))
+    at = at[:: max(1, at.size // SOME_PIXELS)]
+    black, own_white = (image.reshape(-1, 3)[at] for image in (coloured(captures, "black", white.shape[:2]), white))
+    found = np.full((2, at.size, 3), np.nan)
     for axis, prefix in enumerate(FINE):
-        apart, _ = _apart_px(captures, plan, prefix, white, mixing, at)
-        if len(apart) >= FEWEST_PIXELS:
-            found[:, axis] = np.median(apart, axis=0)
-            parts = [np.median(part, axis=0) for part in np.array_split(apart, PARTS)]
+        steps = plan.sinusoids(prefix)
+        seen = np.zeros((at.size, 3), np.complex128)
+        for step in steps:
+            image = coloured(captures, step.name, white.shape[:2]).reshape(-1, 3)[at] - black
+            seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
+        own = np.linalg.solve(mixing, (2 * seen / own_white).T).T
+        # what is not a number in one of the steps is left out, too
+        use = every(np.abs(own) > LEAST_CONTRAST)
+        own = own[use]
+        found[axis, use] = np.angle(own * np.conj(own[:, 1:2])) * FRINGE_PX / (2 * np.pi)
+    return ColoursApart(at, found)
+
+
+def colour_shifts(apart: ColoursApart) -> ColourShifts:
+    """How far the colours of a projector lie apart."""
+    found, errors = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
+    for axis in range(2):
+        seen = apart.px[axis][finite(apart.px[axis])]
+        if len(seen) >= FEWEST_PIXELS:
+            found[:, axis] = np.median(seen, axis=0)
+            parts = [np.median(part, axis=0) for part in np.array_split(seen, PARTS)]
             errors[:, axis] = np.std(parts, axis=0, ddof=1) / np.sqrt(PARTS)
     return ColourShifts(found, errors)
 
@@ -97,49 +129,22 @@ class ColourSizes:
     error: Float64
 
 
-def colour_sizes(
-    captures: Captures, plan: PatternPlan, white: FloatImage, mixing: Float64, position_px: FloatImage
-) -> ColourSizes:
+def colour_sizes(apart: ColoursApart, position_px: FloatImage) -> ColourSizes:
     """Whether the pictures of a projector's colours are of one size.
 
-    ``position_px`` (rows, columns, 2): where camera pixels look in the projector's image, NaN where not known; the rest
-    and the errors: as for ``colour_shifts``
+    ``position_px`` (rows, columns, 2): where camera pixels look in the projector's image, NaN where not known
     """
-    at = _bright(white)
-    at = at[np.isfinite(position_px.reshape(-1, 2)[at]).all(axis=1)]
+    place_px = position_px.reshape(-1, 2)[apart.at].astype(np.float64)
     slopes: list[Float64] = []
-    for axis, prefix in enumerate(FINE):
-        apart, seen = _apart_px(captures, plan, prefix, white, mixing, at)
-        if len(apart) < FEWEST_PIXELS:
+    for axis in range(2):
+        use = finite(place_px) & finite(apart.px[axis])
+        if np.count_nonzero(use) < FEWEST_PIXELS:
             return ColourSizes(np.full(3, np.nan), np.full(3, np.nan))
-        place = position_px.reshape(-1, 2)[at][seen].astype(np.float64)
-        slopes.append(np.stack([_slopes(place, apart[:, colour], axis) for colour in range(3)]))
+        seen = apart.px[axis][use]
+        slopes.append(np.stack([_slopes(place_px[use], seen[:, colour], axis) for colour in range(3)]))
     # of each part of the picture, over both axes
     each = np.mean(slopes, axis=0)
     return ColourSizes(each.mean(axis=1), np.std(each, axis=1, ddof=1) / np.sqrt(PARTS))
-
-
-def _bright(white: FloatImage) -> npt.NDArray[np.int64]:
-    """Numbers of the camera pixels that see the projector well, at most so many."""
-    at = np.flatnonzero(smallest(white) > FAINTEST * np.nanpercentile(smallest(white), 99))
-    return at[:: max(1, at.size // SOME_PIXELS)]
-
-
-def _apart_px(
-    captures: Captures, plan: PatternPlan, prefix: str, white: FloatImage, mixing: Float64, at: npt.NDArray[np.int64]
-) -> tuple[Float64, Mask]:
-    """(some, 3): by how many projector pixels each colour lies beside green along a sinusoid; and which of ``at``."""
-    black = coloured(captures, "black", white.shape[:2])
-    steps = plan.sinusoids(prefix)
-    seen = np.zeros((at.size, 3), np.complex128)
-    for step in steps:
-        image = (coloured(captures, step.name, white.shape[:2]) - black).reshape(-1, 3)[at]
-        seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
-    own = np.linalg.solve(mixing, (2 * seen / white.reshape(-1, 3)[at]).T).T
-    # what is not a number in one of the steps is left out, too
-    use = (np.abs(own) > LEAST_CONTRAST).all(axis=1)
-    own = own[use]
-    return np.angle(own * np.conj(own[:, 1:2])) * FRINGE_PX / (2 * np.pi), use
 
 
 def _slopes(place_px: Float64, apart_px: Float64, axis: int) -> Float64:

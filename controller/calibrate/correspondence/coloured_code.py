@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 import cv2
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +17,8 @@ from controller.calibrate.correspondence.captures import Captures, coloured, lit
 from controller.calibrate.correspondence.gray_code import WEAK_BIT, Cells
 from controller.capture.patterns import PatternKind, PatternPlan
 from controller.capture.profile import CameraNoise
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import FloatImage
+from controller.core.jit import compiled
 
 SOME_PIXELS: Final = 20_000
 ROUNDS: Final = 4
@@ -41,56 +43,93 @@ def decode_colours(captures: Captures, plan: PatternPlan, noise: CameraNoise) ->
     white = coloured(captures, "white", shape) - black
     patterns = plan.of_kind(PatternKind.COLOUR_GRAY)
     separate = _separation(captures, plan, black, white)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        # where hardly anything comes back, one pixel's white may look like light by its noise, but not those around
-        light = np.minimum(white, cv2.blur(np.nan_to_num(white), AROUND_PX))
-        sigma = np.sqrt(np.float32(noise.shot) * np.maximum(white / 2, 0) + np.float32(noise.read**2)) / light
-        # noise of the separated colours
-        sigma[light <= 0] = np.inf
-        spread = np.sqrt(np.square(sigma) @ np.square(separate).astype(np.float32).T)
-    unsure = ~(spread < MOST_NOISE)
-    del sigma, spread, light
-    cell = [np.zeros(shape, np.int32) for _ in range(2)]
-    weak = [np.zeros(shape, np.uint8) for _ in range(2)]
-    bit = [np.zeros(shape, np.bool_) for _ in range(2)]
+    around = cv2.blur(np.nan_to_num(white), AROUND_PX)
+    unsure = _unsure(white, around, np.float32(noise.shot), np.float32(noise.read**2), separate)
+    del around
+    cell, weak = np.zeros((2, *shape), np.int32), np.zeros((2, *shape), np.uint8)
+    bit = np.zeros((2, *shape), np.bool_)
     for pattern in patterns:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            seen = (coloured(captures, pattern.name, shape) - black) / white
-            own = seen @ separate.astype(np.float32).T
-        for channel, place in enumerate(pattern.coloured_bits):
-            if place is None:
-                continue
-            axis = place[0]
-            above = own[..., channel] - np.float32(0.5)
-            bit[axis] ^= above > 0
-            cell[axis] = 2 * cell[axis] + bit[axis]
-            weak[axis] += ~(np.abs(above) >= WEAK_BIT / 2)
-            # a bit near its threshold is a border of cells, of which there may be one; a dark colour tells nothing
-            weak[axis] += np.uint8(2) * unsure[..., channel]
+        axes = np.array([-1 if place is None else place[0] for place in pattern.coloured_bits])
+        _read_bits(coloured(captures, pattern.name, shape), black, white, separate, unsure, axes, bit, cell, weak)
     return Cells(cell[0], weak[0]), Cells(cell[1], weak[1])
 
 
-def _separation(captures: Captures, plan: PatternPlan, black: FloatImage, white: FloatImage) -> Float64:
+@compiled(parallel=True)
+def _unsure(
+    white: FloatImage, around: FloatImage, shot: np.float32, read: np.float32, separate: FloatImage
+) -> npt.NDArray[np.bool_]:
+    """Where noise hides a colour's bits. ``around``: mean of white around each pixel; ``read``: noise squared.
+
+    Where hardly anything comes back, one pixel's white may look like light by its noise, but not those around.
+    """
+    found = np.empty(white.shape, np.bool_)
+    squares = separate * separate
+    for row in numba.prange(white.shape[0]):
+        variance = np.empty(3, np.float32)
+        for column in range(white.shape[1]):
+            for c in range(3):
+                own = white[row, column, c]
+                light = min(own, around[row, column, c])
+                noise = shot * max(own / np.float32(2), np.float32(0)) + read
+                variance[c] = noise / (light * light) if light > 0 else np.float32(np.inf)
+            for c in range(3):
+                spread = squares[c, 0] * variance[0] + squares[c, 1] * variance[1] + squares[c, 2] * variance[2]
+                found[row, column, c] = not np.sqrt(spread) < np.float32(MOST_NOISE)
+    return found
+
+
+@compiled(parallel=True)
+def _read_bits(
+    image: FloatImage,
+    black: FloatImage,
+    white: FloatImage,
+    separate: FloatImage,
+    unsure: npt.NDArray[np.bool_],
+    axes: npt.NDArray[np.int64],
+    bit: npt.NDArray[np.bool_],
+    cell: npt.NDArray[np.int32],
+    weak: npt.NDArray[np.uint8],
+) -> None:
+    """Add the bits of one photograph to ``cell`` and ``weak`` (2, rows, columns); ``axes``: of each colour, or -1."""
+    for row in numba.prange(image.shape[0]):
+        seen = np.empty(3, np.float32)
+        for column in range(image.shape[1]):
+            for c in range(3):
+                seen[c] = (image[row, column, c] - black[row, column, c]) / white[row, column, c]
+            for c in range(3):
+                axis = axes[c]
+                if axis < 0:
+                    continue
+                own = separate[c, 0] * seen[0] + separate[c, 1] * seen[1] + separate[c, 2] * seen[2]
+                above = own - np.float32(0.5)
+                bit[axis, row, column] ^= above > 0
+                cell[axis, row, column] = 2 * cell[axis, row, column] + bit[axis, row, column]
+                # a bit near its threshold is a border of cells, of which there may be one; a dark colour tells nothing
+                near = not abs(above) >= np.float32(WEAK_BIT / 2)
+                weak[axis, row, column] += near + 2 * unsure[row, column, c]
+
+
+def _separation(captures: Captures, plan: PatternPlan, black: FloatImage, white: FloatImage) -> FloatImage:
     """(3, 3): from the camera's channels, of white, to the projector's own colours."""
     at = _some_lit(white)
     seen, shown = [], []
     for pattern in plan.of_kind(PatternKind.COLOUR_GRAY):
-        image = coloured(captures, pattern.name, black.shape[:2]) - black
-        seen.append(image.reshape(-1, 3)[at] / white.reshape(-1, 3)[at])
+        image = coloured(captures, pattern.name, black.shape[:2])
+        seen.append((image.reshape(-1, 3)[at] - black.reshape(-1, 3)[at]) / white.reshape(-1, 3)[at])
         shown.append(np.broadcast_to([place is not None for place in pattern.coloured_bits], (len(at), 3)))
     light, possible = np.concatenate(seen).astype(np.float64), np.concatenate(shown)
     usable = np.isfinite(light).all(axis=1)
     light, possible = light[usable], possible[usable]
     separate = np.eye(3)
     if len(light) < 10:
-        return separate
+        return separate.astype(np.float32)
     for _ in range(ROUNDS):
         bits = (light @ separate.T > 0.5) & possible
         mixing = np.linalg.lstsq(bits.astype(np.float64), light, rcond=None)[0].T
         if not np.isfinite(mixing).all() or abs(np.linalg.det(mixing)) < LEAST_INDEPENDENCE:
-            return np.eye(3)
+            return np.eye(3, dtype=np.float32)
         separate = np.linalg.inv(mixing)
-    return separate
+    return separate.astype(np.float32)
 
 
 def _some_lit(white: FloatImage) -> npt.NDArray[np.int64]:

@@ -14,7 +14,13 @@ from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.artefacts.photographs import Developed, light_of, noise_of, white_bracket
 from controller.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
-from controller.calibrate.correspondence.colour_alignment import colour_shifts, colour_sizes, fringed, misaligned
+from controller.calibrate.correspondence.colour_alignment import (
+    colour_shifts,
+    colour_sizes,
+    colours_apart,
+    fringed,
+    misaligned,
+)
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.correspondence.opposites import completed
@@ -44,7 +50,7 @@ def calibration_steps(
     steps = capture_steps(rig, longest_exposure_s=longest_exposure_s, options=options)
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
-    # All responses first: while one projector's code is photographed, only the places of another are calculated.
+    # All responses first: only that of the first projector is waited for, those of the others are measured beside.
     steps += [_radiometry_step(projector) for projector in rig.projectors]
     for projector in rig.projectors:
         steps.append(code_step(rig, projector, options))
@@ -70,6 +76,7 @@ def _radiometry_step(projector: RigProjector) -> Step:
         after=(StepId(StepKind.BLACK), StepId(StepKind.LIGHT, projector.name), StepId(StepKind.CAMERA)),
         title=f"Measuring the response of {projector.name}",
         weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
+        calculates=True,
     )
 
 
@@ -125,7 +132,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     taken = read_captures(context.folder, projector.name)
     ready = {"black": light.black, "white": light.white + light.black}
     captures = completed(Developed(taken, ready), plan)
-    shifts = colour_shifts(captures, plan, light.white, light.mixing)
+    apart = colours_apart(captures, plan, light.white, light.mixing)
+    shifts = colour_shifts(apart)
     apart_px = shifts.sure_px
     colours = None if apart_px is None else ColourPlaces.of(apart_px, light.white, light.mixing)
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
@@ -145,7 +153,7 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
             remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
         )
     context.advance(0.4, "correspondences")
-    sizes = colour_sizes(captures, plan, light.white, light.mixing, correspondence.projector_px)
+    sizes = colour_sizes(apart, correspondence.projector_px)
     apart_said = {
         TroubleCode.PANEL_ALIGNMENT: misaligned(projector.name, shifts),
         TroubleCode.COLOUR_FRINGES: fringed(projector.name, sizes, projector.size_px),
@@ -166,8 +174,8 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
         spread=None if fitted.spread is None else np.array(astuple(fitted.spread)),
     )
     valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
-    apart = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
-    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen), apart)
+    noted = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
+    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen), noted)
     said = tell(context, StepId(StepKind.PIXELS, projector.name), apart_said)
     return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name), said]
 

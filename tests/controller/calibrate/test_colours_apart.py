@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from controller.calibrate.correspondence.colour_alignment import ColourShifts, colour_shifts
+from controller.calibrate.correspondence.colour_alignment import ColourShifts, colour_shifts, colours_apart
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.correspondence.decode import decode
 from controller.calibrate.correspondence.phase_shift import FRINGE_PX
@@ -39,7 +39,7 @@ def found(scene: Scene, *, corrected: bool = True) -> Found:
     captures, plan = photographed(scene), Stage(scene).plan()
     white = np.maximum(captures["white"] - captures["black"], 0).astype(np.float32)
     radiometry = measure_radiometry(captures, plan)[0]
-    shifts = colour_shifts(captures, plan, white, radiometry.mixing)
+    shifts = colour_shifts(colours_apart(captures, plan, white, radiometry.mixing))
     apart_px = shifts.sure_px if corrected else None
     colours = None if apart_px is None else ColourPlaces.of(apart_px, white, radiometry.mixing)
     correspondence = decode(captures, plan, colours=colours)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from controller.calibrate.correspondence.colour_alignment import (
+    ColoursApart,
     ColourShifts,
     ColourSizes,
     colour_shifts,
     colour_sizes,
+    colours_apart,
     fringed,
     misaligned,
 )
@@ -50,6 +52,10 @@ def pictures(shifts: Float64, noise: float = 0.01, larger: Float64 | None = None
     return found
 
 
+def apart(made: dict[str, FloatImage]) -> ColoursApart:
+    return colours_apart(made, PLAN, made["white"], MIXING)
+
+
 def test_the_formula_is_that_of_the_patterns() -> None:
     (step,) = PLAN.sinusoids("blur-x")[1:2]
     shown = frame(step, (96, 72))
@@ -62,7 +68,7 @@ def test_the_formula_is_that_of_the_patterns() -> None:
 @pytest.mark.parametrize("shift", [((0.3, 0.0), (0.0, 0.0), (-0.1, 0.28)), ((-0.2, 0.15), (0.1, 0.1), (0.1, 0.1))])
 def test_shifts_are_found_and_named(shift: tuple[tuple[float, float], ...]) -> None:
     wanted = np.asarray(shift)
-    found = colour_shifts(pictures(wanted), PLAN, pictures(wanted)["white"], MIXING)
+    found = colour_shifts(apart(pictures(wanted)))
     np.testing.assert_allclose(found.px, wanted - wanted[1], atol=0.01)
     assert found.sure_px is not None
     np.testing.assert_array_equal(found.sure_px, found.px)
@@ -76,7 +82,7 @@ def test_shifts_are_found_and_named(shift: tuple[tuple[float, float], ...]) -> N
 def test_colours_that_lie_on_each_other_are_not_named_however_noisy() -> None:
     for noise in (0.0, 0.05, 0.2):
         made = pictures(np.zeros((3, 2)), noise)
-        assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None
+        assert misaligned("left", colour_shifts(apart(made))) is None
 
 
 @pytest.mark.parametrize(
@@ -97,14 +103,14 @@ def test_only_what_is_beyond_doubt_is_corrected(px: float, error_px: float, sure
 
 def test_without_light_nothing_is_said() -> None:
     made = {name: np.zeros_like(image) for name, image in pictures(np.zeros((3, 2))).items()}
-    assert misaligned("left", colour_shifts(made, PLAN, made["white"], MIXING)) is None
-    assert fringed("left", colour_sizes(made, PLAN, made["white"], MIXING, places()), (96, 72)) is None
+    assert misaligned("left", colour_shifts(apart(made))) is None
+    assert fringed("left", colour_sizes(apart(made), places()), (96, 72)) is None
 
 
 @pytest.mark.parametrize("larger", [(-4e-4, 0.0, 4e-4), (2e-3, 0.0, 0.0), (1e-3, 1e-3, 0.0)])
 def test_colours_of_another_size_are_found_beside_shifts_and_named(larger: tuple[float, float, float]) -> None:
     made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), larger=np.array(larger))
-    found = colour_sizes(made, PLAN, made["white"], MIXING, places())
+    found = colour_sizes(apart(made), places())
     np.testing.assert_allclose(found.larger, np.array(larger) - larger[1], atol=6e-5)
     said = fringed("left", found, (96, 72))
     assert said is not None
@@ -116,7 +122,7 @@ def test_colours_of_another_size_are_found_beside_shifts_and_named(larger: tuple
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])
 def test_shifted_colours_of_one_size_are_not_named_as_fringes(noise: float) -> None:
     made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), noise)
-    assert fringed("left", colour_sizes(made, PLAN, made["white"], MIXING, places()), (96, 72)) is None
+    assert fringed("left", colour_sizes(apart(made), places()), (96, 72)) is None
 
 
 def test_a_size_that_is_not_sure_is_not_named() -> None:
