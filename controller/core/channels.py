@@ -35,6 +35,12 @@ def total(picture: Picture) -> Picture:
     return _over(np.add, picture)
 
 
+def products(one: Picture, other: Picture) -> npt.NDArray[np.float64]:
+    """(channels,): sum over all pixels of the products of two pictures' values, as ``sum(one * other)``."""
+    pairs = ((one[..., channel], other[..., channel]) for channel in range(one.shape[-1]))
+    return np.array([np.multiply(a, b).sum(dtype=np.float64) for a, b in pairs])
+
+
 def length(vectors: Picture) -> Picture:
     """The Euclidean length of each pixel's channels, as ``np.linalg.norm(axis=-1)`` of real numbers."""
     return np.asarray(np.sqrt(_over(np.add, vectors * vectors)))

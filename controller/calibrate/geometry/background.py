@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final, TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -39,14 +40,15 @@ def room_pixels(points_m: FloatImage) -> Mask:
     A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
     picture's border, or where hardly anything else is seen.
     """
-    from scipy.ndimage import distance_transform_edt, median_filter
+    from scipy.ndimage import distance_transform_edt
 
     known = channels.finite(points_m)
     room = np.zeros(known.shape, dtype=np.bool_)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:
         return room
-    everything = points_m[known][rng.integers(0, np.count_nonzero(known), POINTS)].astype(np.float64)
+    at = np.flatnonzero(known)
+    everything = points_m.reshape(-1, 3)[at[rng.integers(0, at.size, POINTS)]].astype(np.float64)
     thick = THICK * float(np.median(np.linalg.norm(everything, axis=1)))
     for _ in range(MOST_PLANES):
         left = known & ~room
@@ -60,8 +62,9 @@ def room_pixels(points_m: FloatImage) -> Mask:
     if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):
         return np.zeros_like(room)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    whole: Mask = median_filter(room[tuple(nearest)], size=5)
-    return whole
+    filled = room[tuple(nearest)].astype(np.uint8)
+    # the median of 25
+    return np.asarray(cv2.boxFilter(filled, -1, (5, 5), normalize=False, borderType=cv2.BORDER_REFLECT) > 12)
 
 
 def _plane(
@@ -71,7 +74,8 @@ def _plane(
     row, column = np.nonzero(left)
     if not len(row):
         return None
-    some = points_m[left][rng.integers(0, len(row), POINTS)].astype(np.float64)
+    chosen = rng.integers(0, len(row), POINTS)
+    some = points_m[row[chosen], column[chosen]].astype(np.float64)
     best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / len(row) * POINTS
     apart = round(APART * left.shape[0])
     for start in rng.integers(0, len(row), TRIALS):

@@ -21,6 +21,8 @@ STEEPEST: Final = 10.0
 """Relative step of inverse depth over two pixels, in pixel widths: beyond it (79 degrees from head-on) both pixels may
 see two surfaces at once."""
 TERMS: Final = 6
+LANES: Final = 256
+"""Pixels of a row whose patches are fitted together."""
 
 
 def whole_pixels(inverse: FloatImage, focal_px: float) -> Mask:
@@ -55,40 +57,29 @@ def fit_patches(inverse: FloatImage, whole: Mask, radius: int) -> FloatImage:
     rows, columns = inverse.shape
     smooth = np.full((rows, columns), np.nan, dtype=np.float32)
     for row in numba.prange(rows):
-        matrix, right, terms = np.empty((TERMS, TERMS)), np.empty(TERMS), np.empty(TERMS)
-        for column in range(columns):
-            if inverse[row, column] > 0.0:
-                smooth[row, column] = _patch_at(inverse, whole, radius, row, column, matrix, right, terms)
+        for first in range(0, columns, LANES):
+            last = min(first + LANES, columns)
+            if np.any(inverse[row, first:last] > 0):
+                _patches_at(inverse, whole, radius, row, first, smooth[row, first:last])
     return smooth
 
 
 @compiled()
-def _patch_at(
-    inverse: FloatImage,
-    whole: Mask,
-    radius: int,
-    row: int,
-    column: int,
-    matrix: Float64,
-    right: Float64,
-    terms: Float64,
-) -> float:
-    """The patch's value at one pixel, or NaN; ``matrix``, ``right`` and ``terms`` are room to work in."""
-    here = inverse[row, column]
-    spread = -1.0
+def _patches_at(inverse: FloatImage, whole: Mask, radius: int, row: int, first: int, smooth: FloatImage) -> None:
+    """The patches' values at neighbouring pixels of a row, from column ``first``, into ``smooth`` (pixels,)."""
+    here = inverse[row, first : first + smooth.size]
+    patch, spread = np.zeros((TERMS, here.size)), np.full(here.size, np.inf)
+    count, good = np.zeros(here.size), here > 0
+    matrix, right = np.empty((TERMS, TERMS, here.size)), np.empty((TERMS, here.size))
     for _ in range(2):
-        count = _equations(inverse, whole, radius, row, column, spread, matrix, right, terms)
-        if count < 2 * TERMS or not _solve(matrix, right):
-            return np.nan
-        spread = _spread(inverse, whole, radius, row, column, right, terms)
-    if not right[0] > -here or abs(right[0]) > 5.0 * np.sqrt(spread) + 1e-6 * here:
-        return np.nan
-    return float(here + right[0])
-
-
-@compiled()
-def _describe(dx: float, dy: float, terms: Float64) -> None:
-    terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = 1.0, dx, dy, dx * dx, dx * dy, dy * dy
+        _equations(inverse, whole, radius, row, first, patch, spread, matrix, right)
+        _solve(matrix, right, good)
+        patch[:] = right
+        _spread(inverse, whole, radius, row, first, patch, spread, count)
+    for k in range(here.size):
+        value, limit = patch[0, k], 5.0 * np.sqrt(spread[k]) + 1e-6 * here[k]
+        if good[k] and count[k] >= 2 * TERMS and value > -here[k] and abs(value) <= limit:
+            smooth[k] = here[k] + value
 
 
 @compiled()
@@ -97,82 +88,125 @@ def _equations(
     whole: Mask,
     radius: int,
     row: int,
-    column: int,
-    spread: float,
+    first: int,
+    patch: Float64,
+    spread: Float64,
     matrix: Float64,
     right: Float64,
-    terms: Float64,
-) -> int:
-    """Normal equations of the patch; neighbours far from the patch in ``right`` count less, if ``spread`` is not < 0.
+) -> None:
+    """Normal equations of patches; neighbours far from the ``patch`` before count less, all alike if ``spread`` is inf.
 
-    Returns the number of neighbours; ``right`` holds the patch before, and the equations' right side after.
+    ``patch``, ``right`` (TERMS, pixels); ``spread`` (pixels,); ``matrix`` (TERMS, TERMS, pixels), whose lower half is
+    filled. The innermost loops run along a row, so that they use vectors.
     """
-    rows, columns = inverse.shape
-    here, old = inverse[row, column], right.copy()
+    off, value, weight = np.empty(spread.size), np.empty(spread.size), np.empty(spread.size)
     matrix[:], right[:] = 0.0, 0.0
-    count = 0
-    for i in range(max(0, row - radius), min(rows, row + radius + 1)):
-        for j in range(max(0, column - radius), min(columns, column + radius + 1)):
-            value = inverse[i, j] - here
-            if not whole[i, j] or not abs(value) < SAME_SURFACE * here:
-                continue
-            _describe((j - column) / radius, (i - row) / radius, terms)
-            weight = 1.0
-            if spread >= 0.0:
-                off = value
-                for k in range(TERMS):
-                    off -= old[k] * terms[k]
-                weight = 1.0 / (1.0 + off * off / (4.0 * spread + 1e-20))
-            count += 1
+    for i in range(max(0, row - radius), min(inverse.shape[0], row + radius + 1)):
+        for shift in range(-radius, radius + 1):
+            terms = _terms(shift / radius, (i - row) / radius)
+            _compare(inverse[row], inverse[i], whole[i], first, shift, value, weight)
+            off[:] = value
+            _leave(off, patch, terms)
+            for p in range(off.size):
+                weight[p] /= 1.0 + off[p] * off[p] / (4.0 * spread[p] + 1e-20)
+                value[p] *= weight[p]
+            _add(right, value, terms, 1.0)
             for k in range(TERMS):
-                scaled = weight * terms[k]
-                right[k] += scaled * value
-                for m in range(k + 1):
-                    matrix[k, m] += scaled * terms[m]
-    return count
+                _add(matrix[k], weight, terms[: k + 1], terms[k])
+
+
+@compiled()
+def _terms(dx: float, dy: float) -> Float64:
+    return np.array([1.0, dx, dy, dx * dx, dx * dy, dy * dy])
+
+
+@compiled()
+def _compare(
+    here: FloatImage, other: FloatImage, whole: Mask, first: int, shift: int, value: Float64, weight: Float64
+) -> None:
+    """What the neighbours beside a row's pixels differ by; 0 with no weight where they are not whole, lie on another
+    surface, or outside the picture."""
+    value[:], weight[:] = 0.0, 0.0
+    a, e = max(0, -first - shift), min(value.size, here.size - first - shift)
+    if a < e:
+        at, there = slice(first + a, first + e), slice(first + a + shift, first + e + shift)
+        _differ(here[at], other[there], whole[there], value[a:e], weight[a:e])
+
+
+@compiled()
+def _differ(here: FloatImage, other: FloatImage, whole: Mask, value: Float64, weight: Float64) -> None:
+    for p in range(value.size):
+        difference = other[p] - here[p]
+        use = whole[p] & (abs(difference) < SAME_SURFACE * here[p])
+        value[p], weight[p] = difference if use else 0.0, 1.0 if use else 0.0
+
+
+@compiled()
+def _add(totals: Float64, values: Float64, terms: Float64, factor: float) -> None:
+    """Add values (pixels,) times each term to its row of ``totals``."""
+    for k in range(terms.size):
+        if terms[k] != 0:
+            for p in range(values.size):
+                totals[k, p] += factor * terms[k] * values[p]
+
+
+@compiled()
+def _leave(off: Float64, patch: Float64, terms: Float64) -> None:
+    """Take the patches from values."""
+    for k in range(terms.size):
+        if terms[k] != 0:
+            for p in range(off.size):
+                off[p] -= patch[k, p] * terms[k]
 
 
 @compiled()
 def _spread(
-    inverse: FloatImage, whole: Mask, radius: int, row: int, column: int, patch: Float64, terms: Float64
-) -> float:
-    """Mean squared distance of the neighbours from a patch."""
-    rows, columns = inverse.shape
-    here = inverse[row, column]
-    squares, count = 0.0, 0
-    for i in range(max(0, row - radius), min(rows, row + radius + 1)):
-        for j in range(max(0, column - radius), min(columns, column + radius + 1)):
-            off = inverse[i, j] - here
-            if not whole[i, j] or not abs(off) < SAME_SURFACE * here:
-                continue
-            _describe((j - column) / radius, (i - row) / radius, terms)
-            for k in range(TERMS):
-                off -= patch[k] * terms[k]
-            squares += off * off
-            count += 1
-    return squares / max(count, 1)
+    inverse: FloatImage, whole: Mask, radius: int, row: int, first: int, patch: Float64, spread: Float64, count: Float64
+) -> None:
+    """Mean squared distance of the neighbours from patches, and how many they are; arrays as in ``_equations``."""
+    off, weight = np.empty(spread.size), np.empty(spread.size)
+    spread[:], count[:] = 0.0, 0.0
+    for i in range(max(0, row - radius), min(inverse.shape[0], row + radius + 1)):
+        for shift in range(-radius, radius + 1):
+            _compare(inverse[row], inverse[i], whole[i], first, shift, off, weight)
+            _leave(off, patch, _terms(shift / radius, (i - row) / radius))
+            for p in range(off.size):
+                spread[p] += weight[p] * off[p] * off[p]
+                count[p] += weight[p]
+    for k in range(spread.size):
+        spread[k] /= max(count[k], 1.0)
 
 
 @compiled()
-def _solve(matrix: Float64, right: Float64) -> bool:
-    """Solve in place by Cholesky from the lower half; False where the neighbours do not fix a patch."""
+def _solve(matrix: Float64, right: Float64, good: Mask) -> None:
+    """Solve in place by Cholesky from the lower halves; not ``good`` where the neighbours do not fix a patch."""
     for i in range(TERMS):
         for j in range(i + 1):
-            total = matrix[i, j]
             for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
+                _subtract(matrix[i, j], matrix[i, k], matrix[j, k])
             if i == j:
-                if not total > 1e-4:
-                    return False
-                matrix[i, i] = np.sqrt(total)
+                for p in range(good.size):
+                    good[p] &= matrix[i, i, p] > 1e-4
+                matrix[i, i] = np.sqrt(matrix[i, i])
             else:
-                matrix[i, j] = total / matrix[j, j]
+                _divide(matrix[i, j], matrix[j, j])
     for i in range(TERMS):
         for k in range(i):
-            right[i] -= matrix[i, k] * right[k]
-        right[i] /= matrix[i, i]
+            _subtract(right[i], matrix[i, k], right[k])
+        _divide(right[i], matrix[i, i])
     for i in range(TERMS - 1, -1, -1):
         for k in range(i + 1, TERMS):
-            right[i] -= matrix[k, i] * right[k]
-        right[i] /= matrix[i, i]
-    return True
+            _subtract(right[i], matrix[k, i], right[k])
+        _divide(right[i], matrix[i, i])
+
+
+@compiled()
+def _subtract(total: Float64, one: Float64, other: Float64) -> None:
+    for k in range(total.size):
+        total[k] -= one[k] * other[k]
+
+
+@compiled()
+def _divide(total: Float64, by: Float64) -> None:
+    for k in range(total.size):
+        total[k] /= by[k]

@@ -107,12 +107,12 @@ def _ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
     """(rows, columns, 2) float32 undistorted x, y at depth 1 of every camera pixel."""
     width, height = size
     focal, k1 = np.exp(camera[0]), camera[3]
-    x, y = (np.arange(width) - camera[1]) / focal, (np.arange(height) - camera[2]) / focal
-    distorted = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=2)
-    xy = distorted
+    distorted_x, distorted_y = (np.arange(width) - camera[1]) / focal, (np.arange(height)[:, None] - camera[2]) / focal
+    x, y = distorted_x, distorted_y
     for _ in range(8):
-        xy = distorted / (1.0 + k1 * np.sum(xy * xy, axis=2, keepdims=True))
-    return np.ascontiguousarray(xy, dtype=np.float32)
+        bent = 1.0 + k1 * (x * x + y * y)
+        x, y = distorted_x / bent, distorted_y / bent
+    return np.stack([x, y], axis=2, dtype=np.float32, casting="same_kind")
 
 
 def _pinhole(lens: Float64, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:

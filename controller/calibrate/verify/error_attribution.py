@@ -110,12 +110,11 @@ def attribute_error(
 def _without_lamp(seen: FloatImage, predicted: FloatImage, use: Mask) -> FloatImage:
     """The squared error, without what a lamp of another strength explains: such a lamp errs alike everywhere, light by
     way of other surfaces from place to place."""
-    within = use[:, :, None]
-    of_lamp = np.sum(np.where(within, seen * predicted, 0), axis=(0, 1), dtype=np.float64)
-    of_lamp /= np.maximum(np.sum(np.where(within, predicted * predicted, 0), axis=(0, 1), dtype=np.float64), 1e-30)
-    rest = np.where(within, seen - of_lamp.astype(np.float32) * predicted, 0)
-    squared: FloatImage = channels.total(rest * rest)
-    return squared
+    expected = np.where(use[:, :, None], predicted, np.float32(0))
+    of_lamp = channels.products(np.where(use[:, :, None], seen, np.float32(0)), expected)
+    of_lamp /= np.maximum(channels.products(expected, expected), 1e-30)
+    rest = seen - of_lamp.astype(np.float32) * predicted
+    return np.where(use, channels.total(rest * rest), np.float32(0))
 
 
 def _near(image: npt.NDArray[Any]) -> FloatImage:

@@ -68,20 +68,23 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
     use = mask & channels.every(np.isfinite(predicted) & np.isfinite(photographed) & np.isfinite(black))
     seen = np.where(use[:, :, None], photographed - black, 0).astype(np.float64)
     light_predicted = np.where(use[:, :, None], predicted - black, 0).astype(np.float64)
-    light = float(np.sum(seen**2))
+    per_pixel = channels.total(seen * seen)
+    light = float(per_pixel.sum())
     if not light > 0 or not np.any(light_predicted):
         raise CalibrationError(
             "verification-dark",
             what="The photograph of the random pattern shows no light where the calibration expects it.",
             remedy="Check that lamps and shutters are open and that the pattern was shown, and verify again.",
         )
-    gain = np.sum(seen * light_predicted, axis=(0, 1)) / np.maximum(np.sum(light_predicted**2, axis=(0, 1)), 1e-30)
-    relative = float(np.sqrt(np.sum((light_predicted - seen) ** 2) / light))
-    without = float(np.sqrt(np.sum((gain * light_predicted - seen) ** 2) / light))
+    both, own = channels.products(seen, light_predicted), channels.products(light_predicted, light_predicted)
+    gain = both / np.maximum(own, 1e-30)
+    off = light_predicted - seen
+    error = channels.total(np.multiply(off, off, out=off))
+    relative = float(np.sqrt(error.sum() / light))
+    without = float(np.sqrt(max(float(np.sum(gain * gain * own - 2 * gain * both)) + light, 0.0) / light))
     red, green, blue = (float(value) for value in gain)
-    return Verification(
-        relative, (red, green, blue), without, _error_map(light_predicted, seen, use), grade_of(relative)
-    )
+    error_map = _error_map(error, per_pixel, use)
+    return Verification(relative, (red, green, blue), without, error_map, grade_of(relative))
 
 
 def grade_of(relative_rms: float) -> Grade:
@@ -89,10 +92,9 @@ def grade_of(relative_rms: float) -> Grade:
     return next((grade for grade, limit in LIMITS if relative_rms <= limit), Grade.D)
 
 
-def _error_map(light_predicted: Float64, seen: Float64, use: Mask) -> FloatImage:
-    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
-    error = cv2.boxFilter(channels.total((light_predicted - seen) ** 2), -1, size)
-    light = cv2.boxFilter(channels.total(seen**2), -1, size)
-    floor = 1e-4 * float(np.sum(seen**2)) / max(int(np.count_nonzero(use)), 1)
-    ratio = np.sqrt(np.maximum(error, 0) / np.maximum(light, floor))
+def _error_map(error: Float64, light: Float64, use: Mask) -> FloatImage:
+    """From (rows, columns): squared error and squared light of each pixel."""
+    floor = 1e-4 * float(light.sum()) / max(int(np.count_nonzero(use)), 1)
+    near_error, near_light = (cv2.boxFilter(one, -1, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)) for one in (error, light))
+    ratio = np.sqrt(np.maximum(near_error, 0) / np.maximum(near_light, floor))
     return np.where(use, ratio, np.nan).astype(np.float32)

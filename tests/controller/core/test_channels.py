@@ -20,6 +20,8 @@ def test_they_are_numpys_for_any_shape(shape: tuple[int, ...], channel_count: in
     np.testing.assert_allclose(channels.mean(picture), picture.mean(axis=-1), rtol=1e-6)
     np.testing.assert_allclose(channels.total(picture), picture.sum(axis=-1), rtol=1e-6)
     np.testing.assert_allclose(channels.length(picture), np.linalg.norm(picture, axis=-1), rtol=1e-6)
+    products = (picture * (1 - picture)).reshape(-1, channel_count).sum(axis=0)
+    np.testing.assert_allclose(channels.products(picture, 1 - picture), products, rtol=1e-5)
     np.testing.assert_array_equal(channels.every(picture > 0.3), (picture > 0.3).all(axis=-1))
     np.testing.assert_array_equal(channels.some(picture > 0.3), (picture > 0.3).any(axis=-1))
 
