@@ -142,8 +142,9 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
         with rawpy.imread(str(path)) as raw:
             check_pixels(path, (raw.sizes.raw_width, raw.sizes.raw_height))
             mosaic = raw.raw_image_visible.copy()
-            colours = _colour_of_sites(raw, path)
-            black, white = _levels(raw)
+            sites = _sites(raw)
+            colours = _colour_of_sites(raw, sites, path)
+            black, white = _levels(raw, sites[:2, :2])
             camera_to_xyz = _camera_to_xyz(raw)
     except (rawpy.LibRawError, OSError) as error:
         raise _unreadable(path, error) from error
@@ -164,10 +165,20 @@ def _unreadable(path: Path, reason: object) -> WorkError:
     )
 
 
-def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
+def _sites(raw: Any) -> npt.NDArray[np.int64]:
+    """(4, 4) LibRaw's numbers of the colours at the visible area's first rows and columns; empty without a pattern.
+
+    One by one: LibRaw's table of all samples takes as long as reading the file.
+    """
+    if raw.raw_pattern is None:
+        return np.empty((0, 0), np.int64)
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    return np.array([[raw.raw_color(top + row, left + column) for column in range(4)] for row in range(4)], np.int64)
+
+
+def _colour_of_sites(raw: Any, sites: npt.NDArray[np.int64], path: Path) -> npt.NDArray[np.int64]:
     """(2, 2) of 0 red, 1 green, 2 blue at the visible area's first rows and columns."""
     letters = raw.color_desc.decode("ascii")
-    sites = raw.raw_colors_visible[:4, :4] if raw.raw_pattern is not None else np.empty((0, 0), int)
     regular = sites.shape == (4, 4) and np.array_equal(sites[:2, :2], sites[2:, 2:])
     names = "".join(sorted(letters[index] for index in sites[:2, :2].ravel())) if regular else ""
     if names != "BGGR":
@@ -179,9 +190,8 @@ def _colour_of_sites(raw: Any, path: Path) -> npt.NDArray[np.int64]:
     return np.array([["RGB".index(letters[index]) for index in row] for row in sites[:2, :2]], np.int64)
 
 
-def _levels(raw: Any) -> tuple[Float64, Float64]:
-    """(2, 2) black and white level at each site of the colour pattern."""
-    sites = raw.raw_colors_visible[:2, :2]
+def _levels(raw: Any, sites: npt.NDArray[np.int64]) -> tuple[Float64, Float64]:
+    """(2, 2) black and white level at each of the ``sites`` (2, 2) of the colour pattern."""
     black = np.asarray(raw.black_level_per_channel, np.float64)[sites]
     per_channel = raw.camera_white_level_per_channel
     known = per_channel is not None and min(np.asarray(per_channel)[sites].ravel()) > 0

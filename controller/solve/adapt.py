@@ -188,9 +188,11 @@ def _shoulder(value: FloatImage) -> FloatImage:
 
 def _soft_maximum(value: FloatImage, level: FloatImage) -> FloatImage:
     """At least the larger of both; ``value`` itself where ``level`` is 0."""
-    value = np.maximum(value, 0)
-    # A root of a power is not the number itself, by a bit or two that differ from processor to processor.
-    return np.where(level > 0, (value**POWER + level**POWER) ** np.float32(1 / POWER), value)
+    found = np.asarray(np.maximum(value, 0), np.float32)
+    # elsewhere a root of a power is not the number itself, by a bit or two that differ from processor to processor
+    raised = level > 0
+    found[raised] = (found[raised] ** POWER + level[raised] ** POWER) ** np.float32(1 / POWER)
+    return found
 
 
 def _quotient(above: FloatImage, below: FloatImage, *, otherwise: float, where: Mask | None = None) -> FloatImage:

@@ -149,14 +149,13 @@ def colour_sizes(apart: ColoursApart, position_px: FloatImage) -> ColourSizes:
 
 def _slopes(place_px: Float64, apart_px: Float64, axis: int) -> Float64:
     """(PARTS,): change of ``apart_px`` (some,) along an axis of the projector's image, of every so many-th pixel."""
-    from_middle = place_px - place_px.mean(axis=0)
-    equations = np.column_stack([np.ones(len(from_middle)), from_middle])
-    used = np.ones(len(equations), np.bool_)
+    equations = np.stack([np.ones(len(place_px)), *(place_px - place_px.mean(axis=0)).T])
+    used = np.ones(len(place_px))
     for _ in range(ROUNDS):
-        plane = np.linalg.lstsq(equations[used], apart_px[used], rcond=None)[0]
-        off = np.abs(apart_px - equations @ plane)
-        used = off <= OUTLIER * 1.4826 * np.median(off) + 1e-9
-    kept, seen = equations[used], apart_px[used]
+        plane = np.linalg.solve((equations * used) @ equations.T, equations @ (used * apart_px))
+        off = np.abs(apart_px - plane @ equations)
+        used = (off <= OUTLIER * 1.4826 * np.median(off) + 1e-9).astype(np.float64)
+    kept, seen = equations[:, used > 0].T, apart_px[used > 0]
     parts = [np.linalg.lstsq(kept[n::PARTS], seen[n::PARTS], rcond=None)[0][1 + axis] for n in range(PARTS)]
     return np.array(parts)
 

@@ -57,8 +57,9 @@ class _Completed(Mapping[str, FloatImage]):
         shown = self._opposite.get(name)
         if shown is None:
             return self._steady(name) if name in self._prefix else self._captures[name]
-        black, white = self._captures["black"], self._captures["white"]
-        return np.asarray(white + black - self._steady(shown), np.float32)
+        image = self._captures["white"] + self._captures["black"]
+        image -= self._steady(shown)
+        return np.asarray(image, np.float32)
 
     def __iter__(self) -> Iterator[str]:
         yield from self._captures
@@ -76,7 +77,9 @@ class _Completed(Mapping[str, FloatImage]):
             shown = [pattern for pattern in self._plan.sinusoids(prefix) if not pattern.opposite]
             self._gains.update(self._strengths(shown))
         black = self._captures["black"]
-        image = np.asarray(black + (self._captures[name] - black) / np.float32(self._gains[name]), np.float32)
+        image = np.asarray(self._captures[name] - black, np.float32)
+        image /= np.float32(self._gains[name])
+        image += black
         self._latest = name, image
         return image
 
@@ -104,12 +107,12 @@ def _middle(contrast: Float64) -> Float64:
     if len(contrast) == 1:
         return np.asarray(np.clip(contrast.mean(axis=1), -MOST_FLICKER, MOST_FLICKER), np.float64)
     square = (contrast**2).sum(axis=0)
-    equations = np.stack([2 * contrast[0], 2 * contrast[1], np.ones_like(square)], axis=1)
+    equations = np.stack([2 * contrast[0], 2 * contrast[1], np.ones_like(square)])
     found = np.array([0.0, 0.0, float(np.median(square))])
     for _ in range(ROUNDS):
-        off = np.abs(square - equations @ found)
+        off = np.abs(square - found @ equations)
         # at the frame's border, and where two surfaces are seen, contrasts are off by far
         weight = np.clip(1 - (off / (OUTLIER * np.median(off) + 1e-9)) ** 2, 0, None)
-        normal = equations.T @ (weight[:, None] * equations)
-        found = np.linalg.lstsq(normal, equations.T @ (weight * square), rcond=None)[0]
+        normal = (weight * equations) @ equations.T
+        found = np.linalg.lstsq(normal, equations @ (weight * square), rcond=None)[0]
     return np.asarray(np.clip(found[:2], -MOST_FLICKER, MOST_FLICKER), np.float64)

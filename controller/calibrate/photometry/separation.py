@@ -228,12 +228,20 @@ def _light_around(image: FloatImage) -> FloatImage:
 
 def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[FloatImage, FloatImage]:
     """Cosine and sine part of a sinusoid's steps."""
-    along: FloatImage | float = 0.0
-    across: FloatImage | float = 0.0
+    found: list[FloatImage] = []
     for image, step in zip(images, steps, strict=True):
-        along = along + np.float32(2 / len(steps) * np.cos(step.phase_rad)) * image
-        across = across - np.float32(2 / len(steps) * np.sin(step.phase_rad)) * image
-    return np.asarray(along, np.float32), np.asarray(across, np.float32)
+        found = found or [np.zeros(image.shape, np.float32) for _ in range(2)]
+        by = np.float32(2 / len(steps) * np.cos(step.phase_rad)), np.float32(-2 / len(steps) * np.sin(step.phase_rad))
+        _add_wave(image.reshape(-1), *by, *(part.reshape(-1) for part in found))
+    along, across = found
+    return along, across
+
+
+@compiled(parallel=True)
+def _add_wave(image: FloatImage, cosine: np.float32, sine: np.float32, along: FloatImage, across: FloatImage) -> None:
+    for k in numba.prange(image.size):
+        along[k] += cosine * image[k]
+        across[k] += sine * image[k]
 
 
 def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
@@ -251,8 +259,8 @@ def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
 
 
 def _bright(white: FloatImage) -> FloatImage:
-    known = white[channels.finite(white)]
-    some = known[:: max(1, len(known) // SOME_PIXELS)] if len(known) else np.zeros((1, 3), np.float32)
+    at = np.flatnonzero(channels.finite(white))
+    some = white.reshape(-1, 3)[at[:: max(1, at.size // SOME_PIXELS)]] if at.size else np.zeros((1, 3), np.float32)
     return np.asarray(np.percentile(some, 99, axis=0), np.float32)
 
 

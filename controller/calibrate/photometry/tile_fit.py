@@ -236,6 +236,7 @@ def _solve(
     They are 0 at black, and 1 at white if ``white_known``.
     """
     bases = [_basis(power) for power in gamma]
+    at_levels = [basis[tiles.levels[:, primary]] for primary, basis in enumerate(bases)]
     last = KNOTS - 1 if white_known else KNOTS
     fixed = np.zeros(KNOTS)
     fixed[-1] = float(white_known)
@@ -246,12 +247,11 @@ def _solve(
         root = np.sqrt(weight[:, channel])
         direct = (tiles.ratio[:, channel] - fit.stray[channel] * around[channel]) / (1 - fit.stray[channel])
         parts = []
-        for primary, basis in enumerate(bases):
+        for primary, rows in enumerate(at_levels):
             share = (1 - fit.segment) * fit.mixing[channel, primary] + fit.segment * (least == primary)
-            rows = basis[tiles.levels[:, primary]] * share[:, None]
-            direct = direct - rows @ fixed
-            parts.append(rows[:, 1:last])
-        equations.append(np.concatenate(parts, axis=1) * root[:, None])
+            direct = direct - share * rows[:, -1] * fixed[-1]
+            parts.append(rows[:, 1:last] * (share * root)[:, None])
+        equations.append(np.concatenate(parts, axis=1))
         values.append(direct * root)
     # where no tile shows a level, the curve is as straight as it can be over that power
     bend = np.diff(np.eye(KNOTS), 2, axis=0) * np.sqrt(STIFFNESS * weight.sum())
