@@ -5,6 +5,8 @@ The inverse depth of a plane is affine in the undistorted image coordinates, so 
 
 from __future__ import annotations
 
+from typing import Final, TypeAlias
+
 import numba
 import numpy as np
 
@@ -12,6 +14,8 @@ from controller.calibrate.geometry.normal_equations import straightening
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 
+LANES: Final = 256
+"""Pixels of a row whose planes are fitted together."""
 _SHARPEST = 0.02  # relative depth step between neighbours beyond which they lie on different surfaces
 
 
@@ -124,90 +128,180 @@ def fit_planes(inverse: FloatImage, rays: FloatImage, radius: int) -> tuple[Floa
     rows, columns = inverse.shape
     smooth = np.full((rows, columns), np.nan, dtype=np.float32)
     normals = np.full((rows, columns, 3), np.nan, dtype=np.float32)
-    fewest = max(6, (2 * radius + 1) ** 2 // 3)
+    across, down = rays[:, :, 0].copy(), rays[:, :, 1].copy()
     for row in numba.prange(rows):
-        for column in range(columns):
-            here = inverse[row, column]
-            if not here > 0.0:
-                continue
-            a, b, c, count = _plane(inverse, rays, row, column, radius, (0.0, 0.0, float(here)), np.inf)
-            if count < fewest:
-                continue
-            spread = _spread(inverse, rays, row, column, radius, (a, b, c))
-            for _ in range(2):
-                a, b, c, count = _plane(inverse, rays, row, column, radius, (a, b, c), spread)
-            if count < fewest or not c > 0.0 or (here - c) ** 2 > 25.0 * spread + 1e-16:
-                continue
-            # a X + b Y + cz Z = 1 is the plane; its gradient points away from the camera
-            cz = c - a * rays[row, column, 0] - b * rays[row, column, 1]
-            length = np.sqrt(a * a + b * b + cz * cz)
-            smooth[row, column] = c
-            normals[row, column, 0] = -a / length
-            normals[row, column, 1] = -b / length
-            normals[row, column, 2] = -cz / length
+        for first in range(0, columns, LANES):
+            last = min(first + LANES, columns)
+            if np.any(inverse[row, first:last] > 0.0):
+                _planes_at(
+                    (inverse, across, down), radius, row, first, smooth[row, first:last], normals[row, first:last]
+                )
     return smooth, normals
 
 
+Surface: TypeAlias = tuple[FloatImage, FloatImage, FloatImage]
+"""Inverse depth, and x and y at depth 1; all (rows, columns)."""
+
+
 @compiled()
-def _plane(
-    inverse: FloatImage,
-    rays: FloatImage,
+def _planes_at(surface: Surface, radius: int, row: int, first: int, smooth: FloatImage, normals: FloatImage) -> None:
+    """The planes of neighbouring pixels of a row, from column ``first``: (pixels,) and (pixels, 3)."""
+    here, fewest = surface[0][row, first : first + smooth.size], max(6, (2 * radius + 1) ** 2 // 3)
+    plane, spread, count = np.zeros((3, here.size)), np.full(here.size, np.inf), np.zeros(here.size)
+    plane[2] = here
+    _refit(surface, radius, row, first, plane, spread, count)
+    good = count >= fewest
+    _spread(surface, radius, row, first, plane, spread)
+    for _ in range(2):
+        _refit(surface, radius, row, first, plane, spread, count)
+    for k in range(here.size):
+        a, b, c = plane[0, k], plane[1, k], plane[2, k]
+        if not (good[k] and count[k] >= fewest and c > 0.0) or (here[k] - c) ** 2 > 25.0 * spread[k] + 1e-16:
+            continue
+        # a X + b Y + cz Z = 1 is the plane; its gradient points away from the camera
+        cz = c - a * surface[1][row, first + k] - b * surface[2][row, first + k]
+        length = np.sqrt(a * a + b * b + cz * cz)
+        smooth[k] = c
+        normals[k, 0], normals[k, 1], normals[k, 2] = -a / length, -b / length, -cz / length
+
+
+@compiled()
+def _refit(
+    surface: Surface, radius: int, row: int, first: int, plane: Float64, spread: Float64, count: Float64
+) -> None:
+    """Refit inverse depth = a x + b y + c about pixels, weighted by the distance to ``plane`` (3, pixels), in place.
+
+    ``count`` (pixels,): how many neighbours; 0 where they fix no plane. The innermost loops run along a row, so that
+    they use vectors.
+    """
+    n = spread.size
+    x, y, value, weight = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    sums = np.zeros((9, n))
+    count[:] = 0.0
+    for i in range(max(0, row - radius), min(surface[0].shape[0], row + radius + 1)):
+        for shift in range(-radius, radius + 1):
+            _compare(surface, row, i, first, shift, x, y, value, weight)
+            _accumulate(
+                x, y, value, weight, plane[0], plane[1], plane[2], spread, sums[0], sums[1], sums[2], sums[3], sums[4],
+                sums[5], sums[6], sums[7], sums[8], count,
+            )  # fmt: skip
+    for k in range(n):
+        sxx, sxy, syy, sx, sy = sums[0, k], sums[1, k], sums[2, k], sums[3, k], sums[4, k]
+        s, tx, ty, t = sums[5, k], sums[6, k], sums[7, k], sums[8, k]
+        pxx, pxy, pyy = sxx - sx * sx / s, sxy - sx * sy / s, syy - sy * sy / s
+        qx, qy = tx - sx * t / s, ty - sy * t / s
+        determinant = pxx * pyy - pxy * pxy
+        if count[k] < 3 or not determinant > 1e-6 * pxx * pyy:
+            count[k] = plane[0, k] = plane[1, k] = plane[2, k] = 0.0
+            continue
+        a, b = (qx * pyy - qy * pxy) / determinant, (qy * pxx - qx * pxy) / determinant
+        plane[0, k], plane[1, k], plane[2, k] = a, b, (t - a * sx - b * sy) / s
+
+
+@compiled()
+def _accumulate(
+    x: Float64,
+    y: Float64,
+    value: Float64,
+    weight: Float64,
+    a: Float64,
+    b: Float64,
+    c: Float64,
+    spread: Float64,
+    sxx: Float64,
+    sxy: Float64,
+    syy: Float64,
+    sx: Float64,
+    sy: Float64,
+    s: Float64,
+    tx: Float64,
+    ty: Float64,
+    t: Float64,
+    count: Float64,
+) -> None:
+    """Add one neighbour of each pixel to the sums; all (pixels,)."""
+    for k in range(x.size):
+        off = value[k] - (a[k] * x[k] + b[k] * y[k] + c[k])
+        w = weight[k] / (1.0 + off * off / (4.0 * spread[k] + 1e-20))
+        wx, wy = w * x[k], w * y[k]
+        sxx[k] += wx * x[k]
+        sxy[k] += wx * y[k]
+        syy[k] += wy * y[k]
+        sx[k] += wx
+        sy[k] += wy
+        s[k] += w
+        tx[k] += wx * value[k]
+        ty[k] += wy * value[k]
+        t[k] += w * value[k]
+        count[k] += weight[k]
+
+
+@compiled()
+def _compare(
+    surface: Surface,
     row: int,
-    column: int,
-    radius: int,
-    plane: tuple[float, float, float],
-    spread: float,
-) -> tuple[float, float, float, int]:
-    """Refit inverse depth = a x + b y + c about the pixel, weighted by the distance to ``plane``; 0 where it can't."""
-    rows, columns = inverse.shape
-    a, b, c = plane
-    x0, y0, here = rays[row, column, 0], rays[row, column, 1], inverse[row, column]
-    sxx, sxy, syy, sx, sy, s, tx, ty, t = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    count = 0
-    for i in range(max(0, row - radius), min(rows, row + radius + 1)):
-        for j in range(max(0, column - radius), min(columns, column + radius + 1)):
-            value = inverse[i, j]
-            if not abs(value - here) < _SHARPEST * here:
-                continue
-            x, y = rays[i, j, 0] - x0, rays[i, j, 1] - y0
-            off = value - (a * x + b * y + c)
-            weight = 1.0 / (1.0 + off * off / (4.0 * spread + 1e-20))
-            sxx += weight * x * x
-            sxy += weight * x * y
-            syy += weight * y * y
-            sx += weight * x
-            sy += weight * y
-            s += weight
-            tx += weight * x * value
-            ty += weight * y * value
-            t += weight * value
-            count += 1
-    if count < 3:
-        return 0.0, 0.0, 0.0, 0
-    pxx, pxy, pyy = sxx - sx * sx / s, sxy - sx * sy / s, syy - sy * sy / s
-    qx, qy = tx - sx * t / s, ty - sy * t / s
-    determinant = pxx * pyy - pxy * pxy
-    if not determinant > 1e-6 * pxx * pyy:
-        return 0.0, 0.0, 0.0, 0
-    a, b = (qx * pyy - qy * pxy) / determinant, (qy * pxx - qx * pxy) / determinant
-    return a, b, (t - a * sx - b * sy) / s, count
+    other: int,
+    first: int,
+    shift: int,
+    x: Float64,
+    y: Float64,
+    value: Float64,
+    weight: Float64,
+) -> None:
+    """Where neighbours of pixels of a row lie, and their inverse depth; 0 with no weight for those that do not count.
+
+    A neighbour is ``shift`` columns beside in the row ``other``; it counts inside the picture, on the same surface.
+    """
+    x[:], y[:], value[:], weight[:] = 0.0, 0.0, 0.0, 0.0
+    inverse, across, down = surface
+    a, e = max(0, -first - shift), min(x.size, inverse.shape[1] - first - shift)
+    if a < e:
+        at, there = slice(first + a, first + e), slice(first + a + shift, first + e + shift)
+        _differ(across[row, at], across[other, there], x[a:e])
+        _differ(down[row, at], down[other, there], y[a:e])
+        _on_surface(inverse[row, at], inverse[other, there], value[a:e], weight[a:e])
 
 
 @compiled()
-def _spread(
-    inverse: FloatImage, rays: FloatImage, row: int, column: int, radius: int, plane: tuple[float, float, float]
-) -> float:
-    """Mean squared distance of a neighbourhood from a plane."""
-    rows, columns = inverse.shape
-    a, b, c = plane
-    here = inverse[row, column]
-    squares, count = 0.0, 0
-    for i in range(max(0, row - radius), min(rows, row + radius + 1)):
-        for j in range(max(0, column - radius), min(columns, column + radius + 1)):
-            value = inverse[i, j]
-            if not abs(value - here) < _SHARPEST * here:
-                continue
-            x, y = rays[i, j, 0] - rays[row, column, 0], rays[i, j, 1] - rays[row, column, 1]
-            squares += (value - a * x - b * y - c) ** 2
-            count += 1
-    return squares / max(count, 1)
+def _differ(here: FloatImage, other: FloatImage, found: Float64) -> None:
+    for k in range(found.size):
+        found[k] = other[k] - here[k]
+
+
+@compiled()
+def _on_surface(here: FloatImage, other: FloatImage, value: Float64, weight: Float64) -> None:
+    for k in range(value.size):
+        use = abs(other[k] - here[k]) < _SHARPEST * here[k]
+        value[k], weight[k] = other[k] if use else 0.0, 1.0 if use else 0.0
+
+
+@compiled()
+def _spread(surface: Surface, radius: int, row: int, first: int, plane: Float64, spread: Float64) -> None:
+    """Mean squared distance of neighbourhoods from planes; arrays as in ``_refit``."""
+    n = spread.size
+    x, y, value, weight, count = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    spread[:] = 0.0
+    for i in range(max(0, row - radius), min(surface[0].shape[0], row + radius + 1)):
+        for shift in range(-radius, radius + 1):
+            _compare(surface, row, i, first, shift, x, y, value, weight)
+            _add_squares(x, y, value, weight, plane[0], plane[1], plane[2], spread, count)
+    for k in range(n):
+        spread[k] /= max(count[k], 1.0)
+
+
+@compiled()
+def _add_squares(
+    x: Float64,
+    y: Float64,
+    value: Float64,
+    weight: Float64,
+    a: Float64,
+    b: Float64,
+    c: Float64,
+    squares: Float64,
+    count: Float64,
+) -> None:
+    for k in range(x.size):
+        off = value[k] - a[k] * x[k] - b[k] * y[k] - c[k]
+        squares[k] += weight[k] * off * off
+        count[k] += weight[k]
