@@ -32,6 +32,7 @@ from controller.rig.rig import Rig, RigProjector
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Context
+from controller.run.step_id import StepId
 from controller.steps.calibrate.full import calibration_steps
 from controller.steps.capture.light import photograph_light
 from controller.steps.capture.photographs import Planned, take_all
@@ -227,3 +228,15 @@ def test_a_projector_is_measured_from_few_photographs(
     assert np.abs(light.response - SCENE.response()).max() < 0.01
     assert abs(float(np.median(indirect.share[pixels.seen]))) < 0.015
     assert photographs_sentence(run, [NAME]) == f"left {number} ({photographs})"
+
+
+def test_a_code_waits_for_no_response_but_its_own(tmp_path: Path, journal: Journal) -> None:
+    rig = stage_of(tmp_path, SCENE, journal).rig
+    other = replace(rig.projectors[0], name="right")
+    both = replace(rig, projectors=(*rig.projectors, other))
+    steps = {step.id: step for step in calibration_steps(both, cast("CameraPrior", None), longest_exposure_s=4.0)}
+    for name in (NAME, "right"):
+        own = StepId(StepKind.RADIOMETRY, name)
+        after = steps[StepId(StepKind.CODES, name)].after
+        assert [step for step in after if step.kind == StepKind.RADIOMETRY] == [own]
+        assert steps[own].calculates
