@@ -105,7 +105,10 @@ def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
     count = 0
 
     def look(white: bool, delay_s: float, *, before_s: float) -> FloatImage:
-        """Each picture follows the other one, which has been shown long enough to be visible."""
+        """Each picture follows the other one, which has been shown long enough to be visible.
+
+        The time in which that one was photographed counts, so that a slow camera needs no more.
+        """
         nonlocal count
         context.advance(min(count / 10, 0.9), "display and camera")
         if before_s and (not shown or shown[-1][0] == white):
@@ -113,8 +116,12 @@ def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
         if before_s:
             context.deadline.sleep(max(0.0, shown[-1][1] + before_s - time.monotonic()))
         shot = Shot(f"delay-{count}", flats[white], exposure_s)
-        file, _ = rig.acquirer.take(shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=delay_s)
-        shown.append((white, time.monotonic()))
+        presented = rig.acquirer.present_for(shot, deadline=context.deadline)
+        shown.append((white, presented.at_s))
+        file, _ = rig.acquirer.photograph(
+            shot.name, exposure_s, context.folder / CAPTURES, shown_at_s=presented.at_s, deadline=context.deadline,
+            wait_s=delay_s,
+        )  # fmt: skip
         count += 1
         image = _provisional(file.path)
         file.path.unlink()
