@@ -61,6 +61,8 @@ class IndirectLight:
     def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """G d: (rows, columns, 3) light of a direct camera image of that shape, as L says, that is not in it.
 
+        Light that L says falls beside lit pixels is not thrown back.
+
         ``beside`` like ``direct``: light on surfaces of the room, which the transport does not know
         """
         if self.paint is None and self.surface is None:
@@ -97,7 +99,9 @@ class IndirectLight:
 
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
-        blocks = self.factors @ down(direct, self.grid, self.side)
+        # beside lit pixels the transport knows some of the light; ``beside`` has all of it
+        known = np.where(self.lit[..., None], direct, np.float32(0))
+        blocks = self.factors @ down(known, self.grid, self.side)
         if beside is not None:
             blocks = blocks + (self.factors if self.room is None else self.room) @ down(beside, self.grid, self.side)
         return up(blocks, self.grid, self.side, self.lit.shape)
@@ -105,7 +109,7 @@ class IndirectLight:
     def adjoint(self, image: FloatImage) -> FloatImage:
         """G' r of a camera image (rows, columns, 3)."""
         blocks = self.factors.T @ up_adjoint(self.scale * image, self.grid, self.side)
-        found = down_adjoint(blocks, self.grid, self.side, self.lit.shape)
+        found = np.where(self.lit[..., None], down_adjoint(blocks, self.grid, self.side, self.lit.shape), np.float32(0))
         if self.surface is not None:
             found = found + self.surface.adjoint(found + image)
         return found if self.paint is None else found + _times(self.paint.swapaxes(0, 1), found + image)

@@ -1,8 +1,13 @@
-"""G from what was measured: form factors of the reconstructed surface, and the indirect part of each white image."""
+"""G from what was measured: form factors of the reconstructed surface, and the indirect part of each white image.
+
+Surfaces give each other all light that leaves them, and so that by way of others, too. How much each gives is found
+for all light of whites and stripes; G, which begins with direct light, adds up all ways (docs/decisions/0114).
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -18,6 +23,8 @@ from controller.transport.indirect_shape import shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
 from controller.transport.indirect_weights import BlockLight, Part, Term, block_light, fit_weights
 from controller.transport.surfaces.blocks import down, up
+from controller.transport.surfaces.bounces import Both, by_all_ways, thrown_back, with_bounces
+from controller.transport.surfaces.falling_colours import falling_colours
 from controller.transport.surfaces.paint_colours import paint_colours
 from controller.transport.surfaces.surface_light import SurfaceLight
 
@@ -43,32 +50,86 @@ def fit_indirect(
     paint, surface = paint_colours(calibration, lit), _surface(calibration, lit)
     if len(indirect) < len(calibration.projectors) or not indirect:
         return None if paint is None and surface is None else replace(_nothing(lit), paint=paint, surface=surface)
-    shape = calibration.black.shape
-    grid, side = blocks_of(shape)
+    grid, side = blocks_of(calibration.black.shape)
     kinds = [_even(grid), *(_near(grid, deviation) for deviation in NEAR_BLOCKS)]
     if points_m is not None and normals is not None:
         kinds.append(form_factors(points_m, normals, grid, side))
     whole = np.sum(indirect, axis=0)
-    whites = [
-        block_light(part.white, down(image, grid, side), whole, lit, grid, side)
-        for part, image in zip(calibration.projectors, indirect, strict=True)
+    view = _View(lit, grid, side, whole, tuple(calibration.projectors))
+    own, room = _factors(kinds, view)
+    directly = np.sum([part.white for part in calibration.projectors], axis=0)
+    scale = view.scale((own, room), block_light(directly, view.down(whole), whole, lit, grid, side))
+    return IndirectLight(own, scale, lit, grid, side, room, paint, surface)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """What the camera sees of all whites that is ``whole`` (rows, columns, 3), their indirect light, by blocks."""
+
+    lit: Mask
+    grid: tuple[int, int]
+    side: int
+    whole: FloatImage
+    projectors: tuple[ProjectorCalibration, ...]
+
+    def down(self, image: FloatImage) -> FloatImage:
+        """(blocks, 3) of an image (rows, columns, 3)."""
+        return down(image, self.grid, self.side)
+
+    def whites(self) -> list[BlockLight]:
+        """All light of each projector's white, which is measured."""
+        return [
+            block_light(p.white + p.indirect, self.down(p.indirect), self.whole, self.lit, self.grid, self.side)
+            for p in self.projectors
+            if p.indirect is not None
+        ]
+
+    def scale(self, factors: Both, white: BlockLight) -> FloatImage:
+        """S (rows, columns, 3), which makes all whites' indirect light of the light of ``white`` what it is."""
+        arriving = np.asarray(factors[0] @ white.own + factors[1] @ white.room, np.float32)
+        falling = up(arriving, self.grid, self.side, self.lit.shape)
+        faint = FAINTEST * falling.max(initial=0)
+        scale = np.divide(self.whole, falling, out=np.zeros_like(self.whole), where=falling > faint)
+        return np.asarray(scale, np.float32)
+
+
+def _factors(kinds: Sequence[FloatImage], view: _View) -> Both:
+    """(blocks, blocks) of object and room, from direct light: of all ``kinds``, of which the last tells most."""
+    whites = view.whites()
+    every = _sum(whites)
+    first = (kinds[-1], kinds[-1])
+    back = thrown_back(view.scale(first, every), view.lit, view.grid, view.side)
+    stripes = [
+        _with_indirect(one, first, back)
+        for part in view.projectors
+        for one in _striped(part, view.whole, view.lit, view.grid, view.side)
     ]
-    stripes = [one for part in calibration.projectors for one in _striped(part, whole, lit, grid, side)]
     # Only stripes tell the light of the object from that of table and walls.
     parts: tuple[Part, ...] = ("object", "room") if stripes else ("all",)
     terms = [Term(kind, part) for kind in kinds for part in parts]
-    weights = fit_weights(terms, whites, stripes, grid, side, shape)
+    shape = view.whole.shape
+    weights = fit_weights(terms, whites, stripes, view.grid, view.side, shape)
     own, room = (
         np.sum([w * t.matrix for w, t in zip(weights, terms, strict=True) if t.part in (part, "all")], axis=0)
         for part in ("object", "room")
     )
     if stripes:
-        own, room = shaped(own, room, (*whites, *stripes), len(whites), grid, side, shape)
-    arriving = np.sum([own @ one.own + room @ one.room for one in whites], axis=0)
-    falling = up(np.asarray(arriving, np.float32), grid, side, shape)
-    faint = FAINTEST * falling.max(initial=0)
-    scale = np.divide(whole, falling, out=np.zeros_like(whole), where=falling > faint)
-    return IndirectLight(own, scale.astype(np.float32), lit, grid, side, room, paint, surface)
+        colours = falling_colours([p.white for p in view.projectors], view.whole, view.lit, view.grid, view.side)
+        own, room = shaped(own, room, (*whites, *stripes), len(whites), view.grid, view.side, shape, colours)
+    found = (own, room)
+    return by_all_ways(found, thrown_back(view.scale(found, every), view.lit, view.grid, view.side))
+
+
+def _sum(whites: Sequence[BlockLight]) -> BlockLight:
+    """All projectors together."""
+    own, room, seen = (np.sum([getattr(one, name) for one in whites], axis=0) for name in ("own", "room", "seen"))
+    return replace(whites[0], own=own, room=room, seen=seen)
+
+
+def _with_indirect(one: BlockLight, factors: Both, back: Both) -> BlockLight:
+    """With what surfaces throw back of the direct light of a picture, as far as is known yet."""
+    own, room = with_bounces((one.own, one.room), factors, back)
+    return replace(one, own=own, room=room)
 
 
 def _nothing(lit: Mask) -> IndirectLight:

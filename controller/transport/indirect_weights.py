@@ -18,8 +18,9 @@ LEAST_DARK: Final = 0.3
 FAINTEST: Final = 1e-3
 ROUNDS: Final = 12
 HEAVY: Final = 1e3
-TOGETHER: Final = 0.5
-"""How strongly a way's factor for the object's light is held to that for the room's: so much of what all pictures say.
+TOGETHER: Final = 0.6
+"""How strongly a way's factor for the object's light is held to that for the room's, which by shape alone is the same:
+so much of what all pictures say.
 Without it, what the shape does not explain is put on one of them."""
 
 
@@ -35,7 +36,7 @@ class Term:
 class BlockLight:
     """A picture of one projector, by blocks: what it lights, and the indirect light that is seen.
 
-    ``own``, ``room`` (blocks, 3): direct light on the object, and on what is none of it
+    ``own``, ``room`` (blocks, 3): light that leaves the object, and what is none of it
     ``seen``, ``whole`` (blocks, 3): indirect light of the picture, and of all whites together, on the same pixels
     ``covered`` (blocks,): the share of the block that these are
     """
@@ -47,20 +48,20 @@ class BlockLight:
     covered: FloatImage
 
     def source(self, part: Part) -> FloatImage:
-        """The direct light of a part of the picture."""
+        """The light of a part of the picture."""
         return self.own + self.room if part == "all" else self.own if part == "object" else self.room
 
 
 def block_light(
-    direct: FloatImage, seen: FloatImage, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int,
+    light: FloatImage, seen: FloatImage, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int,
     dark: Mask | None = None,
 ) -> BlockLight:  # fmt: skip
-    """A picture from its ``direct`` light and that of all whites that is indirect, (rows, columns, 3).
+    """A picture from the ``light`` that leaves surfaces and that of all whites that is indirect, (rows, columns, 3).
 
     ``lit`` (rows, columns): on the object; ``dark``: the pixels that ``seen`` (blocks, 3) is the sum of, None: all
     """
-    own = down(np.where(lit[..., None], direct, np.float32(0)), grid, side)
-    room = down(direct, grid, side) - own
+    own = down(np.where(lit[..., None], light, np.float32(0)), grid, side)
+    room = down(light, grid, side) - own
     if dark is None:
         every = down(np.ones((*lit.shape, 1), np.float32), grid, side)[:, 0]
         return BlockLight(own, room, seen, down(whole, grid, side), every)
@@ -82,7 +83,7 @@ def fit_weights(
 
     pictures = (*whites, *stripes)
     total = whites[0].whole
-    light = total + np.sum([one.source("all") for one in whites], axis=0)
+    light = np.sum([one.source("all") for one in whites], axis=0)
     falling = _falling(terms, pictures, down_up(grid, side, shape))
     means = falling[: len(whites)].sum(axis=0).mean(axis=(1, 2))
     alike = np.divide(1, means, out=np.zeros_like(means), where=means > 0)
@@ -111,7 +112,7 @@ def fit_weights(
 def _falling(
     terms: Sequence[Term], pictures: Sequence[BlockLight], across: Callable[[FloatImage], FloatImage]
 ) -> FloatImage:
-    """(pictures, terms, blocks, 3): what each term makes of each picture's direct light."""
+    """(pictures, terms, blocks, 3): what each term makes of each picture's light."""
     found = []
     for term in terms:
         arriving = term.matrix @ np.concatenate([one.source(term.part) for one in pictures], axis=1)

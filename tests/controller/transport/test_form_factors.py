@@ -67,12 +67,44 @@ def test_patches_give_what_all_pixels_give(bands: tuple[tuple[int, Plane], ...])
 
 def test_what_has_no_shape_receives_like_its_neighbour_and_gives_nothing() -> None:
     points, normals = surfaces(*CREASE)
-    points[:, 60:] = np.nan
+    points[:, 48:] = np.nan
     found = form_factors(points, normals, GRID, SIDE).reshape(*GRID, *GRID)
+    # half a block is still taken for a part of the surface beside it
     np.testing.assert_array_equal(found[:, 5], found[:, 4])
     np.testing.assert_array_equal(found[..., 5], 0)
+
+
+def test_gaps_of_less_than_a_block_are_closed() -> None:
+    points, normals = surfaces(*CREASE)
+    whole = form_factors(points, normals, GRID, SIDE)
+    points[:, 20:28] = np.nan
+    np.testing.assert_allclose(form_factors(points, normals, GRID, SIDE).sum(), whole.sum(), rtol=0.03)
 
 
 def test_without_any_shape_nothing_is_given() -> None:
     nothing = np.full((*SHAPE, 3), np.nan, np.float32)
     np.testing.assert_array_equal(form_factors(nothing, nothing, GRID, SIDE), 0)
+
+
+def walls() -> tuple[FloatImage, FloatImage]:
+    """Points and normals of a wall behind two that stand before it and face each other."""
+    ray = rays()
+    points, normals = ray * 2.4, np.broadcast_to((0.0, 0.0, -1.0), ray.shape).copy()
+    for at, inwards in ((-0.6, 1.0), (0.4, -1.0)):
+        depth = at / np.where(ray[..., 0] * at > 0, ray[..., 0], np.nan)
+        here = (depth > 1.6) & (depth < 2.4)
+        points[here], normals[here] = ray[here] * depth[here, None], (inwards, 0.0, 0.0)
+    return points.astype(np.float32), normals.astype(np.float32)
+
+
+def test_what_is_hidden_gives_nothing() -> None:
+    points, normals = walls()
+    found = form_factors(points, normals, GRID, SIDE).reshape(*GRID, *GRID)
+    x = points[..., 0].reshape(GRID[0], SIDE, GRID[1], SIDE).mean(axis=(0, 1, 3))
+    beyond, left = int(np.argmax(x)), int(np.argmin(np.abs(x + 0.6)))
+    assert x[beyond] > 0.6
+    np.testing.assert_array_equal(found[:, left, :, beyond], 0)
+    # in front of it nothing is
+    unhidden = by_pixels(points, normals).reshape(found.shape)
+    assert unhidden[:, left, :, beyond].sum() > 0.01
+    assert found[:, left].sum() == pytest.approx(unhidden[:, left, :, :beyond].sum(), rel=0.1)

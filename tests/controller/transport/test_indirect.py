@@ -85,7 +85,7 @@ def test_paint_changes_light_before_it_falls_on_other_surfaces() -> None:
     light = replace(some(1), lit=np.ones(SHAPE, np.bool_), paint=some_paint(2))
     d = picture(5)
     painted = d + np.einsum("kmyx,yxm->yxk", some_paint(2), d)
-    total = painted + some(1).forward(painted)
+    total = painted + replace(some(1), lit=np.ones(SHAPE, np.bool_)).forward(painted)
     np.testing.assert_allclose(d + light.forward(d), total, atol=1e-5)
     np.testing.assert_allclose(light.direct_target(total.astype(np.float32)), d, atol=1e-4)
 
@@ -135,32 +135,47 @@ def test_form_factors_add_up_to_the_part_of_the_view_that_is_taken() -> None:
     assert grid[6, 7] > 2 * grid[6, 1]
 
 
+def paint_of(white: FloatImage) -> FloatImage:
+    """What a surface makes of light that falls on it, which has the colours of its direct light."""
+    return np.asarray(0.3 * white / white.max(axis=2, keepdims=True), np.float32)
+
+
+def thrown_back(truth: IndirectLight, direct: FloatImage) -> FloatImage:
+    """Indirect light of direct light, where surfaces throw back that of others, too."""
+    indirect = np.zeros_like(direct)
+    lit = truth.lit[..., None]
+    for _ in range(30):
+        every = direct + indirect
+        indirect = truth.forward(np.where(lit, every, np.float32(0)), np.where(lit, np.float32(0), every))
+    return indirect
+
+
 def fitted(kernel: FloatImage, *, projectors: int = 3) -> tuple[IndirectLight, list[FloatImage], list[FloatImage]]:
     """The fit for a stage whose blocks give each other light by ``kernel``; its direct and indirect whites."""
     stage = plane_calibration(projectors=projectors)
-    truth = IndirectLight(kernel, np.full((60, 80, 3), 0.3, np.float32), stage.object_mask, (12, 16), 5)
+    truth = IndirectLight(kernel, paint_of(stage.projectors[0].white), stage.object_mask, *blocks_of((60, 80)))
     parts = []
     for n, part in enumerate(stage.projectors):
         white = part.white.copy()
         white[:, : 20 * n] = 0
         white[:, 60 - 15 * n :] *= 0.3
-        parts.append(replace(part, white=white, indirect=truth.forward(white)))
+        parts.append(replace(part, white=white, indirect=thrown_back(truth, white)))
     points, normals = corner()
     found = fit_indirect(replace(stage, projectors=tuple(parts)), stage.object_mask, points, normals)
     assert found is not None
-    return found, [part.white for part in parts], [truth.forward(part.white) for part in parts]
+    return found, [part.white for part in parts], [thrown_back(truth, part.white) for part in parts]
 
 
 def test_indirect_light_of_all_whites_is_as_measured() -> None:
-    found, direct, indirect = fitted(form_factors(*corner(), (12, 16), 5))
+    found, direct, indirect = fitted(form_factors(*corner(), *blocks_of((60, 80))))
     both = found.forward(np.sum(direct, axis=0)), np.sum(indirect, axis=0)
     np.testing.assert_allclose(*both, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("even", [0.0, 1.0])
 def test_each_projectors_is_told_by_the_terms_that_fit(even: float) -> None:
-    shape = form_factors(*corner(), (12, 16), 5)
-    kernel = (even / 192 * np.ones_like(shape) + (1 - even) * shape).astype(np.float32)
+    shape = form_factors(*corner(), *blocks_of((60, 80)))
+    kernel = (even / len(shape) * np.ones_like(shape) + (1 - even) * shape).astype(np.float32)
     found, direct, indirect = fitted(kernel)
     for one, wanted in zip(direct, indirect, strict=True):
         error = found.forward(one) - wanted
@@ -198,15 +213,9 @@ def with_and_without_stripes(own: float, room: float, far: float) -> tuple[float
     even = np.full_like(shape, 1 / len(shape))
     y, x = np.mgrid[0:60, 0:80].astype(np.float32)
     lit: Mask = np.asarray((x > 15) & (x < 60))
-    paint = np.full((60, 80, 3), 0.3, np.float32)
-    truth = IndirectLight(
-        np.float32(own) * shape, paint, lit, grid, side, np.float32(room) * shape + np.float32(far) * even
-    )
+    paint, away = paint_of(stage.projectors[0].white), np.float32(room) * shape + np.float32(far) * even
+    truth = IndirectLight(np.float32(own) * shape, paint, lit, grid, side, away)
     plan, parts = plan_patterns((96, 72)), []
-
-    def thrown(direct: FloatImage) -> FloatImage:
-        lighted = np.where(lit[..., None], direct, np.float32(0))
-        return truth.forward(lighted, direct - lighted)
 
     for n, part in enumerate(stage.projectors):
         at = np.stack([1.2 * x - 2.0 * n, 1.2 * y], axis=-1)
@@ -218,16 +227,18 @@ def with_and_without_stripes(own: float, room: float, far: float) -> tuple[float
             assert 0.1 < dark.mean() < 0.7
             assert not shown[dark].any()
             direct = white * shown[..., None]
-            pictures[pattern.name] = direct + thrown(direct)
+            pictures[pattern.name] = direct + thrown_back(truth, direct)
         stripes = dark_light(pictures, plan, at)
         phase_map = PhaseMap(at, np.ones((60, 80, 3), np.float32))
-        parts.append(replace(part, white=white, indirect=thrown(white), phase_map=phase_map, stripes=stripes))
+        parts.append(
+            replace(part, white=white, indirect=thrown_back(truth, white), phase_map=phase_map, stripes=stripes)
+        )
 
     def error(calibration: Calibration) -> float:
         found = fit_indirect(calibration, lit, points, normals)
         assert found is not None
         light = np.where(lit[..., None], parts[0].white, np.float32(0))
-        wanted = truth.forward(light)[lit]
+        wanted = thrown_back(truth, light)[lit]
         return float(np.sqrt(np.mean((found.forward(light)[lit] - wanted) ** 2) / np.mean(wanted**2)))
 
     blind = replace(stage, projectors=tuple(replace(part, stripes=None) for part in parts))
