@@ -152,7 +152,9 @@ def _slopes(place_px: Float64, apart_px: Float64, axis: int) -> Float64:
     equations = np.stack([np.ones(len(place_px)), *(place_px - place_px.mean(axis=0)).T])
     used = np.ones(len(place_px))
     for _ in range(ROUNDS):
-        plane = np.linalg.solve((equations * used) @ equations.T, equations @ (used * apart_px))
+        # of least squares: places on one line fix no plane
+        normal = (equations * used) @ equations.T
+        plane = np.linalg.lstsq(normal, equations @ (used * apart_px), rcond=None)[0]
         off = np.abs(apart_px - plane @ equations)
         used = (off <= OUTLIER * 1.4826 * np.median(off) + 1e-9).astype(np.float64)
     kept, seen = equations[:, used > 0].T, apart_px[used > 0]

@@ -128,3 +128,10 @@ def test_shifted_colours_of_one_size_are_not_named_as_fringes(noise: float) -> N
 def test_a_size_that_is_not_sure_is_not_named() -> None:
     assert fringed("left", ColourSizes(np.array([3e-4, 0, 0]), np.full(3, 1e-4)), (96, 72)) is None
     assert fringed("left", ColourSizes(np.full(3, np.nan), np.full(3, np.nan)), (96, 72)) is None
+
+
+def test_places_on_one_line_stop_nothing() -> None:
+    """An object may be a thin line in the picture; its colours then have a size along the line alone."""
+    made, line = places(), apart(pictures(np.zeros((3, 2)), noise=0.01))
+    made[..., 0] = 20.0
+    assert np.isfinite(colour_sizes(line, made).larger).all()
