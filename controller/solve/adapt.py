@@ -129,7 +129,10 @@ class _Bent:
         floor = self._floor[rows]
         of_grey = np.maximum(self._drive.of(grey[..., None] - floor, rows), 0)
         of_colour = self._drive.of(lifted - floor, rows)
-        kept = _quotient(of_grey, of_grey - of_colour, otherwise=1.0)
+        with np.errstate(invalid="ignore"):
+            # both are infinite where a colour of light is none
+            lost = of_grey - of_colour
+        kept = _quotient(of_grey, lost, otherwise=1.0)
         clear = np.clip((grey / np.maximum(self._lowest[rows], np.float32(1e-12)) - 1) / CLEAR, 0, 1)[..., None]
         own = lifted / grey[..., None]
         need = own + clear * (1 - kept) * (1 - own)
