@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
-from controller.core.errors import VelaturaError
 from controller.rig.lamp_faults import faulty
 from controller.rig.lamp_ledger import Clock, LampLedger, LampRecord, SystemClock
 from hal.deadline import Deadline
@@ -67,6 +66,7 @@ class LampGuard:
         self._record = self._remembered()
         self._born_s = self._counted_s = self._clock.now_s()
         self._unsaved_s = 0.0
+        self._durable = True
 
     # -- hal.interfaces.Projector
 
@@ -81,7 +81,7 @@ class LampGuard:
         """Close the connection. The lamp stays as it is."""
         with self._lock:
             self._count()
-            if self._unsaved_s > 0:
+            if self._unsaved_s > 0 or not self._durable:
                 self._write_quietly(self._record)
         self._projector.close()
 
@@ -96,6 +96,8 @@ class LampGuard:
         with self._lock:
             status = self._projector.status(deadline=deadline)
             self._seen(status.power)
+            if not self._durable:
+                self._write_quietly(self._record)
             since_s = self._record.since_s
             if self.by_hand and status.power is Power.UNKNOWN and self._record.lit:
                 burns = since_s is not None and self._now() >= since_s
@@ -301,18 +303,20 @@ class LampGuard:
             self._write_quietly(self._record)
 
     def _write(self, record: LampRecord) -> None:
-        record = replace(record, lit_s=record.lit_s + self._unsaved_s)
+        record = self._with_hours(record)
         self._ledger.write(self.name, record)
-        self._record, self._unsaved_s = record, 0.0
+        self._record, self._unsaved_s, self._durable = record, 0.0, True
 
     def _write_quietly(self, record: LampRecord) -> None:
-        """Record what has happened: always in memory, and on disk if possible (the next write retries).
+        """Record what has happened: always in memory, and on disk if possible (each status tries again).
 
-        If the record on disk is older, the lamp counts as hot after a restart, which is safe.
+        A restart knows what is on disk alone: of a lamp that was switched on elsewhere, not that it is hot.
         """
-        self._record = record
-        with contextlib.suppress(VelaturaError):
-            self._write(record)
+        self._record, self._unsaved_s = self._with_hours(record), 0.0
+        self._durable = self._ledger.keep(self.name, self._record)
+
+    def _with_hours(self, record: LampRecord) -> LampRecord:
+        return replace(record, lit_s=record.lit_s + self._unsaved_s)
 
     def _now(self) -> float:
         return self._clock.now_s()

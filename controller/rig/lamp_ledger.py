@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
 
+from controller.core.errors import VelaturaError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from hal.deadline import Deadline
@@ -68,6 +69,10 @@ class LampLedger(Protocol):
     def write(self, name: str, record: LampRecord) -> None:
         """Durable on return. Raises WorkError("no-space") and the like; the stored record is then unchanged."""
 
+    def keep(self, name: str, record: LampRecord) -> bool:
+        """As ``write``, of what has happened already: what can't be stored is read from now on, and goes with the next
+        write. Returns whether it is durable."""
+
 
 _UNKNOWN: Final = ""
 _UNREADABLE: Final = (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError)
@@ -103,6 +108,15 @@ class LampFile:
             for path in (self._copy, self._path):
                 write_atomically(path, text.encode() + b"\n")
             self._records = records
+
+    def keep(self, name: str, record: LampRecord) -> bool:
+        try:
+            self.write(name, record)
+        except VelaturaError:
+            with self._lock:
+                self._records = {**self._records, name: record}
+            return False
+        return True
 
     def _load(self) -> Mapping[str, LampRecord]:
         gone = False

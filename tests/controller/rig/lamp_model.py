@@ -154,6 +154,10 @@ class Shelf:
             raise WorkError("no-space", what="Full.", remedy="Free some space.")
         self.records[name] = record
 
+    def keep(self, name: str, record: LampRecord) -> bool:
+        self.records[name] = record
+        return not self.full
+
 
 def soon() -> Deadline:
     return in_seconds(60)

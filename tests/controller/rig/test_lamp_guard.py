@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampFile
+from controller.rig.lamp_ledger import LampFile, LampRecord
 from hal.interfaces import Projector
 from hal.values import LampRules, Power, ProjectorStatus
 from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, refusal, soon
@@ -61,6 +62,56 @@ def test_without_room_to_count_the_strike_there_is_none_but_off_goes_out() -> No
     guard.switch_off(deadline=soon())
     assert lamp.lit_at_s is None
     assert guard.rest_left_s() == RULES.minimum_off_s
+
+
+class FullDisk:
+    """A stage folder in which the lamps' file can't be written for a while."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / LampFile.NAME
+        self._obstacle = folder / LampFile.COPY
+
+    def fill(self) -> None:
+        self._obstacle.unlink(missing_ok=True)
+        (self._obstacle / "in the way").mkdir(parents=True)
+
+    def free(self) -> None:
+        shutil.rmtree(self._obstacle)
+
+
+def test_what_a_full_disk_did_not_take_is_written_as_soon_as_there_is_room(tmp_path: Path) -> None:
+    world, disk = World(), FullDisk(tmp_path)
+    guard, lamp = a_guard(world, ledger=LampFile(disk.file))
+    guard.switch_on(deadline=soon())
+    guard.switch_off(deadline=soon())
+    world.time_s += 1000
+    disk.fill()
+    lamp.lit_at_s = world.time_s  # by its own remote control
+    guard.status(deadline=soon())
+    guard.switch_off(deadline=soon())
+    assert not LampFile(disk.file).damaged
+    disk.free()
+    world.time_s += RULES.cool_down_s
+    guard.status(deadline=soon())
+    after_a_restart = LampGuard("left", lamp, LampFile(disk.file), clock=world)
+    assert after_a_restart.rest_left_s() == RULES.minimum_off_s - RULES.cool_down_s
+    assert refusal(lambda: after_a_restart.switch_on(deadline=soon())) == "lamp-resting"
+
+
+def test_a_projector_connected_again_on_a_full_disk_is_as_hot_as_before(tmp_path: Path) -> None:
+    world, disk = World(), FullDisk(tmp_path)
+    ledger = LampFile(disk.file)
+    guard, lamp = a_guard(world, ledger=ledger)
+    guard.switch_on(deadline=soon())
+    disk.fill()
+    world.time_s += 3600
+    guard.switch_off(deadline=soon())
+    guard.close()
+    again = LampGuard("left", lamp, ledger, clock=world)
+    assert again.rest_left_s() == RULES.minimum_off_s
+    assert again.use().hours == pytest.approx(1)
+    with pytest.raises(WorkError):
+        LampFile(disk.file).write("left", LampRecord())
 
 
 def test_a_look_that_fails_does_not_keep_off_from_going_out() -> None:
