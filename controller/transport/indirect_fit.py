@@ -51,38 +51,33 @@ def fit_indirect(
     if len(indirect) < len(calibration.projectors) or not indirect:
         return None if paint is None and surface is None else replace(_nothing(lit), paint=paint, surface=surface)
     grid, side = blocks_of(calibration.black.shape)
+    whole, stride = np.sum(indirect, axis=0), stride_of(calibration.black.shape)
+    few = _View(lit[::stride, ::stride], grid, side // stride, thinned(whole, stride))
     kinds = [_even(grid), *(_near(grid, deviation) for deviation in NEAR_BLOCKS)]
     if points_m is not None and normals is not None:
-        kinds.append(form_factors(points_m, normals, grid, side))
-    whole = np.sum(indirect, axis=0)
-    view = _View(lit, grid, side, whole, tuple(calibration.projectors))
-    own, room = _factors(kinds, view)
+        kinds.append(form_factors(thinned(points_m, stride), thinned(normals, stride), grid, few.side))
+    factors = _factors(kinds, calibration.projectors, few, stride)
     directly = np.sum([part.white for part in calibration.projectors], axis=0)
-    scale = view.scale((own, room), block_light(directly, view.down(whole), whole, lit, grid, side))
-    return IndirectLight(own, scale, lit, grid, side, room, paint, surface)
+    view = _View(lit, grid, side, whole)
+    scale = view.scale(factors, view.blocks(directly, whole))
+    return IndirectLight(factors[0], scale, lit, grid, side, factors[1], paint, surface)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """What the camera sees of all whites that is ``whole`` (rows, columns, 3), their indirect light, by blocks."""
+    """A camera picture by blocks, or some of its pixels: ``whole`` (rows, columns, 3), all whites' indirect light.
+
+    ``lit`` (rows, columns): on the object; ``grid`` (rows, columns) of blocks of ``side`` x ``side`` pixels
+    """
 
     lit: Mask
     grid: tuple[int, int]
     side: int
     whole: FloatImage
-    projectors: tuple[ProjectorCalibration, ...]
 
-    def down(self, image: FloatImage) -> FloatImage:
-        """(blocks, 3) of an image (rows, columns, 3)."""
-        return down(image, self.grid, self.side)
-
-    def whites(self) -> list[BlockLight]:
-        """All light of each projector's white, which is measured."""
-        return [
-            block_light(p.white + p.indirect, self.down(p.indirect), self.whole, self.lit, self.grid, self.side)
-            for p in self.projectors
-            if p.indirect is not None
-        ]
+    def blocks(self, light: FloatImage, indirect: FloatImage) -> BlockLight:
+        """A picture of ``light`` that leaves surfaces, and of its ``indirect`` light, (rows, columns, 3)."""
+        return block_light(light, down(indirect, self.grid, self.side), self.whole, self.lit, self.grid, self.side)
 
     def scale(self, factors: Both, white: BlockLight) -> FloatImage:
         """S (rows, columns, 3), which makes all whites' indirect light of the light of ``white`` what it is."""
@@ -92,32 +87,39 @@ class _View:
         scale = np.divide(self.whole, falling, out=np.zeros_like(self.whole), where=falling > faint)
         return np.asarray(scale, np.float32)
 
+    def back(self, factors: Both, white: BlockLight) -> Both:
+        """What blocks make of light that falls on them."""
+        return thrown_back(self.scale(factors, white), self.lit, self.grid, self.side)
 
-def _factors(kinds: Sequence[FloatImage], view: _View) -> Both:
-    """(blocks, blocks) of object and room, from direct light: of all ``kinds``, of which the last tells most."""
-    whites = view.whites()
-    every = _sum(whites)
-    first = (kinds[-1], kinds[-1])
-    back = thrown_back(view.scale(first, every), view.lit, view.grid, view.side)
+
+def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibration], view: _View, stride: int) -> Both:
+    """(blocks, blocks) of object and room, from direct light: of all ``kinds``, of which the last tells most.
+
+    ``view``: every ``stride``-th camera pixel
+    """
+    directs = [thinned(part.white, stride) for part in projectors]
+    indirects = [thinned(part.indirect, stride) for part in projectors if part.indirect is not None]
+    whites = [view.blocks(one + other, other) for one, other in zip(directs, indirects, strict=True)]
+    every, first = _sum(whites), (kinds[-1], kinds[-1])
+    back = view.back(first, every)
     stripes = [
         _with_indirect(one, first, back)
-        for part in view.projectors
-        for one in _striped(part, view.whole, view.lit, view.grid, view.side)
+        for part, direct in zip(projectors, directs, strict=True)
+        for one in _striped(part, direct, view, stride)
     ]
     # Only stripes tell the light of the object from that of table and walls.
     parts: tuple[Part, ...] = ("object", "room") if stripes else ("all",)
     terms = [Term(kind, part) for kind in kinds for part in parts]
-    shape = view.whole.shape
-    weights = fit_weights(terms, whites, stripes, view.grid, view.side, shape)
+    place = (view.grid, view.side, view.whole.shape)
+    weights = fit_weights(terms, whites, stripes, *place)
     own, room = (
         np.sum([w * t.matrix for w, t in zip(weights, terms, strict=True) if t.part in (part, "all")], axis=0)
         for part in ("object", "room")
     )
     if stripes:
-        colours = falling_colours([p.white for p in view.projectors], view.whole, view.lit, view.grid, view.side)
-        own, room = shaped(own, room, (*whites, *stripes), len(whites), view.grid, view.side, shape, colours)
-    found = (own, room)
-    return by_all_ways(found, thrown_back(view.scale(found, every), view.lit, view.grid, view.side))
+        colours = falling_colours(directs, view.whole, view.lit, view.grid, view.side)
+        own, room = shaped(own, room, (*whites, *stripes), len(whites), *place, colours)
+    return by_all_ways((own, room), view.back((own, room), every))
 
 
 def _sum(whites: Sequence[BlockLight]) -> BlockLight:
@@ -145,19 +147,16 @@ def _surface(calibration: Calibration, lit: Mask) -> SurfaceLight | None:
     return SurfaceLight.of(spread, np.sum([part.white for part in calibration.projectors], axis=0), lit)
 
 
-def _striped(
-    part: ProjectorCalibration, whole: FloatImage, lit: Mask, grid: tuple[int, int], side: int
-) -> list[BlockLight]:
-    """What a projector's coarse stripes throw back."""
+def _striped(part: ProjectorCalibration, white: FloatImage, view: _View, stride: int) -> list[BlockLight]:
+    """What a projector's coarse stripes throw back; ``white``: its direct light on the pixels of ``view``."""
     if part.stripes is None or part.phase_map is None:
         return []
-    stride, (rows, columns) = stride_of(whole.shape), part.metapixels.valid.shape
-    at, white, few = (thinned(image, stride) for image in (part.phase_map.projector_px, part.white, whole))
-    found = []
+    rows, columns = part.metapixels.valid.shape
+    at, found = thinned(part.phase_map.projector_px, stride), []
     for pattern, seen in zip(coarse_stripes(plan_patterns((columns, rows))), part.stripes, strict=True):
         light, dark = stripe_parts(pattern, (columns, rows), at)
         direct = white * light[..., None]
-        found.append(block_light(direct, seen, few, lit[::stride, ::stride], grid, side // stride, dark))
+        found.append(block_light(direct, seen, view.whole, view.lit, view.grid, view.side, dark))
     return found
 
 
