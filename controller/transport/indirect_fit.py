@@ -22,8 +22,8 @@ from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_shape import shaped
 from controller.transport.indirect_stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
 from controller.transport.indirect_weights import BlockLight, Part, Term, block_light, fit_weights
-from controller.transport.surfaces.blocks import down, up
-from controller.transport.surfaces.bounces import Both, by_all_ways, thrown_back, with_bounces
+from controller.transport.surfaces.blocks import down, parted, up
+from controller.transport.surfaces.bounces import Both, by_all_ways, with_bounces
 from controller.transport.surfaces.falling_colours import falling_colours
 from controller.transport.surfaces.paint_colours import paint_colours
 from controller.transport.surfaces.surface_light import SurfaceLight
@@ -59,7 +59,7 @@ def fit_indirect(
     factors = _factors(kinds, calibration.projectors, few, stride)
     directly = np.sum([part.white for part in calibration.projectors], axis=0)
     view = _View(lit, grid, side, whole)
-    scale = view.scale(factors, view.blocks(directly, whole))
+    scale = view.scale(factors, parted(directly, lit, grid, side))
     return IndirectLight(factors[0], scale, lit, grid, side, factors[1], paint, surface)
 
 
@@ -79,17 +79,17 @@ class _View:
         """A picture of ``light`` that leaves surfaces, and of its ``indirect`` light, (rows, columns, 3)."""
         return block_light(light, down(indirect, self.grid, self.side), self.whole, self.lit, self.grid, self.side)
 
-    def scale(self, factors: Both, white: BlockLight) -> FloatImage:
-        """S (rows, columns, 3), which makes all whites' indirect light of the light of ``white`` what it is."""
-        arriving = np.asarray(factors[0] @ white.own + factors[1] @ white.room, np.float32)
+    def scale(self, factors: Both, light: Both) -> FloatImage:
+        """S (rows, columns, 3), which makes all whites' indirect light of their ``light`` (blocks, 3) what it is."""
+        arriving = np.asarray(factors[0] @ light[0] + factors[1] @ light[1], np.float32)
         falling = up(arriving, self.grid, self.side, self.lit.shape)
         faint = FAINTEST * falling.max(initial=0)
         scale = np.divide(self.whole, falling, out=np.zeros_like(self.whole), where=falling > faint)
         return np.asarray(scale, np.float32)
 
-    def back(self, factors: Both, white: BlockLight) -> Both:
+    def back(self, factors: Both, light: Both) -> Both:
         """What blocks make of light that falls on them."""
-        return thrown_back(self.scale(factors, white), self.lit, self.grid, self.side)
+        return parted(self.scale(factors, light), self.lit, self.grid, self.side)
 
 
 def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibration], view: _View, stride: int) -> Both:
@@ -100,7 +100,8 @@ def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibrat
     directs = [thinned(part.white, stride) for part in projectors]
     indirects = [thinned(part.indirect, stride) for part in projectors if part.indirect is not None]
     whites = [view.blocks(one + other, other) for one, other in zip(directs, indirects, strict=True)]
-    every, first = _sum(whites), (kinds[-1], kinds[-1])
+    every = np.sum([one.own for one in whites], axis=0), np.sum([one.room for one in whites], axis=0)
+    first = (kinds[-1], kinds[-1])
     back = view.back(first, every)
     stripes = [
         _with_indirect(one, first, back)
@@ -120,12 +121,6 @@ def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibrat
         colours = falling_colours(directs, view.whole, view.lit, view.grid, view.side)
         own, room = shaped(own, room, (*whites, *stripes), len(whites), *place, colours)
     return by_all_ways((own, room), view.back((own, room), every))
-
-
-def _sum(whites: Sequence[BlockLight]) -> BlockLight:
-    """All projectors together."""
-    own, room, seen = (np.sum([getattr(one, name) for one in whites], axis=0) for name in ("own", "room", "seen"))
-    return replace(whites[0], own=own, room=room, seen=seen)
 
 
 def _with_indirect(one: BlockLight, factors: Both, back: Both) -> BlockLight:

@@ -1,6 +1,6 @@
 """The shape of G, corrected by what the weights of its terms leave of whites and stripes.
 
-Form factors do not know what hides what, nor surfaces that the camera does not see. What a block gets is predicted for
+Form factors do not know surfaces that the camera does not see. What a block gets is predicted for
 every picture of which indirect light was measured; where the measured part differs, the light of some sources counts
 too little or too much. Of all factors that explain it, those are taken that change least, and alike for neighbouring
 sources: the mean of a Gaussian process (Rasmussen and Williams 2006, eq. 2.25), block by block. Where the colour of

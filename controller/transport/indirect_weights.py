@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.transport.surfaces.blocks import down, down_up
+from controller.transport.surfaces.blocks import down, down_up, parted
 
 Part = Literal["all", "object", "room"]
 LEAST_DARK: Final = 0.3
@@ -60,8 +60,7 @@ def block_light(
 
     ``lit`` (rows, columns): on the object; ``dark``: the pixels that ``seen`` (blocks, 3) is the sum of, None: all
     """
-    own = down(np.where(lit[..., None], light, np.float32(0)), grid, side)
-    room = down(light, grid, side) - own
+    own, room = parted(light, lit, grid, side)
     if dark is None:
         every = down(np.ones((*lit.shape, 1), np.float32), grid, side)[:, 0]
         return BlockLight(own, room, seen, down(whole, grid, side), every)

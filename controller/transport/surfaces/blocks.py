@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 
 
 def down(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
@@ -15,6 +15,12 @@ def down(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:
     first = np.add.reduceat(image, np.arange(0, image.shape[0], side), axis=0)
     sums = np.add.reduceat(first, np.arange(0, image.shape[1], side), axis=1)
     return np.asarray(sums.reshape(grid[0] * grid[1], -1) / np.float32(side * side), np.float32)
+
+
+def parted(image: FloatImage, lit: Mask, grid: tuple[int, int], side: int) -> tuple[FloatImage, FloatImage]:
+    """``down`` of an image's pixels on the object, ``lit`` (rows, columns), and of those on the room."""
+    own = down(np.where(lit[..., None], image, np.float32(0)), grid, side)
+    return own, down(image, grid, side) - own
 
 
 def down_adjoint(blocks: FloatImage, grid: tuple[int, int], side: int, shape: tuple[int, ...]) -> FloatImage:

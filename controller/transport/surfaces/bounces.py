@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage, Mask
-from controller.transport.surfaces.blocks import down
+from controller.core.arrays import FloatImage
 
 Both = tuple[FloatImage, FloatImage]
 """Of the object, and of surfaces that are none of it."""
@@ -15,19 +14,11 @@ DOUBLED: Final = 3
 """2^3 bounces are counted. Surfaces throw back less than half of what falls on them on the mean, so 1 % is left."""
 
 
-def thrown_back(scale: FloatImage, lit: Mask, grid: tuple[int, int], side: int) -> Both:
-    """(blocks, 3) each: what the block's pixels on the object, and those on the room, make of light that falls on it.
-
-    ``scale`` (rows, columns, 3) of camera pixels; ``lit`` (rows, columns): on the object
-    """
-    own = down(np.where(lit[..., None], scale, np.float32(0)), grid, side)
-    return own, down(scale, grid, side) - own
-
-
 def with_bounces(direct: Both, factors: Both, back: Both) -> Both:
     """All light that leaves blocks (blocks, 3), where ``direct`` light is that of projectors.
 
-    ``factors`` (blocks, blocks): light that falls from blocks of object and room; ``back``: see ``thrown_back``
+    ``factors`` (blocks, blocks): light that falls from blocks of object and room; ``back`` (blocks, 3): what they make
+    of light that falls on them
     """
     own, room = direct
     for _ in range(2**DOUBLED):
@@ -50,4 +41,4 @@ def by_all_ways(factors: Both, back: Both) -> Both:
     return found[:, : len(step)], found[:, len(step) :]
 
 
-__all__ = ["Both", "by_all_ways", "thrown_back", "with_bounces"]
+__all__ = ["Both", "by_all_ways", "with_bounces"]

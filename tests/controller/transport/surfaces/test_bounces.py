@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.arrays import FloatImage
-from controller.transport.surfaces.bounces import Both, by_all_ways, thrown_back, with_bounces
+from controller.transport.surfaces.blocks import parted
+from controller.transport.surfaces.bounces import Both, by_all_ways, with_bounces
 
 COUNT = 12
 
@@ -61,7 +62,7 @@ def test_what_blocks_throw_back_is_parted_by_object_and_room() -> None:
     scale = np.random.default_rng(4).random((6, 8, 3)).astype(np.float32)
     lit = np.zeros((6, 8), np.bool_)
     lit[:, :3] = True
-    own, room = thrown_back(scale, lit, (3, 4), 2)
+    own, room = parted(scale, lit, (3, 4), 2)
     assert own[3] == pytest.approx(0)
     assert room[0] == pytest.approx(0)
     np.testing.assert_allclose((own + room)[1], scale[:2, 2:4].mean(axis=(0, 1)), rtol=1e-5)
