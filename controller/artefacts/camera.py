@@ -54,6 +54,12 @@ class Delay:
     def write(self, run: Path) -> Path:
         return write_json(run / _DELAY, asdict(self))
 
+    @staticmethod
+    def read(run: Path) -> Delay:
+        row = read_json(run / _DELAY)
+        tries = tuple((float(delay_s), float(share)) for delay_s, share in row["tries"])
+        return Delay(float(row["wait_s"]), float(row["delay_s"]), tries, float(row["exposure_s"]))
+
 
 def raise_delay(run: Path, wait_s: float) -> None:
     """Store that a longer delay than measured was needed, in seconds. This is not an artefact of a step."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.rig.mains_relays import open_circuits
 from controller.rig.power import BY_HAND_S, light, power_down, steady
@@ -14,6 +16,9 @@ from controller.run.runner import Context, Step
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId
 from hal.errors import DeviceError
+
+NEARLY_S: Final = 60.0
+"""Before lamps are stable: from here on their light changes little, and what needs no more may be measured."""
 
 
 @contextlib.contextmanager
@@ -61,8 +66,11 @@ def _report(reporter: Reporter, text: str, level: Level = Level.INFO) -> None:
         reporter.say(text, level)
 
 
-def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
-    """Strike the lamps and wait for stable light. Never skipped: hardware is checked, not restored."""
+def power_steps(rig: Rig, *, power_up_s: float, early: Sequence[Step] = ()) -> list[Step]:
+    """Strike the lamps, do the ``early`` steps when these are nearly stable, and wait for stable light.
+
+    Lamps are never skipped: hardware is checked, not restored.
+    """
 
     def strike(context: Context) -> Sequence[Path]:
         light(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance,
@@ -70,8 +78,8 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
         note(context)
         return ()
 
-    def settle(context: Context) -> Sequence[Path]:
-        steady(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance)
+    def settle(context: Context, *, but_s: float = 0.0) -> Sequence[Path]:
+        steady(rig.guards, deadline=context.deadline.within(power_up_s), advance=context.advance, but_s=but_s)
         note(context)
         return ()
 
@@ -84,9 +92,16 @@ def power_steps(rig: Rig, *, power_up_s: float) -> list[Step]:
     rules = [guard.capabilities.lamp_rules for guard in rig.guards]
     light_s = max(rule.warm_up_s for rule in rules) + (BY_HAND_S if any(g.by_hand for g in rig.guards) else 0.5)
     steady_s = max(max(rule.stable_s for rule in rules) - light_s, 0.1)
+    last_s = min(NEARLY_S, steady_s) if early else steady_s
+    nearly = [
+        Step(StepId("warm"), partial(settle, but_s=NEARLY_S), title="Warming the lamps up",
+             weight=max(steady_s - last_s, 0.1), always=True)
+    ] if early else []  # fmt: skip
     return [
         Step(StepId("strike"), strike, title="Switching the projectors on", weight=light_s, enter=Event.START,
              leave=Event.LAMPS_LIT, always=True),
-        Step(StepId("steady"), settle, title="Waiting for stable light", weight=steady_s,
+        *nearly,
+        *early,
+        Step(StepId("steady"), settle, title="Waiting for stable light", weight=last_s,
              leave=Event.LAMPS_STABLE, always=True),
     ]  # fmt: skip

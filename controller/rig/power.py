@@ -65,13 +65,16 @@ def light(
         clock.sleep(POLL_S, deadline)
 
 
-def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None) -> None:
-    """Wait until every lamp has been on for its ``stable_s``, and watch for faults meanwhile.
+def steady(
+    guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance, clock: Clock | None = None,
+    but_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Wait until every lamp has been on for its ``stable_s`` but the last ``but_s``, and watch for faults meanwhile.
 
     Raises DeviceRefused("projector-fault", "lamp-went-off"), DeviceTimeout("lamps-not-stable") and Cancelled.
     """
     clock = clock or SystemClock()
-    wait_s = max((guard.stable_left_s() for guard in guards), default=0.0)
+    wait_s = _stable_in_s(guards) - but_s
     while True:
         for guard in guards:
             if not _is_on(guard, deadline) and not guard.may_be_lit:
@@ -80,7 +83,7 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
                     what=f"The lamp of projector {guard.name} went off while it was warming up.",
                     remedy=f"Let it cool for some minutes. If it goes off again, replace the lamp. {START_AGAIN}",
                 )
-        left_s = max((guard.stable_left_s() for guard in guards), default=0.0)
+        left_s = _stable_in_s(guards) - but_s
         if left_s <= 0:
             return
         advance(max(0.0, 1 - left_s / wait_s), f"the lamps become steady, {left_s:.0f} s")
@@ -90,6 +93,10 @@ def steady(guards: Sequence[LampGuard], *, deadline: Deadline, advance: Advance,
             remedy="Increase power_up_s under [safety] in stage.toml.",
         )
         clock.sleep(min(POLL_S, max(left_s, 0.01)), deadline)
+
+
+def _stable_in_s(guards: Sequence[LampGuard]) -> float:
+    return max((guard.stable_left_s() for guard in guards), default=0.0)
 
 
 def power_down(

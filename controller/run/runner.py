@@ -69,6 +69,7 @@ class Step:
         restored from the journal
     calculates : it uses no device, so it may run beside later steps that do not read from it. It has no ``enter`` or
         ``leave``
+    unsteady : it may be done before lamps are stable, and reads from no earlier step
     """
 
     id: StepId
@@ -81,6 +82,7 @@ class Step:
     leave: Event | None = None
     always: bool = False
     calculates: bool = False
+    unsteady: bool = False
 
     @property
     def heading(self) -> str:

@@ -54,6 +54,8 @@ class StageSession(ABC):
     ) -> Path:
         """Run the steps of a new or unfinished run of this name with the lamps on; the run's folder.
 
+        Those that need no stable light are done while lamps become stable, where it is the session that strikes them.
+
         ``checked``: the session's stage; ``dark``: refuse a bright room, if the stage has a light sensor;
         ``plays``: as in ``stage.open.opened``; ``before``: steps before the lamps are struck, if they are not lit yet.
         Raises what the steps raise; UsageError("already-running") if another program works on the stage.
@@ -102,8 +104,11 @@ class OwnSession(StageSession):
             clear_unfinished_writes(journal.folder)
             machine = Machine(journal.record_change)
             first = dark_before(rig.ambient_limit) if dark else []
-            power = power_steps(rig, power_up_s=safety.power_up_s)
-            steps = [*first, *before(rig), *power, *compiled, *make_steps(rig, journal.folder)]
+            made = make_steps(rig, journal.folder)
+            unsteady = [step for step in made if step.unsteady]
+            power = power_steps(rig, power_up_s=safety.power_up_s, early=[*compiled, *unsteady] if unsteady else ())
+            rest = [*(() if unsteady else compiled), *(step for step in made if not step.unsteady)]
+            steps = [*first, *before(rig), *power, *rest]
             with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
                 Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
             return journal.folder

@@ -17,7 +17,7 @@ from controller.capture.demosaic import SensorLevels
 from controller.capture.linearity import RawExposure, exposure_ratio
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import is_jpeg, read_mosaic
-from controller.steps.capture.patterns import bracket
+from controller.steps.capture.exposure import bracket
 
 WANTED: Final = (0.7, 5.0)
 """Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""

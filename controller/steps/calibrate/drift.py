@@ -26,7 +26,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.solve.scaling.dither import to_light
 from controller.steps import costs
-from controller.steps.capture.patterns import bracket
+from controller.steps.capture.exposure import bracket
 from controller.steps.capture.photographs import Planned, take_all
 
 PATTERN = Pattern("drift", PatternKind.RANDOM, seed=17)

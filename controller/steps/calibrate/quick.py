@@ -105,7 +105,8 @@ def chosen(rig: Rig, last: Calibrated, step: Step) -> Step:
             return step.run(context)
         return kept if way is Reuse.KEEP else _correct(rig, last, step.id, kept, context)
 
-    return dataclasses.replace(step, run=run, after=(*step.after, StepId(StepKind.DRIFT)), weight=0.1 * step.weight)
+    after = (*step.after, StepId(StepKind.DRIFT))
+    return dataclasses.replace(step, run=run, after=after, weight=0.1 * step.weight, unsteady=False)
 
 
 def reuse_of(step: StepId, drift: Drift, mode: str = "fast") -> Reuse:

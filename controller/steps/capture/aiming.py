@@ -23,7 +23,7 @@ from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.storage import write_atomically
 from controller.rig.rig import Rig
-from controller.steps.capture.patterns import FIRST_EXPOSURE_S, bracket
+from controller.steps.capture.exposure import FIRST_EXPOSURE_S, bracket
 from hal.deadline import Deadline
 
 FOLDER: Final = "kiosk/aiming"

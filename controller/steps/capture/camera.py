@@ -37,6 +37,7 @@ from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
+from controller.steps.capture.exposure import White, white_exposures
 from controller.steps.capture.photographs import Planned, take_all
 from controller.steps.troubles import tell
 
@@ -46,17 +47,17 @@ BRIGHTNESS_OF_ALL = 0.7
 """Factor of a shorter exposure for white of all projectors together, so that nothing clips."""
 
 
-def delay_step(rig: Rig) -> Step:
+def delay_step(rig: Rig, longest_exposure_s: float) -> Step:
     """``delay.json``: time from a picture's presentation until it is completely visible; the acquirer waits so long.
 
-    Runs after ``exposure`` and uses the shortest one.
+    It needs no stable light, and says at which exposure white of all projectors is certainly not clipped.
     """
     return Step(
         StepId(StepKind.DELAY),
-        partial(_measure_delay, rig),
-        after=(StepId(StepKind.EXPOSURE),),
+        partial(_measure_delay, rig, longest_exposure_s),
         title="Measuring the display's delay",
         weight=5 * LONGEST_S,
+        unsteady=True,
     )
 
 
@@ -93,13 +94,16 @@ def camera_step(rig: Rig) -> Step:
 def _exposure_of_all(rig: Rig, context: Context) -> float:
     """Exposure at which white of all projectors together is certainly not clipped."""
     shortest = min(exposure.base_s for exposure in Exposures.read(context.folder).values())
-    wanted = BRIGHTNESS_OF_ALL * shortest / len(rig.projectors)
-    available = rig.acquirer.exposures_s()
-    return max((value for value in available if value <= wanted), default=min(available))
+    return _at_most(rig.acquirer.exposures_s(), BRIGHTNESS_OF_ALL * shortest / len(rig.projectors))
 
 
-def _measure_delay(rig: Rig, context: Context) -> Sequence[Path]:
-    exposure_s = _exposure_of_all(rig, context)
+def _at_most(available_s: Sequence[float], wanted_s: float) -> float:
+    return max((value for value in available_s if value <= wanted_s), default=min(available_s))
+
+
+def _measure_delay(rig: Rig, longest_s: float, context: Context) -> Sequence[Path]:
+    found_s = white_exposures(rig, context, White(rig.projectors, "all projectors together"), longest_s, most=1)[0]
+    exposure_s = _at_most(rig.acquirer.exposures_s(), BRIGHTNESS_OF_ALL * found_s)
     flats = [_flat(rig, 0), _flat(rig, 255)]
     shown: list[tuple[bool, float]] = []
     count = 0

@@ -21,7 +21,7 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import WorkError
 from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context
-from controller.steps.capture.patterns import bracket
+from controller.steps.capture.exposure import bracket
 from controller.steps.capture.photographs import Planned, take_all
 from controller.steps.modes import DotOptions
 

@@ -8,30 +8,21 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from controller.artefacts.camera import Exposures
+from controller.artefacts.camera import Delay, Exposures
 from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import CAPTURES
 from controller.artefacts.pattern_plans import PhotographOptions
-from controller.artefacts.photographs import BLACK, WHITE, codes_of
+from controller.artefacts.photographs import BLACK, codes_of
 from controller.artefacts.projectors import Light
-from controller.capture.acquire import Shot
-from controller.capture.brackets import choose_brackets
-from controller.capture.jpeg_response import nominal_response
-from controller.capture.latency import LONGEST_S
-from controller.capture.pattern_frames import device_frame
-from controller.capture.patterns import CELL_PX, Pattern, PatternPlan, plan_patterns
-from controller.capture.raw import read_photograph
-from controller.core.errors import CalibrationError
+from controller.capture.patterns import CELL_PX, Pattern, PatternPlan
 from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.capture.camera import delay_step, response_steps
-from controller.steps.capture.light import before_response, expected_plan, named, photograph_light, planned_pattern
-from controller.steps.capture.photographs import Planned, take_all
+from controller.steps.capture.exposure import White, bracket, white_exposures
+from controller.steps.capture.light import before_response, expected_plan, photograph_light, planned_pattern
+from controller.steps.capture.photographs import Planned, take_all, use_delay
 
-FIRST_EXPOSURE_S = 1 / 30
-EXPOSURE_TRIES = 8
 WHITE_EXPOSURES = 3
 """Maximum number of photographs for one HDR white image."""
 MOST_CHANGED = 1.6
@@ -46,14 +37,15 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float, options: PhotographOpt
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
     a_shot_s = _shot_s(rig)
     steps = [
+        delay_step(rig, longest_exposure_s),
         Step(
             StepId(StepKind.EXPOSURE),
             lambda context: _find_exposures(rig, context, longest_exposure_s),
             inputs=inputs,
+            after=(StepId(StepKind.DELAY),),
             title="Finding the exposure",
             weight=2 * len(rig.projectors) * a_shot_s,
         ),
-        delay_step(rig),
         *response_steps(rig),
         Step(
             StepId(StepKind.BLACK),
@@ -102,17 +94,15 @@ def _shot_s(rig: Rig) -> float:
     return costs.shot_s(costs.scale(projector.size_px for projector in rig.projectors))
 
 
-def bracket(base_s: float, factors: Sequence[float], available_s: Sequence[float], longest_s: float) -> list[float]:
-    """Distinct exposures of the camera, each the nearest to ``base_s`` times a factor, none above ``longest_s``."""
-    usable = [value for value in available_s if value <= longest_s] or [min(available_s)]
-    return sorted({min(usable, key=lambda value: abs(math.log(value / (base_s * factor)))) for factor in factors})
-
-
 def _find_exposures(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
     found = {}
+    use_delay(rig, context.folder)
+    all_s = Delay.read(context.folder).exposure_s
     for number, projector in enumerate(rig.projectors):
         context.advance(number / len(rig.projectors), projector.name)
-        found[projector.name] = _find_exposure(rig, projector, context, longest_s)
+        white = White((projector,), f"projector {projector.name}", all_s)
+        exposures_s = white_exposures(rig, context, white, longest_s, most=WHITE_EXPOSURES)
+        found[projector.name] = Exposures(exposures_s[0], exposures_s)
     return [Exposures.write(context.folder, linked(found))]
 
 
@@ -145,32 +135,6 @@ def _with_one_of(used: set[float], one: Exposures) -> Exposures:
     return Exposures(one.base_s, (*own[:at], value, *own[at + 1 :]))
 
 
-def _find_exposure(rig: Rig, projector: RigProjector, context: Context, longest_s: float) -> Exposures:
-    """Photograph white until it is well exposed. These test photographs are not journalled."""
-    white = device_frame(named(plan_patterns(projector.size_px), WHITE), projector.size_px)
-    available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
-    exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_s)[0]
-    for number in range(EXPOSURE_TRIES):
-        context.check()
-        shot = Shot(f"try-{number}", rig.on_outputs({projector.name: white}), exposure_s)
-        # The display's delay is not known yet: the first photograph of this white waits for the longest possible.
-        file, confirmed_s = rig.acquirer.take(
-            shot, context.folder / CAPTURES, deadline=context.deadline, wait_s=LONGEST_S if number == 0 else None
-        )
-        image = read_photograph(file.path, response=nominal_response()).measured()
-        file.path.unlink()
-        choice = choose_brackets(image, confirmed_s, available, most=WHITE_EXPOSURES)
-        exposure_s = choice.exposures_s[0]
-        if choice.settled:
-            return Exposures(exposure_s, choice.exposures_s)
-    rig.check_light(deadline=context.deadline)  # a longer exposure does not help with a dead lamp
-    raise CalibrationError(
-        "exposure-not-found",
-        what=f"No exposure suits the white light of projector {projector.name}.",
-        remedy="Check that it lights the object and the room is dark. Check the camera's aperture and ISO.",
-    )
-
-
 def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[Path]:
     base_s = max(found.base_s for found in Exposures.read(context.folder).values())
     exposures = bracket(base_s, BLACK_BRACKET, rig.acquirer.exposures_s(), longest_s)
@@ -194,4 +158,4 @@ def _sizes(rig: Rig) -> str:
     return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
 
 
-__all__ = ["bracket", "capture_steps", "code_step", "linked"]
+__all__ = ["capture_steps", "code_step", "linked"]

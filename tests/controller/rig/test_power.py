@@ -47,6 +47,17 @@ def test_all_lamps_are_struck_and_waited_for_until_their_light_is_steady() -> No
     assert RULES.stable_s <= room.world.time_s - 1000 <= RULES.stable_s + 2
 
 
+@pytest.mark.parametrize("but_s", [0.0, 10.0, 1000.0])
+def test_lamps_may_be_waited_for_until_they_are_nearly_steady(but_s: float) -> None:
+    room = Room()
+    light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)
+    lit_s = room.world.time_s
+    steady(room.guards, deadline=soon(), advance=room.advance, clock=room.world, but_s=but_s)
+    left_s = max(guard.stable_left_s() for guard in room.guards)
+    assert left_s <= but_s
+    assert room.world.time_s == lit_s or left_s > but_s - 2
+
+
 def test_lamps_that_must_rest_are_waited_for() -> None:
     room = Room()
     light(room.guards, deadline=soon(), advance=room.advance, clock=room.world)

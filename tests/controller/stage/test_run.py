@@ -6,6 +6,7 @@ import errno
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +185,26 @@ def test_lamps_are_lit_while_the_work_goes_on_and_off_afterwards(models: Models)
     ]  # fmt: skip
     with Journal(run) as journal:
         assert journal.outcomes() == [("trial", "done")]
+
+
+def test_what_needs_no_stable_light_is_done_while_lamps_become_stable(models: Models) -> None:
+    """In the order of the list otherwise; the state tells whether the lamps are stable."""
+    (models.folder / "stage.toml").write_text(STAGE + "stable_s = 0.5\n")
+    done: list[tuple[str, str]] = []
+
+    def steps(rig: Rig, run: Path) -> Sequence[Step]:
+        def noting(name: str, context: Context) -> Sequence[Path]:
+            stable = max(guard.stable_left_s() for guard in rig.guards) <= 0
+            done.append((name, "stable" if stable else "not yet"))
+            assert all(lamp.lit for lamp in models.lamps.values())
+            return ()
+
+        names = {"first": False, "delay": True, "last": False}
+        return [Step(StepId(name), partial(noting, name), unsteady=early) for name, early in names.items()]
+
+    checked = check_stage(models.folder, drivers=models.drivers)
+    OwnSession(models.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
+    assert done == [("delay", "not yet"), ("first", "stable"), ("last", "stable")]
 
 
 def test_the_folder_of_sockets_goes_with_the_run_unless_a_player_has_said_something(models: Models) -> None:

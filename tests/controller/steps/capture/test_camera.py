@@ -27,6 +27,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Context
 from controller.steps.capture import camera as camera_steps
+from controller.steps.capture import exposure as exposure_steps
 from controller.steps.capture import photographs as shots
 from controller.steps.capture.camera import delay_step
 from controller.steps.capture.photographs import Planned, take_all
@@ -106,7 +107,7 @@ class LateStage:
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (latency, camera_steps, shots):
+    for module in (latency, camera_steps, exposure_steps, shots):
         monkeypatch.setattr(module, "LONGEST_S", LONGEST_S)
 
 
@@ -152,7 +153,7 @@ def photographs(paths: list[Path]) -> list[bool]:
 
 
 def test_the_delay_is_measured_and_then_every_photograph_shows_its_own_frames(rig: Rig, context: Context) -> None:
-    (path,) = delay_step(rig).run(context)
+    (path,) = delay_step(rig, 4.0).run(context)
     wait_s = json.loads(path.read_text())["wait_s"]
     assert LATE_S <= wait_s < LATE_S + 0.2
     assert rig.acquirer.wait_s == pytest.approx(wait_s)
@@ -166,7 +167,7 @@ def test_with_the_fixed_wait_alone_photographs_would_show_the_frames_before(rig:
 
 
 def test_a_run_that_goes_on_waits_as_long_as_was_measured(rig: Rig, context: Context, stage: LateStage) -> None:
-    delay_step(rig).run(context)
+    delay_step(rig, 4.0).run(context)
     fresh = Acquirer(stage, stage, iso=100, aperture_f=None, settle_s=0.01)
     again = Rig(rig.stage, rig.projectors, stage, stage, fresh)
     assert all(photographs(take_all(again, context, plan(), into=PhotographSet("stripes"))))

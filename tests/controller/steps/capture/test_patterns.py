@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.artefacts.camera import Exposures
-from controller.steps.capture.patterns import bracket, linked
+from controller.steps.capture.exposure import bracket
+from controller.steps.capture.patterns import linked
 
 EXPOSURES_S = [2.0 ** (number / 3) for number in range(-30, 10)]
 
