@@ -51,8 +51,8 @@ class Rig:
     def guards(self) -> tuple[LampGuard, ...]:
         return tuple(projector.guard for projector in self.projectors)
 
-    def check_light(self, *, deadline: Deadline) -> None:
-        """Check every projector: a photograph is valid only if each lamp is on and stable.
+    def check_light(self, *, deadline: Deadline, stable: bool = True) -> None:
+        """Check every projector: a photograph is valid only if each lamp is on and ``stable``.
 
         Raises DeviceRefused("projector-fault" or "lamp-went-off"), and what the drivers raise.
         """
@@ -60,7 +60,7 @@ class Rig:
             status = guard.status(deadline=deadline.within(guard.answer_s))
             if status.power is Power.FAULT:
                 raise faulty(guard.name, status, then=START_AGAIN)
-            if status.power is not Power.ON or guard.stable_left_s() > 0:
+            if status.power is not Power.ON or (stable and guard.stable_left_s() > 0):
                 raise DeviceRefused(
                     "lamp-went-off",
                     what=f"The lamp of projector {guard.name} went off during the work.",

@@ -132,7 +132,7 @@ def _measure_delay(rig: Rig, longest_s: float, context: Context) -> Sequence[Pat
         return image
 
     found = measure_latency(look)
-    rig.check_light(deadline=context.deadline)
+    rig.check_light(deadline=context.deadline, stable=False)
     path = Delay(found.wait_s, found.delay_s, found.tries, exposure_s).write(context.folder)
     rig.acquirer.set_delay(found.wait_s)
     return [path]

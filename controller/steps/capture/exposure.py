@@ -57,7 +57,7 @@ def white_exposures(rig: Rig, context: Context, white: White, longest_s: float, 
         exposure_s = choice.exposures_s[0]
         if choice.settled:
             return choice.exposures_s
-    rig.check_light(deadline=context.deadline)  # a longer exposure does not help with a dead lamp
+    rig.check_light(deadline=context.deadline, stable=False)  # a longer exposure does not help with a dead lamp
     raise CalibrationError(
         "exposure-not-found",
         what=f"No exposure suits the white light of {white.named}.",
