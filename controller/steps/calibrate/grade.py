@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.camera import Exposures
@@ -21,7 +22,7 @@ from controller.bundle.export import png
 from controller.calibrate.photometry.glare import veiled, veiling_glare
 from controller.calibrate.photometry.gloss import gloss_strength, glossy
 from controller.calibrate.photometry.surface_spread import spreading, typical_spread
-from controller.calibrate.values import ProjectorCalibration
+from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
 from controller.capture.pattern_frames import device_frame, frame
@@ -30,6 +31,7 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.core.troubles import TroubleCode
 from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
+from controller.run.side_by_side import side_by_side
 from controller.run.step_id import StepId
 from controller.solve.scaling.dither import to_light
 from controller.steps import costs
@@ -37,6 +39,9 @@ from controller.steps.appearance.solving import random_pattern
 from controller.steps.calibrate.drift import shown_frames
 from controller.steps.capture.photographs import Planned, take_all
 from controller.steps.troubles import tell
+
+JUDGING_BYTES: Final = 300
+"""A camera pixel, while one projector is judged (decision 97)."""
 
 
 def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -> Step:
@@ -83,25 +88,15 @@ def _taken(folder: Path, projector: str, pattern: Pattern) -> Taken:
 
 
 def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
-    calibration, transport = calibrated.calibration, calibrated.transport
+    calibration, _, _ = calibrated.calibration, calibrated.transport, calibrated.indirect  # read once, before threads
     figures, pictures = {}, []
     maps: dict[str, ErrorMaps] = {}
-    for n, part in enumerate(calibration.projectors):
-        context.advance(n / len(calibration.projectors), part.name)
-        rows, columns = part.metapixels.valid.shape
-        pattern = random_pattern((columns, rows))
-        shown = _shown(context.folder, part, pattern, (columns, rows))
-        light, indirect = transport.forward_part(n, shown), calibrated.indirect_of(n, shown)
-        taken = _taken(context.folder, part.name, pattern)
-        seen = taken.per_second()
-        expected = light + calibration.black if indirect is None else light + indirect + calibration.black
-        found = verify(expected, seen, calibration.black, transport.lit[n])
-        why = attribute_error(
-            transport, calibration, n, shown, seen, exposure_s=taken.exposure_s, indirect=indirect
-        )  # fmt: skip
-        figures[part.name] = _figures(found, why) | _indirect_figures(context.folder, part.name)
-        maps[part.name] = ErrorMaps(found.error_map, why.labels)
-        pictures.append(attribution_picture(why, calibration, part.name))
+    count = len(calibration.projectors)
+    judged = side_by_side(partial(_judged, calibrated, context.folder), count, bytes_each=_judging_bytes(calibration))
+    for n, (part, one) in enumerate(zip(calibration.projectors, judged, strict=True)):
+        context.advance((n + 1) / (count + 1), part.name)
+        figures[part.name], maps[part.name], picture = one
+        pictures.append(picture)
     geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
     troubles = {
         TroubleCode.GLOSS: glossy(gloss_strength(calibration, geometry)),
@@ -110,6 +105,29 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     }
     said = tell(context, StepId(StepKind.VERIFY), troubles)
     return [*write_grade(context.folder, figures, maps, png(in_rows(pictures))), said]
+
+
+def _judged(calibrated: Calibrated, folder: Path, n: int) -> tuple[dict[str, object], ErrorMaps, ByteImage]:
+    """Figures of projector ``n``, its errors, and a picture of their causes."""
+    calibration, transport = calibrated.calibration, calibrated.transport
+    part = calibration.projectors[n]
+    rows, columns = part.metapixels.valid.shape
+    pattern = random_pattern((columns, rows))
+    shown = _shown(folder, part, pattern, (columns, rows))
+    light, indirect = transport.forward_part(n, shown), calibrated.indirect_of(n, shown)
+    taken = _taken(folder, part.name, pattern)
+    seen = taken.per_second()
+    expected = light + calibration.black if indirect is None else light + indirect + calibration.black
+    found = verify(expected, seen, calibration.black, transport.lit[n])
+    why = attribute_error(
+        transport, calibration, n, shown, seen, exposure_s=taken.exposure_s, indirect=indirect
+    )  # fmt: skip
+    figures = _figures(found, why) | _indirect_figures(folder, part.name)
+    return figures, ErrorMaps(found.error_map, why.labels), attribution_picture(why, calibration, part.name)
+
+
+def _judging_bytes(calibration: Calibration) -> int:
+    return JUDGING_BYTES * calibration.object_mask.size
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:
