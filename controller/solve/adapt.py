@@ -5,7 +5,8 @@ falls on a pale one it stays pale. What is not seen is a limit that varies slowl
 becomes smooth limits (``smooth_limits``), and the target is bent towards them as a film bends highlights: what keeps
 well away from a limit stays as it is, differences beyond it shrink.
 
-1. Dark: no darker than a smooth floor, in grey, so that shadows don't take on the colour of the light in them.
+1. Dark: no darker than a smooth floor, in grey, so that shadows don't take on the colour of the light in them. Paint on
+   which no grey outshines that colour keeps it, and does not lift what is around.
 2. Chroma: no more saturated than can be shown around; the hue and the lightness stay.
 3. Light: no brighter than a smooth ceiling. Mostly all channels together, so that highlights keep their colour.
 
@@ -20,7 +21,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask, strips
-from controller.core.channels import largest
+from controller.core.channels import largest, smallest
 from controller.core.errors import UsageError
 from controller.solve.bounded.solver import check_target
 from controller.solve.drive_levels import DriveLevels
@@ -93,13 +94,15 @@ class _Bent:
         self._chroma: FloatImage = np.ones(drive.mask.shape, np.float32)
 
     def lift(self) -> None:
-        """Raise the darkest parts by grey light."""
+        """Raise the darkest parts by grey light, where the stage can make a grey that bright at all."""
         need = np.zeros_like(self._lowest)
         for rows in strips(len(need)):
             floor, wanted = self._floor[rows], np.maximum(self._wanted[rows], 0)
-            lowest = _quotient(self._drive.of(floor, rows), self._drive.of(np.ones_like(floor), rows), otherwise=0.0)
-            self._lowest[rows] = np.maximum(largest(lowest), 0)
-            lacking = self._drive.mask[rows] & (wanted @ GREY < self._lowest[rows])
+            of_floor, of_grey = self._drive.of(floor, rows), self._drive.of(np.ones_like(floor), rows)
+            self._lowest[rows] = np.maximum(largest(_quotient(of_floor, of_grey, otherwise=0.0)), 0)
+            brightest = smallest(_quotient(of_floor + 1, of_grey, otherwise=np.inf))
+            shown = self._lowest[rows] <= brightest
+            lacking = self._drive.mask[rows] & shown & (wanted @ GREY < self._lowest[rows])
             need[rows] = np.where(lacking, self._lowest[rows], 0)
         self._level = self._limits.above(need)
         np.maximum(self._lowest, self._level, out=self._lowest)

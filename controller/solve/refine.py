@@ -123,6 +123,8 @@ def refusal(
         return "it is too dark"
     if seen > BRIGHTEST * wanted:
         return "it is too bright"
+    if measured.sum() < (1 - MOST_REJECTED) * mask.sum():
+        return "too much of it is overexposed"
     if trusted.sum() < (1 - MOST_REJECTED) * mask.sum():
         return "something moved or stood in the picture"
     return None

@@ -77,6 +77,20 @@ def test_dark_places_of_the_object_do_not_show_through_a_highlight() -> None:
     assert np.log(bent[inside]).std() < 0.25 * np.log(cut[inside]).std()
 
 
+def test_coloured_light_that_no_grey_outshines_lifts_nothing_around() -> None:
+    """Red light of other surfaces on a patch, brighter than any grey that can be shown there: it stays red."""
+    floor = np.array(STAGE.black, np.float32)
+    patch = np.s_[40:80, 60:100]
+    floor[patch] += np.array([2.0, 0.1, 0.1], np.float32) * REACH[patch]
+    wanted = np.asarray(STAGE.black + 0.3 * REACH, np.float32)
+    bent = adapted(wanted, floor)
+    around = np.ones(wanted.shape[:2], np.bool_)
+    around[patch] = False
+    np.testing.assert_array_equal(bent[around], wanted[around])
+    floor[patch] = STAGE.black[patch] + np.array([0.2, 0.05, 0.05], np.float32) * REACH[patch]
+    assert (adapted(wanted, floor)[60, 58] > 1.02 * wanted[60, 58]).all(), "light that a grey outshines lifts it"
+
+
 def test_chroma_goes_before_lightness() -> None:
     """A colour more saturated than can be shown becomes paler, of the same hue and lightness."""
     floor = np.asarray(STAGE.black + np.array([0, 0, 0.08], np.float32) * np.median(REACH), np.float32)

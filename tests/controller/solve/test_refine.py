@@ -265,6 +265,17 @@ def test_a_photograph_that_measured_nothing_is_refused() -> None:
     assert refusal(photograph, found.target, found.stage, found.mask, trusted) == "it is too dark"
 
 
+def test_a_photograph_that_is_clipped_in_half_of_the_picture_says_so() -> None:
+    found = result()
+    photograph = found.photograph(found.frames)
+    radiance = photograph.radiance.copy()
+    radiance[: CAMERA[0] // 2] = np.nan
+    photograph = replace(photograph, radiance=radiance)
+    predicted = found.predicted(found.frames)
+    trusted = trusted_pixels(photograph, predicted, found.stage, found.mask)
+    assert refusal(photograph, predicted, found.stage, found.mask, trusted) == "too much of it is overexposed"
+
+
 def test_nothing_is_corrected_beyond_the_border_of_what_is_trusted() -> None:
     found = result(light=indirect(0.1))
     trusted = np.zeros(CAMERA, np.bool_)
