@@ -126,6 +126,22 @@ def test_any_target_stays_finite_and_comes_nearer_to_what_can_be_shown(
     assert lacking[1] <= lacking[0] * (1 + 1e-4) + 1e-6
 
 
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000), bright=st.floats(0.05, 1), coloured=st.floats(0, 3))
+def test_light_of_any_colour_from_other_surfaces_never_puts_more_out_of_reach(
+    seed: int, bright: float, coloured: float
+) -> None:
+    random = np.random.default_rng(seed)
+    coarse = (np.kron(random.random((6, 8, 3)) ** power, np.ones((20, 20, 1))) for power in (3, 6))
+    wanted, floor = (np.asarray(one * REACH, np.float32) for one in coarse)
+    wanted, floor = wanted * np.float32(bright), STAGE.black + floor * np.float32(coloured)
+    bent = adapted(wanted, floor)
+    before, after = (np.abs(off - np.clip(off, 0, 1)) for off in (DRIVE.of(one - floor) for one in (wanted, bent)))
+    mask = TRANSPORT.object_mask
+    in_reach = [float((np.nan_to_num(off).max(axis=2) <= 0.02)[mask].mean()) for off in (before, after)]
+    assert in_reach[1] >= in_reach[0] - 0.02
+
+
 def test_no_strength_leaves_a_target_as_it_is_and_a_wrong_one_is_refused() -> None:
     wanted = highlight(2.0)
     np.testing.assert_array_equal(adapted(wanted, strength=0.0), wanted)
