@@ -28,6 +28,7 @@ MOST_ENDS: Final = 12
 WRITTEN_S: Final = 60.0
 """Twice the pause after which the log is written again."""
 ENDED: Final = ("player-hung", "player-gone")
+STARTED: Final = "service-started"
 
 
 class LogWitness:
@@ -178,8 +179,9 @@ class LogWitness:
             self._ends_s.append(now_s)
             if len(self._ends_s) == MOST_ENDS and now_s - self._ends_s[0] < WORDS_S:
                 raise Broken("few ends", f"the player was ended {MOST_ENDS} times in {now_s - self._ends_s[0]:.0f} s")
-        # Who asks often gets as many answers: a request, and the line after it, are words of their own.
-        asked = "done-by" in (row.code, self._before)
+        # Who asks often gets as many answers: a request, and the line after it, are words of their own. So is a start,
+        # because people restart the service; what ends by itself is another promise.
+        asked = "done-by" in (row.code, self._before) or row.code == STARTED
         self._before = row.code
         text = f"{row.text} ({row.number})" if asked else row.text
         recent.append((now_s, text))
