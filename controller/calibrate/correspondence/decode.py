@@ -24,7 +24,7 @@ from controller.calibrate.correspondence.smoothing import correct_for_paint, fit
 from controller.calibrate.values import Correspondence
 from controller.capture.patterns import BLUR_FREQUENCIES, CELL_PX, PERIOD_PX, PHASE_STEPS, PatternPlan
 from controller.capture.profile import CameraNoise
-from controller.core.arrays import FloatImage, Mask, array_in_file
+from controller.core.arrays import FloatImage, Mask, array_in_file, strips
 from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
 
@@ -36,6 +36,8 @@ WORST_NOISE_PX = 0.6
 """Noise of one camera pixel by the coarse phase alone; a fringe is 5 px wide."""
 LEAST_CONSISTENT = 0.6
 LEAST_STEADY = 0.75
+SAME_PHASE_PX = 2.0
+"""From a camera pixel to the next on one surface, apart from whole periods; by chance, a sixth of all edges."""
 LEAST_UNCONTRADICTED = 0.5
 WITHOUT_DIAGONAL = 0.7
 """The same where no diagonal phase helps to contradict: by chance, a wrong fine phase fits the coarse one in 56 %."""
@@ -298,13 +300,22 @@ def _check_order(
 
 
 def _steady_share(position_px: FloatImage, agreeing: Mask) -> float:
-    """Of adjacent camera pixels in different cells, the share in adjacent cells."""
+    """Of adjacent camera pixels in different cells, the share in which the code is not wrong.
+
+    A wrong code is off by whole periods, so that the phases go on as if it were right. From one surface to another
+    in front of it, phases jump, too: that is no fault, however many edges an object has.
+    """
     crossings = jumps = 0
-    cell = np.floor(np.where(agreeing, position_px, np.nan) / np.float32(CELL_PX))
-    for axis in range(2):
-        step = np.abs(np.diff(cell, axis=axis))
-        crossings += int(np.count_nonzero(step > 0))
-        jumps += int(np.count_nonzero(step > 1))
+    for rows in strips(len(position_px)):
+        # and the row after them, for steps from row to row
+        more = slice(rows.start, rows.stop + 1)
+        place = np.where(agreeing[more], position_px[more], np.float32(np.nan))
+        cell = np.floor(place / np.float32(CELL_PX))
+        for axis, here in ((0, slice(None)), (1, slice(rows.stop - rows.start))):
+            step, away = np.abs(np.diff(cell[here], axis=axis)), np.diff(place[here], axis=axis)
+            goes_on = np.abs(away - PERIOD_PX * np.round(away / PERIOD_PX)) < SAME_PHASE_PX
+            crossings += int(np.count_nonzero(step > 0))
+            jumps += int(np.count_nonzero((step > 1) & goes_on))
     return 1 - jumps / crossings if crossings else 1.0
 
 

@@ -207,6 +207,8 @@ def _of_pattern(
     fit = np.flatnonzero((distance >= SIGMAS_CLEAR * blur_px) & (distance <= FARTHEST_PX) & np.isfinite(seen))
     fit = fit[:: max(1, len(fit) // MOST_PIXELS)]
     fit = fit[_alike(seen[fit] / light[fit], distance[fit])]
+    if len(fit) < FEWEST_PIXELS:
+        return
     at, seen, light, parts = at[fit], seen[fit].astype(np.float64), light[fit].astype(np.float64), parts[fit]
     each = [light * np.interp(at, pixels, _spread_along(shown, d)) for d in DISTANCES_PX]
     alone = np.stack([*each, seen], axis=1)

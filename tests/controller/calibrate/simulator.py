@@ -32,6 +32,8 @@ class Scene:
     bend: float = 3.0
     step_px: float = 0.0
     """Projector px by which the right 40 % of the camera's image look farther right: a depth edge."""
+    bars_px: int = 0
+    """With bars, it is every other strip of so many camera px instead: a fence before a wall."""
     projector_blur_px: float = 0.3
     camera_blur_px: float = 0.6
     lit_share_of_pixel: int = 8
@@ -67,7 +69,9 @@ class Scene:
         r2 = np.sum((q / 60) ** 2, axis=-1, keepdims=True)
         w = 1 + 0.002 * q[..., :1]
         bulge = self.bend * np.stack([np.sin(q[..., 1] / 25), np.cos(q[..., 0] / 30)], axis=-1)
-        step = np.where(camera[..., :1] > 0.6 * self.camera_px[0], self.step_px, 0.0) * np.array([1.0, 0.0])
+        x = camera[..., :1]
+        nearer = (x // self.bars_px) % 2 == 1 if self.bars_px else x > 0.6 * self.camera_px[0]
+        step = np.where(nearer, self.step_px, 0.0) * np.array([1.0, 0.0])
         return np.asarray(q * (1 + 0.05 * r2) / w + bulge + step + (np.array(self.projector_px) - 1) / 2)
 
     def jacobian(self, camera: Float64) -> Float64:
@@ -112,10 +116,10 @@ class Scene:
 
 @functools.lru_cache(maxsize=8)
 def _lookup(
-    camera_px: tuple[int, int], projector_px: tuple[int, int], scale: float, bend: float, step_px: float
+    camera_px: tuple[int, int], projector_px: tuple[int, int], scale: float, bend: float, step_px: float, bars_px: int
 ) -> FloatImage:
     """Where each subsample of the camera looks in the enlarged picture, by the geometry of a scene."""
-    scene, s = Scene(camera_px, projector_px, scale, bend, step_px), SUPERSAMPLED
+    scene, s = Scene(camera_px, projector_px, scale, bend, step_px, bars_px), SUPERSAMPLED
     y, x = np.mgrid[0 : camera_px[1] * s, 0 : camera_px[0] * s]
     sub = np.stack([(x + 0.5) / s - 0.5, (y + 0.5) / s - 0.5], axis=-1)
     found: FloatImage = ((scene.projector_of(sub) + 0.5) * ENLARGED - 0.5).astype(np.float32)
@@ -145,7 +149,9 @@ class Stage:
         self.random = np.random.default_rng(scene.seed)
         columns, rows = scene.camera_px
         s = SUPERSAMPLED
-        self._lookup = _lookup(scene.camera_px, scene.projector_px, scene.scale, scene.bend, scene.step_px)
+        self._lookup = _lookup(
+            scene.camera_px, scene.projector_px, scene.scale, scene.bend, scene.step_px, scene.bars_px
+        )
         smooth = cv2.resize(self.random.uniform(0.4, 1.0, (rows // 16, columns // 16, 3)), (columns * s, rows * s))
         patches = (
             self.random.uniform(0.5, 1.0, (rows // 10 + 1, columns // 10 + 1, 3)).repeat(10 * s, 0).repeat(10 * s, 1)

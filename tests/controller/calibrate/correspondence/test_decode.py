@@ -92,6 +92,19 @@ def test_a_depth_edge_neither_mixes_surfaces_nor_spreads() -> None:
     assert np.mean(found.valid[inside & ~near]) > 0.99
 
 
+@pytest.mark.parametrize("step_px", [13.0, 20.0, 30.0])
+def test_an_object_with_many_depth_edges_is_no_contradiction(step_px: float) -> None:
+    """Bars narrower than a cell: most cells beside each other in the picture are none on the projector's."""
+    scene = Scene(step_px=step_px, bars_px=11)
+    found = decode(photographed(scene), PLAN)
+    at = np.arange(scene.camera_px[0]) % scene.bars_px
+    inside = found.valid & (at > 1) & (at < scene.bars_px - 1)
+    error = np.abs(found.projector_px - positions(scene))[inside]
+    assert np.count_nonzero(inside) > 5000
+    assert float(np.median(error)) < 0.05
+    assert float(np.percentile(error, 99)) < 0.75
+
+
 @pytest.mark.parametrize("name", ["black", "gray-x-2", "phase-y-2", "blur-d-1"])
 def test_a_missing_capture_is_named(name: str) -> None:
     captures = changed()
