@@ -1,7 +1,7 @@
 """Appearances on stages whose surfaces light each other, by paths through Mitsuba: against the light without noise.
 
 Stages: a bust in a painted corner, a bowl, a vase beside a bust, balls on steps, a bust in a niche, a vase between
-coloured walls (``benchmarks.lab.scenes``).
+coloured walls, a fence before a wall (``benchmarks.lab.scenes``).
 Each is calibrated and refined as the command line would, through its devices; then its frames are judged in the optical
 model. The worst stage counts.
 ``BENCH_SCENES`` and ``BENCH_SEEDS`` choose some; ``BENCH_FOLDER`` keeps the stages, and measures kept ones again.

@@ -1,5 +1,5 @@
 """Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust, steps, a bust in a
-niche, a vase between walls."""
+niche, a vase between walls, a fence before a wall."""
 
 from __future__ import annotations
 
@@ -113,8 +113,25 @@ def alcove() -> Part:
     )  # fmt: skip
 
 
+def fence() -> Part:
+    """Nine thin bars and two rails before a wall in squares: a third of what the camera sees is beside a depth edge."""
+    wide, high = np.array([0.32, 0.0, 0.0]), np.array([0.0, 0.24, 0.0])
+    parts = [_plane(np.array([-0.16, 0.0, -0.08]), wide, high, (0.25, 0.45, 0.70), (0.75, 0.70, 0.50), 7)]
+    for number in range(9):
+        bar = trimesh.creation.cylinder(0.004, 0.2, sections=24)
+        points = np.asarray(bar.vertices)[:, [0, 2, 1]] + (-0.14 + 0.035 * number, 0.1, 0.02)
+        parts.append(
+            (points, np.asarray(bar.faces, np.float64)[:, ::-1], np.tile((0.80, 0.75, 0.60), (len(points), 1)))
+        )
+    for level in (0.05, 0.15):
+        at, along = np.array([-0.15, level, 0.028]), np.array([0.30, 0.0, 0.0])
+        parts.append(_plane(at, along, np.array([0.0, 0.012, 0.0]), (0.60, 0.20, 0.15), (0.80, 0.75, 0.60), 6))
+    return _together(*parts)
+
+
 SCENES: Final[Mapping[str, Callable[[], Part]]] = {
     "corner": corner, "bowl": bowl, "two-objects": two_objects, "steps": steps, "niche": niche, "alcove": alcove,
+    "fence": fence,
 }  # fmt: skip
 
 
