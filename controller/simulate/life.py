@@ -51,6 +51,8 @@ while all is well.
 CALMER: Final = 3.0
 END_S: Final = 150.0
 SERVES_S: Final = 60.0
+RENEWS_S: Final = 2 * SERVES_S
+"""The same with saved settings, for which a service ends first: lamps go off, at projectors that may not answer."""
 KEEPS_S: Final = 30.0
 LOOKS_S: Final = 60.0
 WAITS_S: Final = DAY_S
@@ -110,7 +112,7 @@ class Life:
         self.unreadable: set[str] = set()
         self.sound: dict[str, bytes] = {}
         """What people will write again into files that are damaged."""
-        self.repaired_s = 0.0
+        self.repaired_s, self.renewed_s = 0.0, -1e9
         self._keep_by_s: float | None = None
         self._looked_s = 0.0
         self._order = itertools.count()
@@ -215,6 +217,7 @@ class Life:
         """A program that was not ended since has a service. Raises Broken."""
         spoilt = {"stage.toml", GOOD} <= self.unreadable
         spoilt = spoilt or self.world.scheduler.now_s - self.repaired_s < SERVES_S
+        spoilt = spoilt or self.world.scheduler.now_s - self.renewed_s < RENEWS_S
         if self.program is program and not program.dead and self.service is None and not spoilt:
             why = None if self.kiosk is None else self.kiosk.snapshot().reason
             raise Broken("serves", f"{SERVES_S:.0f} s after its start it does not: {why}")
@@ -262,7 +265,10 @@ class Life:
                     # The end sets both; the real one looks at both several times a second.
                     while not (stop.is_set() or kiosk.reload.is_set()):
                         kiosk.reload.wait()
-                    self.service = None
+                    self.service, self.renewed_s = None, world.scheduler.now_s
+                    if not stop.is_set():
+                        assert self.program is not None
+                        self.later(RENEWS_S, partial(self._serves, self.program))
                 kiosk.detach()
                 self.witness.disturb(0.0)
             except (VelaturaError, DeviceError) as error:
