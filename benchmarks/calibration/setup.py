@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
-import tomlkit
-
 from benchmarks import Row, at_most
 from benchmarks.lab.stage import FIRST_SEED, prepared_stage
+from controller.config.editing import KeyChange, rewrite_stage
 from controller.demo.stage import DEFAULT_ROOM
 from controller.run.progress import Phase, Progress, Silent
 from controller.services.calibrate import calibrate, make_appearances
@@ -50,16 +49,9 @@ def measure(size: str) -> list[Row]:
     with prepared_stage(size, FIRST_SEED, room=os.environ.get("BENCH_ROOM", DEFAULT_ROOM)) as stage:
         truth = read_truth(stage)
         write_truth(stage, dataclasses.replace(truth, camera=dataclasses.replace(truth.camera, picture_s=PICTURE_S)))
-        _let_lamps_take(stage, STABLE_S)
+        rewrite_stage(stage / "stage.toml", [KeyChange(("safety",), "stable_s", STABLE_S)])
         with BenchProcess(stage, cancel=threading.Event()):
             return [row for which in os.environ.get("BENCH_SETS", SETS).split() for row in _of_set(stage, size, which)]
-
-
-def _let_lamps_take(stage: Path, seconds: float) -> None:
-    table = stage / "stage.toml"
-    settings = tomlkit.parse(table.read_text(encoding="utf-8"))
-    settings.setdefault("safety", tomlkit.table())["stable_s"] = seconds
-    table.write_text(tomlkit.dumps(settings), encoding="utf-8")
 
 
 @dataclass(slots=True)

@@ -120,9 +120,8 @@ def fence() -> Part:
     for number in range(9):
         bar = trimesh.creation.cylinder(0.004, 0.2, sections=24)
         points = np.asarray(bar.vertices)[:, [0, 2, 1]] + (-0.14 + 0.035 * number, 0.1, 0.02)
-        parts.append(
-            (points, np.asarray(bar.faces, np.float64)[:, ::-1], np.tile((0.80, 0.75, 0.60), (len(points), 1)))
-        )
+        colours = np.tile((0.80, 0.75, 0.60), (len(points), 1))
+        parts.append((points, np.asarray(bar.faces, np.float64)[:, ::-1], colours))
     for level in (0.05, 0.15):
         at, along = np.array([-0.15, level, 0.028]), np.array([0.30, 0.0, 0.0])
         parts.append(_plane(at, along, np.array([0.0, 0.012, 0.0]), (0.60, 0.20, 0.15), (0.80, 0.75, 0.60), 6))

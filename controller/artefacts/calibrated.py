@@ -71,6 +71,10 @@ class Calibrated:
             self._indirect_known = True
         return self._indirect
 
+    def read_all(self) -> None:
+        """Read what is read at its first use, so that threads may use it at the same time."""
+        _ = self.transport, self.indirect
+
     def indirect_of(self, n: int, frame: FloatImage) -> FloatImage | None:
         """What other surfaces throw back of projector ``n``'s linear frame, on table and walls, too; None without G."""
         if self.indirect is None:

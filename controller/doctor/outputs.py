@@ -103,7 +103,7 @@ def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Output
     with_shutter = [projector for projector in rig.projectors if projector.guard.capabilities.shutter]
     shown = []
     for projector in rig.projectors:
-        frames = rig.on_outputs({projector.name: np.full_like(projector.black(), 255)})
+        frames = rig.on_outputs({projector.name: projector.white()})
         bright = look.brightness(frames, exposure_s)
         # First the one in stage.toml: if the cables are right, one photograph per output is enough.
         suspects = sorted(with_shutter, key=lambda one: one is not projector)
@@ -141,7 +141,7 @@ class _Camera:
 
     def exposure_s(self) -> float:
         """Short enough for white on all outputs, so that no single output is clipped either."""
-        frames = {p.output: np.full_like(p.black(), 255) for p in self._rig.projectors}
+        frames = {p.output: p.white() for p in self._rig.projectors}
         for exposure_s in reversed(self._rig.acquirer.exposures_s()):
             if exposure_s <= 1.0 and self._values(frames, exposure_s)[1] < 0.01:
                 return exposure_s

@@ -34,6 +34,10 @@ class RigProjector:
         """(rows, columns, 3) uint8 zeros."""
         return np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
 
+    def white(self) -> ByteImage:
+        """The same of 255."""
+        return np.full((self.size_px[1], self.size_px[0], 3), 255, np.uint8)
+
 
 @dataclass(frozen=True, slots=True)
 class Rig:

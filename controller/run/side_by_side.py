@@ -25,10 +25,7 @@ def side_by_side(work: Callable[[int], T], count: int, *, bytes_each: int) -> It
         yield from map(work, range(count))
         return
     with ThreadPoolExecutor(together, thread_name_prefix="velatura-side-by-side") as pool:
-        try:
-            yield from pool.map(work, range(count))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        yield from pool.map(work, range(count))
 
 
 def threads_at_once(bytes_each: int) -> int:

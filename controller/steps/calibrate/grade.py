@@ -22,7 +22,7 @@ from controller.bundle.export import png
 from controller.calibrate.photometry.glare import veiled, veiling_glare
 from controller.calibrate.photometry.gloss import gloss_strength, glossy
 from controller.calibrate.photometry.surface_spread import spreading, typical_spread
-from controller.calibrate.values import Calibration, ProjectorCalibration
+from controller.calibrate.values import ProjectorCalibration
 from controller.calibrate.verify.error_attribution import ErrorAttribution, attribute_error, attribution_picture, ranked
 from controller.calibrate.verify.grade import Verification, verify
 from controller.capture.pattern_frames import device_frame, frame
@@ -88,11 +88,14 @@ def _taken(folder: Path, projector: str, pattern: Pattern) -> Taken:
 
 
 def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
-    calibration, _, _ = calibrated.calibration, calibrated.transport, calibrated.indirect  # read once, before threads
+    calibrated.read_all()
+    calibration = calibrated.calibration
     figures, pictures = {}, []
     maps: dict[str, ErrorMaps] = {}
     count = len(calibration.projectors)
-    judged = side_by_side(partial(_judged, calibrated, context.folder), count, bytes_each=_judging_bytes(calibration))
+    judged = side_by_side(
+        partial(_judged, calibrated, context.folder), count, bytes_each=JUDGING_BYTES * calibration.object_mask.size
+    )
     for n, (part, one) in enumerate(zip(calibration.projectors, judged, strict=True)):
         context.advance((n + 1) / (count + 1), part.name)
         figures[part.name], maps[part.name], picture = one
@@ -124,10 +127,6 @@ def _judged(calibrated: Calibrated, folder: Path, n: int) -> tuple[dict[str, obj
     )  # fmt: skip
     figures = _figures(found, why) | _indirect_figures(folder, part.name)
     return figures, ErrorMaps(found.error_map, why.labels), attribution_picture(why, calibration, part.name)
-
-
-def _judging_bytes(calibration: Calibration) -> int:
-    return JUDGING_BYTES * calibration.object_mask.size
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:

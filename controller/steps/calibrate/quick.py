@@ -194,7 +194,7 @@ def _correct_light(folder: Path, name: str, one: ProjectorDrift) -> None:
 
 def _photograph_white(rig: Rig, projector: RigProjector, context: Context) -> list[Path]:
     exposures = Exposures.read(context.folder)[projector.name].white_s
-    white = np.full_like(projector.black(), 255)
+    white = projector.white()
     plan = [
         Planned(str(number), partial(_one, projector.name, white), exposure_s)
         for number, exposure_s in enumerate(exposures)

@@ -46,7 +46,7 @@ def take_test_shots(
     folder.mkdir(parents=True, exist_ok=True)
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_exposure_s]
     take = partial(_take, rig, folder, deadline)
-    white = {projector.name: np.full_like(projector.black(), 255) for projector in rig.projectors}
+    white = {projector.name: projector.white() for projector in rig.projectors}
     exposure_s = bracket(FIRST_EXPOSURE_S, (1.0,), available, longest_exposure_s)[0]
     for number in range(TRIES):
         advance(0.04 * number, "exposure")

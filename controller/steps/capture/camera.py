@@ -104,7 +104,7 @@ def _at_most(available_s: Sequence[float], wanted_s: float) -> float:
 def _measure_delay(rig: Rig, longest_s: float, context: Context) -> Sequence[Path]:
     found_s = white_exposures(rig, context, White(rig.projectors, "all projectors together"), longest_s, most=1)[0]
     exposure_s = _at_most(rig.acquirer.exposures_s(), BRIGHTNESS_OF_ALL * found_s)
-    flats = [_flat(rig, 0), _flat(rig, 255)]
+    flats = [rig.on_outputs({}), rig.on_outputs({p.name: p.white() for p in rig.projectors})]
     shown: list[tuple[bool, float]] = []
     count = 0
 
@@ -143,13 +143,9 @@ def _provisional(path: Path) -> FloatImage:
     return read_photograph(path, response=nominal_response()).measured()
 
 
-def _flat(rig: Rig, value: int) -> dict[str, ByteImage]:
-    return rig.on_outputs({p.name: np.full_like(p.black(), value) for p in rig.projectors})
-
-
 def _photograph_response(rig: Rig, context: Context) -> Sequence[Path]:
     """The bracket series of the lit scene."""
-    whites: Mapping[str, ByteImage] = {p.name: np.full_like(p.black(), 255) for p in rig.projectors}
+    whites: Mapping[str, ByteImage] = {p.name: p.white() for p in rig.projectors}
     middle = _exposure_of_all(rig, context)
     available = rig.acquirer.exposures_s()
     wanted = {min(available, key=lambda value: abs(np.log2(value / middle) - stop)) for stop in RESPONSE_STOPS}

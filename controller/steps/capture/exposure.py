@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from controller.artefacts.names import CAPTURES
 from controller.capture.acquire import Shot
 from controller.capture.brackets import choose_brackets
@@ -34,7 +32,7 @@ class White:
 
     def frames(self) -> dict[str, ByteImage]:
         """By projector name."""
-        return {projector.name: np.full_like(projector.black(), 255) for projector in self.projectors}
+        return {projector.name: projector.white() for projector in self.projectors}
 
 
 def white_exposures(rig: Rig, context: Context, white: White, longest_s: float, *, most: int) -> tuple[float, ...]:
@@ -43,7 +41,7 @@ def white_exposures(rig: Rig, context: Context, white: White, longest_s: float, 
     At the first one white is just not clipped. Raises CalibrationError("exposure-not-found").
     """
     available = [value for value in rig.acquirer.exposures_s() if value <= longest_s]
-    exposure_s = bracket(white.first_s, (1.0,), available or rig.acquirer.exposures_s(), longest_s)[0]
+    exposure_s = bracket(white.first_s, (1.0,), rig.acquirer.exposures_s(), longest_s)[0]
     frames: Mapping[str, ByteImage] = rig.on_outputs(white.frames())
     for number in range(TRIES):
         context.check()

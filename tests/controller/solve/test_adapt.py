@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError
 from controller.solve.adapt import adapted_target
 from controller.solve.drive_levels import DriveLevels
@@ -35,6 +35,11 @@ def checked(size_px: int) -> FloatImage:
     """(rows, columns) of 0 and 1."""
     y, x = np.mgrid[0:120, 0:160]
     return np.asarray((y // size_px + x // size_px) % 2, np.float32)
+
+
+def patches(random: np.random.Generator, power: int) -> Float64:
+    """(rows, columns, 3) squares of random colours from 0 to 1, the darker the higher the ``power``."""
+    return np.asarray(np.kron(random.random((6, 8, 3)) ** power, np.ones((20, 20, 1))), np.float64)
 
 
 def highlight(peak: float) -> FloatImage:
@@ -112,8 +117,7 @@ def test_any_target_stays_finite_and_comes_nearer_to_what_can_be_shown(
     seed: int, bright: float, strength: float
 ) -> None:
     random = np.random.default_rng(seed)
-    coarse = np.kron(random.random((6, 8, 3)) ** 3, np.ones((20, 20, 1)))
-    wanted = (coarse * REACH * bright).astype(np.float32)
+    wanted = (patches(random, 3) * REACH * bright).astype(np.float32)
     bent = adapted(wanted, strength=strength)
     assert np.isfinite(bent).all()
     assert (bent >= 0).all()
@@ -132,8 +136,7 @@ def test_light_of_any_colour_from_other_surfaces_never_puts_more_out_of_reach(
     seed: int, bright: float, coloured: float
 ) -> None:
     random = np.random.default_rng(seed)
-    coarse = (np.kron(random.random((6, 8, 3)) ** power, np.ones((20, 20, 1))) for power in (3, 6))
-    wanted, floor = (np.asarray(one * REACH, np.float32) for one in coarse)
+    wanted, floor = (np.asarray(patches(random, power) * REACH, np.float32) for power in (3, 6))
     wanted, floor = wanted * np.float32(bright), STAGE.black + floor * np.float32(coloured)
     bent = adapted(wanted, floor)
     before, after = (np.abs(off - np.clip(off, 0, 1)) for off in (DRIVE.of(one - floor) for one in (wanted, bent)))
