@@ -118,7 +118,7 @@ def test_a_lost_acknowledgement_strikes_once_and_is_confirmed_by_the_state(open_
 
 
 def expecting_late_ones(text: str) -> str:
-    return hasty(text).replace("late_s = 0.8", "late_s = 2.0")
+    return hasty(text).replace("answer_s = 0.4", "answer_s = 0.8").replace("late_s = 0.8", "late_s = 2.4")
 
 
 def test_a_late_answer_is_never_the_answer_to_the_next_question(open_serial: Any) -> None:
@@ -127,7 +127,8 @@ def test_a_late_answer_is_never_the_answer_to_the_next_question(open_serial: Any
         pair = open_serial(profile=profile, name=profile, lamp=lamp, edit=expecting_late_ones)
         before = pair.driver.status(deadline=in_seconds(SOON)).power
         for _ in range(2):
-            pair.emulator.faults.set(late_s=0.6)  # later than the driver waits, sooner than it gives up on it
+            # Just later than the driver waits, so that an emulator that is slow itself still answers before it gives up.
+            pair.emulator.faults.set(late_s=0.9)
             assert pair.driver.status(deadline=in_seconds(SOON)).power is before
 
     each(SERIAL, late_twice)
