@@ -20,6 +20,7 @@ from controller.core.storage import sha256_of
 
 if TYPE_CHECKING:
     from controller.solve.bounded.problem import Solution
+    from controller.solve.refine import ModelError
     from controller.solve.targets.values import Target
 
 _SOLUTION = ("objective", "kkt", "iterations", "seconds", "converged")
@@ -229,6 +230,7 @@ class Refining:
     where not compared; None before the first photograph that counted
     ``photographs``: one row of figures for each; ``ended``: why there are no more, "" while there may be
     ``equations``: what they say of common causes (``solve.common_causes``), added; None before the first that counted
+    ``seen``: the model's error by all of them; None before the first that counted
     """
 
     frames: dict[str, FloatImage]
@@ -237,6 +239,7 @@ class Refining:
     photographs: tuple[dict[str, Any], ...] = ()
     ended: str = ""
     equations: Float64 | None = None
+    seen: ModelError | None = None
 
     def write(self, run: Path, name: str, number: int) -> list[Path]:
         arrays = _named("frame", self.frames)
@@ -244,19 +247,25 @@ class Refining:
             arrays |= {**_named("best", self.best), "error": self.error}
         if self.equations is not None:
             arrays["equations"] = self.equations
+        if self.seen is not None:
+            arrays |= {"model-error": self.seen.light, "model-sigma": self.seen.sigma}
         path = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
         save_arrays(path.with_suffix(".npz"), arrays)
         return [path.with_suffix(".npz"), write_json(path, {"photographs": self.photographs, "ended": self.ended})]
 
     @classmethod
     def read(cls, run: Path, name: str, number: int, projectors: Sequence[str]) -> Self:
+        from controller.solve.refine import ModelError
+
         path = run / f"{stem(StepKind.REFINE, name, part=number)}.json"
         arrays, figures = load_arrays(path.with_suffix(".npz")), read_json(path)
         frames = {projector: arrays[f"frame-{projector}"] for projector in projectors}
         error = arrays.get("error")
         best = None if error is None else {projector: arrays[f"best-{projector}"] for projector in projectors}
         recorded = tuple(figures["photographs"]), str(figures["ended"])
-        return cls(frames, best, error, *recorded, arrays.get("equations"))
+        light = arrays.get("model-error")
+        seen = None if light is None else ModelError(light, arrays["model-sigma"])
+        return cls(frames, best, error, *recorded, arrays.get("equations"), seen)
 
 
 def write_causes(run: Path, figures: Mapping[str, Any]) -> Path:

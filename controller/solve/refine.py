@@ -54,6 +54,8 @@ STEADY_STEP_PX: Final = 3
 """Every so many rows and columns are looked at for what lamps that flicker change."""
 SURE: Final = 2.0
 """Standard deviations of what lamps flicker by: a smaller factor of a projector's light says nothing."""
+LEAST_FLICKER: Final = 1e-6
+"""Of a lamp's light: no lamp is steadier."""
 CORRELATED_PX: Final = 16.0
 """Camera pixels whose errors count as one when the uncertainty of a mean is estimated."""
 
@@ -161,11 +163,22 @@ def without_flicker(
         for error in (photograph.radiance - predicted, photograph.last - photograph.first)
     ]
     factors, between = np.linalg.lstsq(columns, np.stack(errors, axis=1), rcond=None)[0].T
-    here2, known2 = float(np.mean(between**2)) / 2, np.square(flicker)
-    flicker2 = np.where(known2 > 0, (here2 + known2) / 2, here2)
-    taken = np.minimum(SURE**2 * flicker2 / np.maximum(factors**2, 1e-30), 1) * factors
+    variances = [float(np.mean(between**2)) / 2]
+    if any(flicker):
+        variances.append(float(np.mean(np.square([one for one in flicker if one]))))
+    spread = max(float(np.mean(variances)) ** 0.5, LEAST_FLICKER)
+    taken = _by_flicker(factors, spread)
+    # Lamps light much of the same: what all of them change together is known better than what each one does, and
+    # must not change by parts of single lamps' changes, which may be large and opposite.
+    together = np.linalg.svd(columns, full_matrices=False)[2][0]
+    taken += (_by_flicker(together @ factors, spread) - together @ taken) * together
     light = np.sum([np.float32(factor) * part for factor, part in zip(taken, parts, strict=True)], axis=0)
     return replace(photograph, radiance=np.asarray(photograph.radiance - light, np.float32))
+
+
+def _by_flicker(changes: Float64, spread: float) -> Float64:
+    """What flicker of ``spread`` explains of changes of light: all of small ones, less and less of larger ones."""
+    return np.asarray(np.minimum(1, SURE * spread / np.maximum(np.abs(changes), 1e-30)) ** 3 * changes)
 
 
 def noise_variance(sigma: FloatImage, mask: Mask, scale_px: float) -> FloatImage:
@@ -200,21 +213,56 @@ def _shrunk(band: FloatImage, sigma: FloatImage, mask: Mask, scale_px: float, wi
     return np.asarray(share * band, np.float32)
 
 
-def corrected_target(
-    target: FloatImage, photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, trusted: Mask
-) -> FloatImage:
-    """What to aim at, so that the photograph becomes ``target`` on the ``trusted`` pixels; elsewhere ``target``.
+@dataclass(frozen=True, slots=True)
+class ModelError:
+    """By how much the light differs from what the transport predicts, (rows, columns, 3), by photographs of results.
 
-    ``target``, ``predicted`` (rows, columns, 3): radiance, the latter as the transport makes it of the frames that were
-    photographed, with the black image
+    ``light``: NaN where no photograph is trusted; ``sigma``: its standard deviation by the noise model
     """
-    error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
-    found = without_noise(error, photograph.sigma, trusted)
+
+    light: FloatImage
+    sigma: FloatImage
+
+    @property
+    def known(self) -> Mask:
+        """The pixels at which a photograph is trusted."""
+        return channels.finite(self.light)
+
+    def then(self, later: ModelError) -> ModelError:
+        """With what a ``later`` photograph says: the mean of both where noise explains how they differ, else the later.
+
+        A correction changes the frames, and with them the error, but most of what two photographs differ by is noise.
+        """
+        both = self.known & later.known
+        change = np.where(both[..., None], later.light - self.light, 0).astype(np.float32)
+        variance, later_variance = self.sigma**2, later.sigma**2
+        added = np.where(both[..., None], variance + later_variance, 1).astype(np.float32)
+        real = without_noise(change, np.sqrt(added), both)
+        light = later.light - (later_variance / added) * (change - real)
+        light = np.where(both[..., None], light, np.where(later.known[..., None], later.light, self.light))
+        sigma = np.where(later.known[..., None], later.sigma, self.sigma)
+        sigma = np.where(both[..., None], np.sqrt(variance * later_variance / added), sigma)
+        return ModelError(np.asarray(light, np.float32), np.asarray(sigma, np.float32))
+
+
+def model_error(photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> ModelError:
+    """What a photograph says of the light of the frames that were photographed, ``predicted`` by the transport."""
+    error = np.where(trusted[..., None], photograph.radiance - predicted, np.nan)
+    return ModelError(np.asarray(error, np.float32), photograph.sigma)
+
+
+def corrected_target(target: FloatImage, error: ModelError, stage: RefinedStage) -> FloatImage:
+    """What to aim at, so that a photograph becomes ``target`` where the ``error`` is known; elsewhere ``target``.
+
+    ``target`` (rows, columns, 3): radiance
+    """
+    known = error.known
+    found = without_noise(np.nan_to_num(error.light), error.sigma, known)
     light = np.maximum(target - stage.black, 0)
     room = FLOOR * stage.white
     found = np.clip(found, -(LIMIT - 1) * light - room, (1 - 1 / LIMIT) * light + room)
-    near = cv2.GaussianBlur(trusted.astype(np.float32), (0, 0), EDGE_PX)
-    found *= np.where(trusted, 1, np.clip(2 * near, 0, 1))[..., None].astype(np.float32)
+    near = cv2.GaussianBlur(known.astype(np.float32), (0, 0), EDGE_PX)
+    found *= np.where(known, 1, np.clip(2 * near, 0, 1))[..., None].astype(np.float32)
     return np.asarray(target - found, np.float32)
 
 

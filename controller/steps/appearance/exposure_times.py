@@ -12,15 +12,26 @@ from dataclasses import replace
 from statistics import fmean
 from typing import Final
 
+import numpy as np
+
 from controller.artefacts.photographs import Taken
 from controller.capture.demosaic import SensorLevels
 from controller.capture.linearity import RawExposure, exposure_ratio
 from controller.capture.profile import CameraProfile
 from controller.capture.raw import is_jpeg, read_mosaic
+from controller.core import channels
+from controller.core.arrays import Float64, FloatImage
+from controller.solve.refine import FLOOR
 from controller.steps.capture.exposure import bracket
 
 WANTED: Final = (0.7, 5.0)
 """Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""
+BRIGHTEST_PERCENTILE: Final = 99.9
+CLIPPED: Final = 0.9
+"""Of full scale: what is expected to be brighter may clip."""
+DARKEST: Final = 1e-6
+"""Full scales per second: what has less light gets the longest exposure."""
+SAMPLES: Final = 20_000
 LONG: Final = 2.2, 9.0
 """In the same unit: a known exposure is taken for the longer photograph. With less, white's half is missing in it, and
 with more hardly anything is well exposed in both."""
@@ -32,13 +43,44 @@ def speeds(white: float, available_s: Sequence[float], longest_s: float, profile
     ``profile``: of the camera; without corrections in it, its exposures are what it says
     """
     found = bracket(1 / white, WANTED, available_s, longest_s)
-    if profile is None or not len(profile.exposures) or len(found) < 2:
+    known = _known(white, available_s, longest_s, profile)
+    if not known or len(found) < 2:
         return found
+    return [found[0], min(known, key=lambda value: abs(math.log(value * white / WANTED[1])))]
+
+
+def speeds_for(
+    light: FloatImage, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None
+) -> tuple[float, float, float]:
+    """As ``speeds``, for what is known to have this ``light``, (pixels, 3) in full scales per second.
+
+    The first exposure comes once more at the end. The longer one is that with which all of them together have least
+    noise: as short as the others where all of the light is about as bright.
+    """
+    sample = light[:: max(1, len(light) // SAMPLES)].astype(np.float64)
+    brightest = max(float(np.percentile(channels.largest(sample), BRIGHTEST_PERCENTILE)), DARKEST)
+    (short_s,) = bracket(1 / brightest, WANTED[:1], available_s, longest_s)
+    longer = [value for value in available_s if short_s <= value <= min(LONG[1] / brightest, longest_s)]
+    noise = (profile or CameraProfile()).noise
+
+    def certainty(value: float) -> Float64:
+        variance = (noise.shot * np.maximum(sample, 0) * value + noise.read**2) / value**2
+        return np.asarray(np.where(value * sample < CLIPPED, 1 / variance, 0))
+
+    def uncertain(value: float) -> float:
+        spread = 1 / np.sqrt(np.maximum(2 * certainty(short_s) + certainty(value), 1e-30))
+        return float(np.mean(spread / (np.maximum(sample, 0) + FLOOR * brightest)))
+
+    long_s = min(_known(brightest, available_s, longest_s, profile) or longer or [short_s], key=uncertain)
+    return short_s, long_s, short_s
+
+
+def _known(white: float, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None) -> list[float]:
+    """Exposures whose true times a camera's corrections have, and that suit the longer photograph."""
+    if profile is None or not len(profile.exposures):
+        return []
     low, high = (factor / white for factor in LONG)
-    usable = [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
-    if not usable:
-        return found
-    return [found[0], min(usable, key=lambda value: abs(math.log(value * white / WANTED[1])))]
+    return [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
 
 
 def timed(taken: Sequence[Taken]) -> list[Taken]:
@@ -79,4 +121,4 @@ def _listed(value: float, known: set[float]) -> bool:
     return any(math.isclose(value, one, rel_tol=1e-6) for one in known)
 
 
-__all__ = ["speeds", "timed"]
+__all__ = ["speeds", "speeds_for", "timed"]

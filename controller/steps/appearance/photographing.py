@@ -77,7 +77,8 @@ def take_hdr(
     of: Mapping[str, str],
 ) -> tuple[list[Taken], FloatImage]:  # fmt: skip
     """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
-    taken = take_bracket(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of)
+    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder))
+    taken = take_bracket(rig, context, kind, name, exposures_s, shown_at_s=shown_at_s, of=of)
     merged = merge_brackets(
         [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
     ).radiance
@@ -85,16 +86,12 @@ def take_hdr(
 
 
 def take_bracket(
-    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
-    of: Mapping[str, str], first_again: bool = False,
+    rig: Rig, context: Context, kind: str, name: str, exposures_s: Sequence[float], *, shown_at_s: float,
+    of: Mapping[str, str],
 ) -> list[Taken]:  # fmt: skip
-    """The photographs of ``photograph_hdr``, with their true exposures.
-
-    ``first_again``: the first exposure is taken at the end once more
-    """
-    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder))
+    """Photographs of what is shown now, in this order, with their true exposures; the rest as ``photograph_hdr``."""
     with photograph_series(rig, context) as series:
-        for number, exposure_s in enumerate([*exposures_s, *exposures_s[: int(first_again)]]):
+        for number, exposure_s in enumerate(exposures_s):
             identity = ShotId(kind, f"{name}-{number}")
             series.add(take_photograph(rig, context, identity, exposure_s, shown_at_s=shown_at_s, of=of))
     return timed(series.taken)

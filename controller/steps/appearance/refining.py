@@ -17,6 +17,7 @@ from controller.artefacts.kinds import StepKind
 from controller.artefacts.projectors import IndirectFigures
 from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
 from controller.capture.brackets import merge_brackets
+from controller.capture.profile import load_profile
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.rig.rig import Rig
 from controller.run.progress import Level
@@ -24,11 +25,13 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.solve.common_causes import equations
 from controller.solve.refine import (
+    ModelError,
     PhotographedError,
     RefinedStage,
     ResultPhotograph,
     corrected_target,
     gain,
+    model_error,
     photographed_error,
     refusal,
     solve_again,
@@ -37,6 +40,7 @@ from controller.solve.refine import (
 )
 from controller.steps import costs
 from controller.steps.appearance.causes import causes_step
+from controller.steps.appearance.exposure_times import speeds_for
 from controller.steps.appearance.photographing import take_bracket
 from controller.steps.appearance.solving import device_frames
 from controller.steps.capture.photographs import frames_digest
@@ -137,9 +141,10 @@ class _Round:
 
     def after(self, now: Refining, number: int) -> Refining:
         """Photograph ``now.frames``; judge them, and correct them."""
-        photograph = self._photographed(now.frames, number)
         predicted = self._predicted(now.frames)
         mask = self.solved.reachable & self.calibrated.calibration.object_mask
+        light = predicted[mask] if mask.any() else predicted.reshape(-1, 3)
+        photograph = self._photographed(now.frames, light, number)
         trusted = trusted_pixels(photograph, predicted, self._stage, mask)
         refused = refusal(photograph, predicted, self._stage, mask, trusted)
         if refused is not None:
@@ -158,8 +163,10 @@ class _Round:
                 return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
             if not better.worth_it:
                 return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
-        judged = Refining(now.frames, now.frames, found.map, rows, equations=said)
-        return self._corrected(judged, photograph, predicted, trusted)
+        seen = model_error(photograph, predicted, trusted)
+        seen = seen if now.seen is None else now.seen.then(seen)
+        judged = Refining(now.frames, now.frames, found.map, rows, equations=said, seen=seen)
+        return self._corrected(judged, seen, predicted)
 
     def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
         """What this photograph and those before it say of common causes."""
@@ -168,11 +175,11 @@ class _Round:
         said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
         return said if now.equations is None else said + now.equations
 
-    def _corrected(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Refining:
+    def _corrected(self, now: Refining, seen: ModelError, predicted: FloatImage) -> Refining:
         """With frames of a corrected target, if the transport says that these are worth it."""
         self.context.advance(0.4, "solving again")
         transport, black = self.calibrated.transport, self.calibrated.calibration.black
-        aimed = corrected_target(self.solved.target, photograph, predicted, self._stage, trusted)
+        aimed = corrected_target(self.solved.target, seen, self._stage)
         indirect = predicted - black - transport.forward(self._in_order(now.frames))
         frames = solve_again(
             transport,
@@ -187,9 +194,9 @@ class _Round:
             progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
-        expected = self._error(photograph.radiance + self._predicted(new) - predicted, trusted)
-        assert now.error is not None
-        if not gain(now.error, expected.map).worth_it:
+        error = self._error(predicted + seen.light, seen.known)
+        expected = self._error(self._predicted(new) + seen.light, seen.known)
+        if not gain(error.map, expected.map).worth_it:
             return replace(now, ended=ENOUGH)
         row = {**now.photographs[-1], "expected_median": expected.median}
         return replace(now, frames=new, photographs=(*now.photographs[:-1], row))
@@ -224,15 +231,16 @@ class _Round:
     def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
         return [frames[projector] for projector in self.calibrated.projectors]
 
-    def _photographed(self, frames: Mapping[str, FloatImage], number: int) -> ResultPhotograph:
+    def _photographed(self, frames: Mapping[str, FloatImage], light: FloatImage, number: int) -> ResultPhotograph:
         if self.context.folder != self.calibrated.folder:
             inherit_camera(self.calibrated.folder, self.context.folder)
         shown = device_frames(self.calibrated.calibration, self._in_order(frames))
         presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
+        available_s, profile = self.rig.acquirer.exposures_s(), load_profile(self.context.folder)
+        wanted_s = speeds_for(light, available_s, self.options.longest_exposure_s, profile)
         taken = take_bracket(
-            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", self.solved.exposure,
-            self.options.longest_exposure_s, shown_at_s=presented_s, of={"frames": frames_digest(shown)},
-            first_again=True,
+            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", wanted_s,
+            shown_at_s=presented_s, of={"frames": frames_digest(shown)},
         )  # fmt: skip
         exposures_s = [one.exposure_s for one in taken]
         images = [one.read().measured() for one in taken]

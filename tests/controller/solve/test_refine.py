@@ -17,10 +17,12 @@ from controller.solve.refine import (
     EDGE_PX,
     LEAST_GAIN,
     MARGIN_PX,
+    ModelError,
     RefinedStage,
     ResultPhotograph,
     corrected_target,
     gain,
+    model_error,
     photographed_error,
     refusal,
     solve_again,
@@ -100,7 +102,7 @@ class Result:
         predicted = self.predicted(frames)
         trusted = trusted_pixels(photograph, predicted, self.stage, self.mask)
         assert refusal(photograph, predicted, self.stage, self.mask, trusted) is None
-        aimed = corrected_target(self.target, photograph, predicted, self.stage, trusted)
+        aimed = corrected_target(self.target, model_error(photograph, predicted, trusted), self.stage)
         new = solve_again(
             self.transport, self.target, aimed, self.calibration.black, frames, exposure=EXPOSURE, smoothness=SMOOTHNESS
         )
@@ -172,6 +174,22 @@ def test_lamps_that_flicker_are_not_corrected(by: float, known: bool) -> None:
     assert all(steady <= seen + 2e-4 for steady, seen in zip(away["steady"], away["as seen"], strict=True))
 
 
+def test_errors_of_single_lamps_that_cancel_out_change_no_brightness() -> None:
+    """The model gives too much of its light to one lamp, and too little to the other."""
+    for seed in range(1, 9):
+        found = result(seed, noise=1e-5)
+        parts = [found.true.forward_part(n, frame) for n, frame in enumerate(found.frames)]
+        share = float(parts[0][found.mask].sum() / parts[1][found.mask].sum())
+        photograph = found.flickering(found.frames, 0.005)
+        wrong = np.float32(0.02) * parts[0] - np.float32(0.02 * share) * parts[1]
+        light, first, last = (one + wrong for one in (photograph.radiance, photograph.first, photograph.last))
+        seen = ResultPhotograph(light, photograph.sigma, first, last)
+        steady = found.steady(found.frames, seen, 0.005)
+        predicted = found.predicted(found.frames)
+        change = float((steady.radiance - predicted)[found.mask].sum() / predicted[found.mask].sum())
+        assert abs(change) < 0.001
+
+
 def test_a_lamp_that_is_darker_is_corrected_although_lamps_flicker() -> None:
     found = result()
     photograph = found.flickering(found.frames, 0.005, dimmed=0.92)
@@ -224,7 +242,7 @@ def test_a_hand_in_the_photograph_is_left_out_and_the_rest_is_corrected(spoil: S
     trusted = trusted_pixels(photograph, predicted, found.stage, found.mask)
     assert not trusted[36:54, 45:65].any()
     assert trusted[found.mask].mean() > 0.6
-    aimed = corrected_target(found.target, photograph, predicted, found.stage, trusted)
+    aimed = corrected_target(found.target, model_error(photograph, predicted, trusted), found.stage)
     assert np.array_equal(aimed[38:52, 47:63], found.target[38:52, 47:63])
     after = found.corrected(found.frames, photograph)
     here = np.zeros(CAMERA, np.bool_)
@@ -276,12 +294,58 @@ def test_a_photograph_that_is_clipped_in_half_of_the_picture_says_so() -> None:
     assert refusal(photograph, predicted, found.stage, found.mask, trusted) == "too much of it is overexposed"
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_two_photographs_of_the_same_error_have_less_noise_than_one(seed: int) -> None:
+    found = result(seed, indirect(0.1), noise=0.01)
+    predicted = found.predicted(found.frames)
+    true = found.seen(found.frames) - predicted
+    first, second = (model_error(found.photograph(found.frames), predicted, found.mask) for _ in range(2))
+    both = first.then(second)
+
+    def away(one: ModelError) -> float:
+        return float(np.std((one.light - true)[found.mask]))
+
+    assert away(both) == pytest.approx(away(second) / 2**0.5, rel=0.05)
+    np.testing.assert_allclose(both.sigma[found.mask], second.sigma[found.mask] / 2**0.5, rtol=1e-5)
+
+
+def test_where_a_correction_changed_the_error_the_later_photograph_counts() -> None:
+    found = result(noise=0.002)
+    predicted = found.predicted(found.frames)
+    light = found.seen(found.frames)
+    step = np.zeros_like(light)
+    step[:, CAMERA[1] // 2 :] = 0.05
+    rng = np.random.default_rng(5)
+    photographs = [np.asarray(image + rng.normal(0, 0.002, light.shape), np.float32) for image in (light + step, light)]
+    first, second = (
+        model_error(ResultPhotograph(one, np.full_like(one, 0.002), one, one), predicted, found.mask)
+        for one in photographs
+    )
+    both = first.then(second)
+    away = np.abs(cv2.GaussianBlur(np.nan_to_num(both.light - (light - predicted)), (0, 0), 3))
+    assert away[found.mask & (step[..., 0] > 0)].mean() < 0.05 * 0.05
+
+
+def test_what_a_later_photograph_does_not_show_is_known_by_the_earlier_one() -> None:
+    found = result(light=indirect(0.1))
+    predicted = found.predicted(found.frames)
+    left, right = found.mask.copy(), found.mask.copy()
+    left[:, 50:], right[:, :45] = False, False
+    first, second = (model_error(found.photograph(found.frames), predicted, part) for part in (left, right))
+    both = first.then(second)
+    assert np.array_equal(both.known, left | right)
+    assert np.array_equal(both.light[left & ~right], first.light[left & ~right])
+    assert np.array_equal(both.light[right & ~left], second.light[right & ~left])
+    assert np.array_equal(both.sigma[left & ~right], first.sigma[left & ~right])
+
+
 def test_nothing_is_corrected_beyond_the_border_of_what_is_trusted() -> None:
     found = result(light=indirect(0.1))
     trusted = np.zeros(CAMERA, np.bool_)
     trusted[20:70, 20:70] = True
     photograph = found.photograph(found.frames)
-    aimed = corrected_target(found.target, photograph, found.predicted(found.frames), found.stage, trusted)
+    seen = model_error(photograph, found.predicted(found.frames), trusted)
+    aimed = corrected_target(found.target, seen, found.stage)
     change = np.abs(aimed - found.target).max(axis=2)
     outside = cv2.dilate(trusted.astype(np.uint8), np.ones((3, 3)), iterations=int(4 * EDGE_PX)) == 0
     assert change[trusted].min() > 0.002

@@ -127,7 +127,7 @@ def test_a_late_answer_is_never_the_answer_to_the_next_question(open_serial: Any
         pair = open_serial(profile=profile, name=profile, lamp=lamp, edit=expecting_late_ones)
         before = pair.driver.status(deadline=in_seconds(SOON)).power
         for _ in range(2):
-            # Just later than the driver waits, so that an emulator that is slow itself still answers before it gives up.
+            # Just later than the driver waits: an emulator that is slow itself still answers before it gives up.
             pair.emulator.faults.set(late_s=0.9)
             assert pair.driver.status(deadline=in_seconds(SOON)).power is before
 
