@@ -13,7 +13,7 @@ import numpy as np
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.kinds import StepKind, of_projectors
 from controller.artefacts.published import Dimmed, write_photograph
-from controller.artefacts.solved import read_solved
+from controller.artefacts.solved import RequestedTarget, read_solved
 from controller.core.arrays import FloatImage
 from controller.report.demo import write_demo_report
 from controller.rig.rig import Rig
@@ -128,7 +128,7 @@ def _traditional(
         context.advance(number / len(names), name)
         solved = read_solved(context.folder, name, calibrated.projectors)
         picture = _by_one(
-            rig, calibrated, StepKind.TRADITIONAL, name, solved.requested.target, solved.exposure, longest_s, context
+            rig, calibrated, StepKind.TRADITIONAL, name, solved.requested, solved.exposure, longest_s, context
         )
         paths.append(write_photograph(context.folder, StepKind.TRADITIONAL, name, picture))
     return paths
@@ -146,8 +146,9 @@ def _dimmed(
             calibrated.calibration, picture, _best(calibrated), share=share, indirect=calibrated.indirect
         )
         target = target_radiance(found.wanted, calibrated.calibration.black, 1.0)
-        photograph = _by_one(rig, calibrated, StepKind.DIMMED, name, target, found.exposure, longest_s, context)
-        dimmed = Dimmed(photograph, target, found.possible.reachable & asked.requested.valid, found.exposure)
+        wanted = RequestedTarget(target, found.possible.reachable & asked.requested.valid, asked.requested.valid)
+        photograph = _by_one(rig, calibrated, StepKind.DIMMED, name, wanted, found.exposure, longest_s, context)
+        dimmed = Dimmed(photograph, target, wanted.reachable, found.exposure)
         paths.append(dimmed.write(context.folder, name))
     return paths
 
@@ -159,14 +160,16 @@ def _best(calibrated: Calibrated) -> int:
 
 
 def _by_one(
-    rig: Rig, calibrated: Calibrated, kind: StepKind, name: str, target: FloatImage, exposure: float, longest_s: float,
-    context: Context,
+    rig: Rig, calibrated: Calibrated, kind: StepKind, name: str, wanted: RequestedTarget, exposure: float,
+    longest_s: float, context: Context,
 ) -> FloatImage:  # fmt: skip
-    """A photograph of ``target`` (rows, columns, 3), made by the best projector alone."""
+    """A photograph of what is ``wanted``, made by the best projector alone."""
     best = _best(calibrated)
-    frames = device_frames(calibrated.calibration, traditional_compensation(calibrated.calibration, target, best))
+    frames = device_frames(
+        calibrated.calibration, traditional_compensation(calibrated.calibration, wanted.target, best)
+    )
     shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
     return photograph_hdr(
         rig, context, kind, name, exposure, longest_s, shown_at_s=shown.at_s,
-        of={"appearance": name, "projector": str(best)},
+        of={"appearance": name, "projector": str(best)}, light=wanted.target[wanted.reachable],
     )  # fmt: skip

@@ -78,7 +78,10 @@ def _compare(
     # The day is part of the photograph's settings, so that yesterday's photographs are not reused.
     of = {"bundle": bundle, "appearance": name, "day": time.strftime("%Y-%m-%d")}
     photographed_s = time.time()
-    picture = photograph_hdr(rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of)
+    picture = photograph_hdr(
+        rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of,
+        light=solved.target[solved.reachable],
+    )  # fmt: skip
     context.advance(0.7, "comparing with the target")
     mask, size_px = compared_mask(calibrated, solved), window_px(picture.shape)
     asked = solved.requested.target

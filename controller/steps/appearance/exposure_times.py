@@ -31,48 +31,68 @@ CLIPPED: Final = 0.9
 """Of full scale: what is expected to be brighter may clip."""
 DARKEST: Final = 1e-6
 """Full scales per second: what has less light gets the longest exposure."""
+LEAST_CERTAINTY: Final = 1e-30
 SAMPLES: Final = 20_000
 LONG: Final = 2.2, 9.0
 """In the same unit: a known exposure is taken for the longer photograph. With less, white's half is missing in it, and
 with more hardly anything is well exposed in both."""
 
 
-def speeds(white: float, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None) -> list[float]:
+def speeds(
+    white: float,
+    available_s: Sequence[float],
+    longest_s: float,
+    profile: CameraProfile | None,
+    *,
+    light: FloatImage | None = None,
+    shorter: int = 1,
+) -> list[float]:
     """Exposures for what has ``white`` in full scales per second, rising: those ``WANTED``, the longer one known.
 
-    ``profile``: of the camera; without corrections in it, its exposures are what it says
+    With ``light``, about what is shown, the longer one is that with which all of them together have least noise: as
+    short as the first where all of the light is about as bright.
+
+    Parameters
+    ----------
+    profile : of the camera; without corrections in it, its exposures are what it says
+    light : (pixels, 3) in full scales per second
+    shorter : so many photographs have the first exposure
     """
     found = bracket(1 / white, WANTED, available_s, longest_s)
     known = _known(white, available_s, longest_s, profile)
+    if light is not None and len(light):
+        longer = [value for value in available_s if found[0] <= value <= min(LONG[1] / white, longest_s)]
+        noise = _Noise(light, found[0], shorter, white, profile)
+        return [found[0], min(known or longer or found[:1], key=noise.with_longer)]
     if not known or len(found) < 2:
         return found
     return [found[0], min(known, key=lambda value: abs(math.log(value * white / WANTED[1])))]
 
 
-def speeds_for(
-    light: FloatImage, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None
-) -> tuple[float, float, float]:
-    """As ``speeds``, for what is known to have this ``light``, (pixels, 3) in full scales per second.
+def brightest(light: FloatImage) -> float:
+    """What a photograph of ``light`` (pixels, 3) must not clip, in full scales per second, above 0."""
+    return max(float(np.percentile(channels.largest(light), BRIGHTEST_PERCENTILE)), DARKEST)
 
-    The first exposure comes once more at the end. The longer one is that with which all of them together have least
-    noise: as short as the others where all of the light is about as bright.
-    """
-    sample = light[:: max(1, len(light) // SAMPLES)].astype(np.float64)
-    brightest = max(float(np.percentile(channels.largest(sample), BRIGHTEST_PERCENTILE)), DARKEST)
-    (short_s,) = bracket(1 / brightest, WANTED[:1], available_s, longest_s)
-    longer = [value for value in available_s if short_s <= value <= min(LONG[1] / brightest, longest_s)]
-    noise = (profile or CameraProfile()).noise
 
-    def certainty(value: float) -> Float64:
-        variance = (noise.shot * np.maximum(sample, 0) * value + noise.read**2) / value**2
-        return np.asarray(np.where(value * sample < CLIPPED, 1 / variance, 0))
+class _Noise:
+    """The noise of ``light`` in ``shorter`` photographs of ``short_s`` and a longer one, of light and white."""
 
-    def uncertain(value: float) -> float:
-        spread = 1 / np.sqrt(np.maximum(2 * certainty(short_s) + certainty(value), 1e-30))
-        return float(np.mean(spread / (np.maximum(sample, 0) + FLOOR * brightest)))
+    def __init__(
+        self, light: FloatImage, short_s: float, shorter: int, white: float, profile: CameraProfile | None
+    ) -> None:
+        self._light = np.maximum(light[:: max(1, len(light) // SAMPLES)].astype(np.float64), 0)
+        self._noise = (profile or CameraProfile()).noise
+        self._counted_over = self._light + FLOOR * white
+        self._short = shorter * self._certainty(short_s)
 
-    long_s = min(_known(brightest, available_s, longest_s, profile) or longer or [short_s], key=uncertain)
-    return short_s, long_s, short_s
+    def _certainty(self, exposure_s: float) -> Float64:
+        noise = self._noise.per_second(exposure_s)
+        measured = exposure_s * self._light < CLIPPED
+        return np.asarray(np.where(measured, 1 / (noise.shot * self._light + noise.read**2), 0))
+
+    def with_longer(self, exposure_s: float) -> float:
+        certainty = np.maximum(self._short + self._certainty(exposure_s), LEAST_CERTAINTY)
+        return float(np.mean(1 / (np.sqrt(certainty) * self._counted_over)))
 
 
 def _known(white: float, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None) -> list[float]:
@@ -121,4 +141,4 @@ def _listed(value: float, known: set[float]) -> bool:
     return any(math.isclose(value, one, rel_tol=1e-6) for one in known)
 
 
-__all__ = ["speeds", "speeds_for", "timed"]
+__all__ = ["brightest", "speeds", "timed"]

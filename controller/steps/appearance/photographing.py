@@ -51,33 +51,36 @@ def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Conte
     paths = []
     for number, name in enumerate(names):
         context.advance(number / len(names), name)
-        exposure = read_solved(context.folder, name, projectors).exposure
+        solved = read_solved(context.folder, name, projectors)
         shown = display.play(name, deadline=context.deadline.within(20))
         of = {"bundle": bundle, "appearance": name}
-        picture = photograph_hdr(rig, context, PLAYED, name, exposure, longest_s, shown_at_s=shown.at_s, of=of)
+        picture = photograph_hdr(
+            rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of,
+            light=solved.target[solved.reachable],
+        )  # fmt: skip
         paths.append(write_photograph(context.folder, StepKind.PHOTOGRAPH, name, picture))
     return paths
 
 
 def photograph_hdr(
     rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
-    of: Mapping[str, str],
+    of: Mapping[str, str], light: FloatImage | None = None,
 ) -> FloatImage:  # fmt: skip
     """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second.
 
     ``kind`` and ``name`` identify the photographs, together with a number for each. ``white`` is the radiance of
-    the target's white; ``of`` names the picture shown, for the journal.
+    the target's white; ``of`` names the picture shown, for the journal; ``light`` (pixels, 3) is about what it shows.
     """
-    _, merged = take_hdr(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of)
+    _, merged = take_hdr(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of, light=light)
     return np.asarray(np.nan_to_num(merged), np.float32)
 
 
 def take_hdr(
     rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
-    of: Mapping[str, str],
+    of: Mapping[str, str], light: FloatImage | None = None,
 ) -> tuple[list[Taken], FloatImage]:  # fmt: skip
     """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
-    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder))
+    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder), light=light)
     taken = take_bracket(rig, context, kind, name, exposures_s, shown_at_s=shown_at_s, of=of)
     merged = merge_brackets(
         [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]

@@ -40,7 +40,7 @@ from controller.solve.refine import (
 )
 from controller.steps import costs
 from controller.steps.appearance.causes import causes_step
-from controller.steps.appearance.exposure_times import speeds_for
+from controller.steps.appearance.exposure_times import brightest, speeds
 from controller.steps.appearance.photographing import take_bracket
 from controller.steps.appearance.solving import device_frames
 from controller.steps.capture.photographs import frames_digest
@@ -237,9 +237,10 @@ class _Round:
         shown = device_frames(self.calibrated.calibration, self._in_order(frames))
         presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
         available_s, profile = self.rig.acquirer.exposures_s(), load_profile(self.context.folder)
-        wanted_s = speeds_for(light, available_s, self.options.longest_exposure_s, profile)
+        longest_s = self.options.longest_exposure_s
+        wanted_s = speeds(brightest(light), available_s, longest_s, profile, light=light, shorter=2)
         taken = take_bracket(
-            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", wanted_s,
+            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", (*wanted_s, wanted_s[0]),
             shown_at_s=presented_s, of={"frames": frames_digest(shown)},
         )  # fmt: skip
         exposures_s = [one.exposure_s for one in taken]
