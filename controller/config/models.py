@@ -138,7 +138,7 @@ class SolveTable(ConfigTable):
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
     )
     smoothness: float = Field(
-        default=0.001,
+        default=0.0003,
         ge=0,
         le=100,
         description="the weight of smoothness in a compensation image (equal neighbours), 0 to 100",

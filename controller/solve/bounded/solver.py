@@ -21,9 +21,9 @@ from controller.solve.bounded.problem import Solution, SolveInput
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 
-SMOOTHNESS: Final = 0.001
-"""Default strength of smoothness, relative to the mean diagonal of the data's majoriser. On a disturbed synthetic stage
-the edges kept (eq. 9) peak between 0.003 and 0.01; colour noise falls up to 0.03, at the cost of detail."""
+SMOOTHNESS: Final = 0.0003
+"""Default strength of smoothness, relative to the mean diagonal of the data's majoriser: that with the least error on
+calibrated stages (docs/decisions/0117)."""
 TOLERANCE: Final = 3e-5
 """Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
 calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0055)."""

@@ -112,7 +112,9 @@ def test_indirect_light_is_left_room_for(transport: LightTransport, base: Base, 
         there = found.reachable & transport.object_mask
         error = (seen - found.target)[there] / found.target[there]
         errors[name] = float(np.sqrt(np.mean(error**2)))
-    assert errors["truth"] < errors["known"] < 0.5 * errors["none"]
+    # a scaled base misses the wave by more than light that is known somewhat wrong does
+    assert max(errors["truth"], errors["known"]) < 0.5 * errors["none"]
+    assert mode == "scale" or errors["truth"] < errors["known"]
 
 
 def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightTransport, base: Base) -> None:
