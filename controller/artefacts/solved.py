@@ -230,7 +230,7 @@ class Refining:
     where not compared; None before the first photograph that counted
     ``photographs``: one row of figures for each; ``ended``: why there are no more, "" while there may be
     ``equations``: what they say of common causes (``solve.common_causes``), added; None before the first that counted
-    ``seen``: the model's error by all of them; None before the first that counted
+    ``seen``: the model's error by all of them, for the next one; None before the first that counted, and after the last
     """
 
     frames: dict[str, FloatImage]

@@ -6,6 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from controller.config.defaults import SMOOTHNESS
 from controller.config.table import ConfigTable, Name, OpenConfigTable, Positive, Seconds, Size
 from controller.config.upkeep import AlertsTable, BackupTable, DiskTable
 from hal.values import LampRules
@@ -138,7 +139,7 @@ class SolveTable(ConfigTable):
         default=0.9, gt=0, le=1, description="the share of the reachable light that targets may use, above 0, at most 1"
     )
     smoothness: float = Field(
-        default=0.0003,
+        default=SMOOTHNESS,
         ge=0,
         le=100,
         description="the weight of smoothness in a compensation image (equal neighbours), 0 to 100",

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.checks import all_finite, check_image
 from controller.core.errors import UsageError
@@ -21,9 +22,6 @@ from controller.solve.bounded.problem import Solution, SolveInput
 from controller.solve.engines.processor import Engine, Processor
 from controller.transport import LightTransport
 
-SMOOTHNESS: Final = 0.0003
-"""Default strength of smoothness, relative to the mean diagonal of the data's majoriser: that with the least error on
-calibrated stages (docs/decisions/0117)."""
 TOLERANCE: Final = 3e-5
 """Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
 calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0055)."""
@@ -90,3 +88,6 @@ def check_input(given: SolveInput) -> None:
 
 def _wrong(what: str) -> UsageError:
     return UsageError("solve-arguments", what=f"The solve can't start: {what}.", remedy="Correct it and solve again.")
+
+
+__all__ = ["MOST_ITERATIONS", "SMOOTHNESS", "TOLERANCE", "check_input", "check_target", "solve_bounded"]

@@ -163,10 +163,13 @@ class _Round:
                 return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
             if not better.worth_it:
                 return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
-        seen = model_error(photograph, predicted, trusted)
-        seen = seen if now.seen is None else now.seen.then(seen)
-        judged = Refining(now.frames, now.frames, found.map, rows, equations=said, seen=seen)
-        return self._corrected(judged, seen, predicted)
+        seen, error = model_error(photograph, predicted, trusted), found.map
+        if now.seen is not None:
+            seen = now.seen.then(seen)
+            error = self._error(predicted + seen.light, seen.known).map
+        kept = seen if number < self.options.photographs else None
+        judged = Refining(now.frames, now.frames, found.map, rows, equations=said, seen=kept)
+        return self._corrected(judged, seen, error, predicted)
 
     def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
         """What this photograph and those before it say of common causes."""
@@ -175,8 +178,8 @@ class _Round:
         said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
         return said if now.equations is None else said + now.equations
 
-    def _corrected(self, now: Refining, seen: ModelError, predicted: FloatImage) -> Refining:
-        """With frames of a corrected target, if the transport says that these are worth it."""
+    def _corrected(self, now: Refining, seen: ModelError, error: FloatImage, predicted: FloatImage) -> Refining:
+        """With frames of a corrected target, if the transport says that these are worth it; ``error`` as ``seen``."""
         self.context.advance(0.4, "solving again")
         transport, black = self.calibrated.transport, self.calibrated.calibration.black
         aimed = corrected_target(self.solved.target, seen, self._stage)
@@ -194,9 +197,8 @@ class _Round:
             progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
-        error = self._error(predicted + seen.light, seen.known)
         expected = self._error(self._predicted(new) + seen.light, seen.known)
-        if not gain(error.map, expected.map).worth_it:
+        if not gain(error, expected.map).worth_it:
             return replace(now, ended=ENOUGH)
         row = {**now.photographs[-1], "expected_median": expected.median}
         return replace(now, frames=new, photographs=(*now.photographs[:-1], row))
