@@ -10,7 +10,6 @@ import functools
 from dataclasses import dataclass
 from typing import Final, Self
 
-import cv2
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +25,8 @@ SUBPIXELS: Final = 128
 REACH_SIGMAS: Final = 3.2
 LARGEST_RADIUS: Final = 13
 MARGIN_PX: Final = LARGEST_RADIUS + int(BEYOND_PX) + 1
+LANES: Final = 8
+"""Rows of weights are as long as a multiple of this, with zeros at their ends, so that a core takes eight at once."""
 KEPT_BYTES: Final = 256 << 20
 """A projector's summed weights may take so much memory. Pixels beyond it are summed again for each frame."""
 BOX_BYTES: Final = 16
@@ -35,10 +36,11 @@ MOST_STEPS: Final = 65535
 
 @functools.lru_cache(maxsize=4)
 def pixel_profiles(fill_factor: float) -> tuple[Floats, Integers]:
-    """Cross-sections of a blurred pixel: weights (256, SUBPIXELS, 2 * LARGEST_RADIUS + 1), and radius (256,).
+    """Cross-sections of a blurred pixel: weights (256, SUBPIXELS, 2 * LARGEST_RADIUS + LANES), and radius (256,).
 
-    The first index is the blur in SIGMA_STEP_PX, the second the position between two half pixels. The weights of
-    an evenly lit image sum to 1 on average over positions; between narrow pixels the gap shows.
+    The first index is the blur in SIGMA_STEP_PX, the second the position between two half pixels; of the third,
+    LARGEST_RADIUS is the middle, and the last LANES - 1 are 0. The weights of an evenly lit image sum to 1 on average
+    over positions; between narrow pixels the gap shows.
     """
     side = np.sqrt(fill_factor)
     sigma = np.maximum(np.arange(256), 1) * SIGMA_STEP_PX
@@ -51,7 +53,8 @@ def pixel_profiles(fill_factor: float) -> tuple[Floats, Integers]:
     near = np.where(np.abs(far) <= radius[:, None, None], whole, 0.0)
     # What the cut takes from the tails goes back to the rest, so that an even image is not darker where blurred.
     near *= (whole.sum(axis=2) / np.maximum(near.sum(axis=2), 1e-30))[..., None]
-    return np.ascontiguousarray(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], dtype=np.float32), radius
+    weights = np.pad(near[..., LARGEST_RADIUS:-LARGEST_RADIUS], ((0, 0), (0, 0), (0, LANES - 1)))
+    return np.ascontiguousarray(weights, dtype=np.float32), radius
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +87,12 @@ class Footprints:
     """What a projector lights, with its weights summed over the samples of each camera pixel, as far as memory allows.
 
     A camera pixel's weights are those of a rectangle of panel pixels for each colour, which lie one behind the other
-    in ``weights``. Summing them costs as much as a frame; showing a frame through them costs a tenth of it. They are
+    in ``weights``. Summing them costs more than a frame; showing a frame through them costs a fraction of it. They are
     kept in steps of 1/65535 of the pixel's largest, which is far below any noise and half the memory.
 
-    ``boxes`` (K, 4) int32: first row, first column, rows, columns; ``offsets`` (K + 1,) int64: into ``weights``;
-    ``weights`` uint16: (rows, columns, 3) of each of the first K camera pixels; ``steps`` (K,) float32: what a weight
-    of 1 stands for; ``rest``: the others' samples
+    ``boxes`` (K, 4) int32: first row, first column, rows, columns (a multiple of LANES, or 0);
+    ``offsets`` (K + 1,) int64: into ``weights``; ``weights`` uint16: (3, rows, columns) of each of the first K camera
+    pixels; ``steps`` (K,) float32: what a weight of 1 stands for; ``rest``: the others' samples
     """
 
     boxes: Integers
@@ -116,8 +119,9 @@ class Footprints:
 
     def light(self, sent: Floats) -> Floats:
         """Light (P, 3) of each camera pixel for what the panel's pixels (rows, columns, 3) send out."""
-        framed = cv2.copyMakeBorder(sent, *(MARGIN_PX,) * 4, cv2.BORDER_CONSTANT, value=0)
-        frame = np.ascontiguousarray(framed, dtype=np.float32)
+        rows, columns = sent.shape[:2]
+        frame = np.zeros((3, rows + 2 * MARGIN_PX, columns + 2 * MARGIN_PX + LANES - 1), dtype=np.float32)
+        frame[:, MARGIN_PX:-MARGIN_PX, MARGIN_PX : MARGIN_PX + columns] = np.moveaxis(sent, 2, 0)
         kept, rest = len(self.boxes), self.rest
         out = np.empty((kept + len(rest.starts) - 1, 3), dtype=np.float32)
         _through_weights(frame, self.boxes, self.offsets, self.weights, self.steps, out[:kept])
@@ -135,6 +139,12 @@ def _place(at_px: float) -> tuple[int, int]:
     return pixel, min(int((at_px - pixel + 0.5) * SUBPIXELS), SUBPIXELS - 1)
 
 
+@compiled()
+def _padded(length: int) -> int:
+    """The next multiple of LANES."""
+    return (length + LANES - 1) // LANES * LANES
+
+
 @compiled(parallel=True)
 def _boxes(starts: Integers, at_px: Floats, gain: Floats, blur: npt.NDArray[np.uint8], radii: Integers) -> Integers:
     """For each camera pixel first row, first column, rows and columns (P, 4) of the panel pixels that light it."""
@@ -150,7 +160,7 @@ def _boxes(starts: Integers, at_px: Floats, gain: Floats, blur: npt.NDArray[np.u
                 left, right = min(left, column - radius), max(right, column + radius + 1)
         if bottom > top:
             boxes[pixel, 0], boxes[pixel, 1] = top, left
-            boxes[pixel, 2], boxes[pixel, 3] = bottom - top, right - left
+            boxes[pixel, 2], boxes[pixel, 3] = bottom - top, _padded(right - left)
     return boxes
 
 
@@ -170,30 +180,29 @@ def _sum_weights(
 ) -> None:
     """Fill ``weights`` and ``steps`` (see ``Footprints``) of the camera pixels in ``boxes``."""
     for pixel in numba.prange(len(boxes)):
-        sums = np.zeros(offsets[pixel + 1] - offsets[pixel], dtype=np.float32)
+        sums = np.zeros((3, boxes[pixel, 2], boxes[pixel, 3]), dtype=np.float32)
         for n in range(starts[pixel], starts[pixel + 1]):
             if gain[n] <= 0.0:
                 continue
             column, x = _place(at_px[n, 0])
             row, y = _place(at_px[n, 1])
-            across, down, radius = profiles[blur[n], x], profiles[blur[n], y], radii[blur[n]]
-            red, green, blue = gain[n] * albedo[n, 0], gain[n] * albedo[n, 1], gain[n] * albedo[n, 2]
-            for j in range(-radius, radius + 1):
-                line = (row + j - boxes[pixel, 0]) * boxes[pixel, 3] + column - radius - boxes[pixel, 1]
-                at = 3 * line
-                for i in range(-radius, radius + 1):
-                    weight = down[LARGEST_RADIUS + j] * across[LARGEST_RADIUS + i]
-                    sums[at] += red * weight
-                    sums[at + 1] += green * weight
-                    sums[at + 2] += blue * weight
-                    at += 3
+            radius = radii[blur[n]]
+            side, first = 2 * radius + 1, LARGEST_RADIUS - radius
+            across, down = profiles[blur[n], x, first : first + side], profiles[blur[n], y, first : first + side]
+            top, left = row - radius - boxes[pixel, 0], column - radius - boxes[pixel, 1]
+            for c in range(3):
+                for j in range(side):
+                    line, share = sums[c, top + j, left : left + side], gain[n] * albedo[n, c] * down[j]
+                    for i in range(side):
+                        line[i] += share * across[i]
         largest = np.float32(0.0)
-        for value in sums:
+        for value in sums.flat:
             largest = max(largest, value)
         steps[pixel] = largest / np.float32(MOST_STEPS)
         each = np.float32(MOST_STEPS) / largest if largest > 0.0 else np.float32(0.0)
-        for k in range(len(sums)):
-            weights[offsets[pixel] + k] = np.uint16(sums[k] * each + np.float32(0.5))
+        kept = weights[offsets[pixel] : offsets[pixel + 1]]
+        for k, value in enumerate(sums.flat):
+            kept[k] = np.uint16(value * each + np.float32(0.5))
 
 
 @compiled(parallel=True, fastmath=True)
@@ -205,20 +214,19 @@ def _through_weights(
     steps: Floats,
     out: Floats,
 ) -> None:
-    """Light (K, 3) of the camera pixels in ``boxes`` for a frame with MARGIN_PX of black around it."""
+    """Light (K, 3) of the camera pixels in ``boxes`` for a frame (3, rows, columns) with MARGIN_PX of black around."""
     for pixel in numba.prange(len(boxes)):
-        red = green = blue = np.float32(0.0)
-        at = offsets[pixel]
-        for j in range(boxes[pixel, 2]):
-            row = boxes[pixel, 0] + j + MARGIN_PX
-            for i in range(boxes[pixel, 3]):
-                column = boxes[pixel, 1] + i + MARGIN_PX
-                red += np.float32(weights[at]) * frame[row, column, 0]
-                green += np.float32(weights[at + 1]) * frame[row, column, 1]
-                blue += np.float32(weights[at + 2]) * frame[row, column, 2]
-                at += 3
-        step = steps[pixel]
-        out[pixel, 0], out[pixel, 1], out[pixel, 2] = step * red, step * green, step * blue
+        top, left, rows, columns = boxes[pixel]
+        left += MARGIN_PX
+        for c in range(3):
+            total = np.float32(0.0)
+            at = offsets[pixel] + c * rows * columns
+            for j in range(rows):
+                line, shares = frame[c, top + j + MARGIN_PX, left : left + columns], weights[at : at + columns]
+                for i in range(columns):
+                    total += np.float32(shares[i]) * line[i]
+                at += columns
+            out[pixel, c] = steps[pixel] * total
 
 
 @compiled(parallel=True, fastmath=True)
@@ -241,18 +249,23 @@ def _through_samples(
                 continue
             column, x = _place(at_px[n, 0])
             row, y = _place(at_px[n, 1])
-            across, down, radius = profiles[blur[n], x], profiles[blur[n], y], radii[blur[n]]
+            radius = radii[blur[n]]
+            side, first = 2 * radius + 1, LARGEST_RADIUS - radius
+            columns, top, left = _padded(side), row - radius + MARGIN_PX, column - radius + MARGIN_PX
+            across, down = profiles[blur[n], x, first : first + columns], profiles[blur[n], y]
             red = green = blue = np.float32(0.0)
-            for j in range(-radius, radius + 1):
+            for j in range(side):
+                reds = frame[0, top + j, left : left + columns]
+                greens = frame[1, top + j, left : left + columns]
+                blues = frame[2, top + j, left : left + columns]
                 r = g = b = np.float32(0.0)
-                for i in range(-radius, radius + 1):
-                    weight = across[LARGEST_RADIUS + i]
-                    r += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 0]
-                    g += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 1]
-                    b += weight * frame[row + j + MARGIN_PX, column + i + MARGIN_PX, 2]
-                red += down[LARGEST_RADIUS + j] * r
-                green += down[LARGEST_RADIUS + j] * g
-                blue += down[LARGEST_RADIUS + j] * b
+                for i in range(columns):
+                    r += across[i] * reds[i]
+                    g += across[i] * greens[i]
+                    b += across[i] * blues[i]
+                red += down[first + j] * r
+                green += down[first + j] * g
+                blue += down[first + j] * b
             total_red += gain[n] * albedo[n, 0] * red
             total_green += gain[n] * albedo[n, 1] * green
             total_blue += gain[n] * albedo[n, 2] * blue

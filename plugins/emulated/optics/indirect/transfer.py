@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from hal.runtime.jit import compiled
 from plugins.emulated.optics.indirect.patches import Hits, Patches
 from plugins.emulated.optics.indirect.scattering import Scattering
 from plugins.emulated.optics.rays import directions
@@ -60,7 +62,7 @@ class Transfer:
     def returned(self, direct: FloatImage) -> FloatImage:
         """Irradiance (pixels, 3) that comes back, where each camera pixel looks, for ``direct`` on the patches."""
         light = np.stack([self.back[channel] @ direct[:, channel] for channel in range(3)], axis=1)
-        return np.take(np.asarray(self.blend @ light, dtype=np.float32), self.cells, axis=0)
+        return _taken(np.ascontiguousarray(self.blend @ light, dtype=np.float32), self.cells)
 
 
 def transfer_of(truth: BenchTruth, scattering: Scattering, pixels: npt.NDArray[np.int32]) -> Transfer:
@@ -189,3 +191,13 @@ def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
         rows = np.repeat(mine, found.shape[1])
         blend = blend + sparse.csr_matrix((weight.ravel(), (rows, near[found].ravel())), shape=blend.shape)
     return blend.astype(np.float32)
+
+
+@compiled(parallel=True)
+def _taken(light: FloatImage, cells: npt.NDArray[np.int32]) -> FloatImage:
+    """The light (pixels, 3) of each pixel's cell: as numpy.take, on all cores."""
+    out = np.empty((len(cells), 3), dtype=np.float32)
+    for pixel in numba.prange(len(cells)):
+        for c in range(3):
+            out[pixel, c] = light[cells[pixel], c]
+    return out

@@ -83,7 +83,7 @@ def test_blur_spreads_as_a_gaussian_of_the_wanted_width() -> None:
     profiles, _ = pixel_profiles(1.0)
     sigma_px = 1.5
     offsets = (np.arange(profiles.shape[1]) + 0.5) / profiles.shape[1] - 0.5
-    position = offsets[:, None] - np.arange(-LARGEST_RADIUS, LARGEST_RADIUS + 1)[None, :]
+    position = offsets[:, None] - (np.arange(profiles.shape[2]) - LARGEST_RADIUS)[None, :]
     weights = profiles[round(sigma_px / SIGMA_STEP_PX)] / profiles.shape[1]
     assert float((weights * position**2).sum()) == pytest.approx(sigma_px**2 + 1 / 12, rel=0.02)
 
