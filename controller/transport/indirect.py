@@ -20,8 +20,9 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask, moved_to_file, strips
+from controller.core.arrays import STRIP_ROWS, FloatImage, Mask, moved_to_file, strips
 from controller.transport.surfaces.blocks import down, down_adjoint, up, up_adjoint
+from controller.transport.surfaces.direct_light import approach, displayable_sums
 from controller.transport.surfaces.surface_light import SurfaceLight
 
 ROUNDS: Final = 30
@@ -31,6 +32,10 @@ LEAST_VOLUME: Final = 0.02
 """Determinant of I + D: three colours that a paint makes nearly one are no nearer to one than this."""
 LARGEST: Final = 1e4
 """Of a number of (I + D)^-1 - I: float16 ends at 65504."""
+
+NOTHING: Final[FloatImage] = np.empty((0, 0, 3), np.float32)
+"""A picture without rows, for a kernel where there is none."""
+NO_MATRICES: Final[FloatImage] = np.empty((3, 3, 0, 0), np.float32)
 
 Colours = npt.NDArray[np.floating[Any]]
 """A matrix for the colours of each pixel (3, 3, rows, columns); float16 where it is kept."""
@@ -84,18 +89,26 @@ class IndirectLight:
         painted = self.painted(direct)
         return painted, np.float32(0) if self.surface is None else self.surface.forward(painted)
 
-    def _shown(self, direct: FloatImage, reach: FloatImage | None) -> tuple[FloatImage, FloatImage | None]:
-        """What falls on surfaces while what can be shown of ``direct`` is shown, and what spreads under them."""
+    def _falling_shown(self, direct: FloatImage, reach: FloatImage) -> tuple[FloatImage, FloatImage]:
+        """While what can be shown of ``direct`` is shown: the light that falls on blocks (rows of blocks, columns of
+        blocks, 3), and the light (rows, columns, 3) that spreads under surfaces, without rows where none does.
+
+        ``reach`` without rows: without a limit
+        """
+        if self.paint is None and self.surface is None:
+            sums = displayable_sums(direct, reach, *self.grid, self.side)
+            return self._from_blocks(sums.reshape(-1, 3) / np.float32(self.side**2)), NOTHING
         own = np.empty(direct.shape, np.float32)
         for rows in strips(len(own)):
-            part = displayable(direct[rows], None if reach is None else reach[rows])
+            part = displayable(direct[rows], reach[rows] if len(reach) else None)
             own[rows] = part if self.paint is None else part + _times(self.paint[:, :, rows], part)
-        spread = None if self.surface is None else self.surface.forward(own)
-        if spread is not None:
+        spread = NOTHING if self.surface is None else self.surface.forward(own)
+        if len(spread):
             own += spread
-        blocks = down(own, self.grid, self.side)
-        del own
-        return up(self.factors @ blocks, self.grid, self.side, self.lit.shape), spread
+        return self._from_blocks(down(own, self.grid, self.side)), spread
+
+    def _from_blocks(self, blocks: FloatImage) -> FloatImage:
+        return np.ascontiguousarray(self.factors @ blocks, np.float32).reshape(*self.grid, 3)
 
     def falling(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """up(F down(d)): (rows, columns, 3) light that falls on surfaces, before S."""
@@ -120,28 +133,31 @@ class IndirectLight:
         It is negative where more indirect light falls than is wanted. No light is less than none, nor more than
         ``reach``, so that G takes no more than that of it.
         """
+        total = np.ascontiguousarray(total, np.float32)
+        most = NOTHING if reach is None else np.ascontiguousarray(reach, np.float32)
         unpainted = self.unpainted()
         direct = np.zeros(total.shape, np.float32)
-        size = self._approached(direct, total, unpainted)
+        size = self._approach(direct, total, unpainted, np.zeros((*self.grid, 3), np.float32), NOTHING)
         for _ in range(ROUNDS):
-            falling, spread = self._shown(direct, reach)
-            if self._approached(direct, total, unpainted, falling, spread) < CONVERGED * max(size, 1e-30):
+            if self._approach(direct, total, unpainted, *self._falling_shown(direct, most)) < CONVERGED * max(
+                size, 1e-30
+            ):
                 break
         return direct
 
-    def _approached(
-        self, direct: FloatImage, total: FloatImage, unpainted: Colours | None, falling: FloatImage | None = None,
-        spread: FloatImage | None = None,
-    ) -> float:  # fmt: skip
+    def _approach(
+        self, direct: FloatImage, total: FloatImage, unpainted: Colours | None, falling: FloatImage, spread: FloatImage
+    ) -> float:
         """Let ``direct`` be what is left of ``total`` beside other light; the largest change of a number."""
         change = 0.0
-        for rows in strips(len(direct)):
-            left = np.asarray(total[rows], np.float32)
-            left = left if falling is None else left - self.scale[rows] * falling[rows]
-            left = np.where(self.lit[rows][..., None], left if spread is None else left - spread[rows], 0)
-            left = left if unpainted is None else left + _times(unpainted[:, :, rows], left)
-            change = max(change, float(np.abs(left - direct[rows]).max(initial=0)))
-            direct[rows] = left
+        # the matrices are as many numbers as three pictures, and are not kept as float32
+        for rows in strips(len(direct), len(direct) if unpainted is None else STRIP_ROWS):
+            matrices = NO_MATRICES if unpainted is None else unpainted[:, :, rows].astype(np.float32)
+            found = approach(
+                direct[rows], total[rows], self.scale[rows], self.lit[rows], falling, self.side,
+                spread[rows] if len(spread) else NOTHING, matrices, rows.start,
+            )  # fmt: skip
+            change = max(change, float(found.max(initial=0)))
         return change
 
     def in_files(self, folder: Path) -> Self:

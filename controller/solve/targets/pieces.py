@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
+from controller.calibrate.values import Geometry
 from controller.core.arrays import FloatImage, Mask
 from controller.solve.targets.values import Target
 
@@ -42,3 +44,19 @@ def on_each(mask: Mask, make: Callable[[Mask], Target]) -> Target:
         said |= part.mask & piece
         softened = part.softened or softened
     return Target(image, said, softened)
+
+
+def in_box(geometry: Geometry, mask: Mask, make: Callable[[Geometry, Mask], Target]) -> Target:
+    """``make`` for the part of the picture (rows, columns) that ``mask`` has pixels in; it may look at no others.
+
+    An object is a part of a picture, and each of several a small one.
+    """
+    if not mask.any():
+        return make(geometry, mask)
+    rows, columns = (slice(int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(mask.any(axis=n)) for n in (1, 0)))
+    part = replace(geometry, points_m=geometry.points_m[rows, columns], normals=geometry.normals[rows, columns])
+    made = make(part, mask[rows, columns])
+    image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
+    said: Mask = np.zeros(mask.shape, np.bool_)
+    image[rows, columns], said[rows, columns] = made.image, made.mask
+    return replace(made, image=image, mask=said)

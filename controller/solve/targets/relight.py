@@ -79,7 +79,8 @@ def smooth_normals(
     normals = np.where(filled[..., None], geometry.normals[tuple(nearest)], 0).astype(np.float32)
     normals = np.nan_to_num(normals)
     if sigma_px > 0:
-        normals = ndimage.gaussian_filter(normals, (sigma_px, sigma_px, 0), mode="nearest", truncate=3.0)
+        # beyond the picture as beyond the object: nothing
+        normals = ndimage.gaussian_filter(normals, (sigma_px, sigma_px, 0), mode="constant", truncate=3.0)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     directions = np.where(filled[..., None], geometry.points_m[tuple(nearest)], 0)
     directions /= np.maximum(np.linalg.norm(directions, axis=2, keepdims=True), 1e-9)

@@ -145,7 +145,7 @@ def wrap_photograph(
         y = (np.float32(middle[1]) - above) / np.float32(metres) + np.float32((height - 1) / 2)
         return np.float32(ink) + np.float32(paper - ink) * _sampled(photo_linear, x, y)
 
-    return painted(space, pattern, gain=facing(geometry, mask, shading))
+    return painted(space, pattern, gain=facing(geometry, mask, shading) if shading else None)
 
 
 def facing(geometry: Geometry, mask: Mask, shading: float) -> FloatImage:

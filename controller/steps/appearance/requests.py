@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -20,7 +21,7 @@ from controller.core.storage import sha256_of
 from controller.solve.targets.colour import ColourSpace
 from controller.solve.targets.files import check_picture, load_target, read_picture
 from controller.solve.targets.patterns import Colour, checkerboard, replace_pattern
-from controller.solve.targets.pieces import on_each
+from controller.solve.targets.pieces import in_box, on_each
 from controller.solve.targets.relight import gloss, recolour
 from controller.solve.targets.values import Target, through_camera
 from controller.solve.targets.wrap import wrap_photograph
@@ -148,10 +149,10 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
     if kind == "photograph":
         assert file is not None
         photograph = np.maximum(read_picture(file, colour)[..., :3], 0)
-        made = on_each(mask, lambda piece: wrap_photograph(photograph, geometry, piece, **options))
+        make = partial(wrap_photograph, photograph, **options)
     else:
-        made = on_each(mask, lambda piece: _MAKERS[kind](geometry, piece, **options))
-    return through_camera(made)
+        make = partial(_MAKERS[kind], **options)
+    return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make)))
 
 
 def _as_it_is(calibrated: Calibrated) -> FloatImage:
