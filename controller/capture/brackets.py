@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.capture.profile import CameraNoise
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, strips
 from controller.core.errors import UsageError
 from controller.core.jit import compiled
 
@@ -47,6 +47,8 @@ FLICKER = 0.02
 """A longer exposure may show this share less than shorter ones: lamps are not steady."""
 SPREADS = 3.0
 """Standard deviations by which a longer exposure may be below what shorter ones predict."""
+AT_ONCE = 1 << 18
+"""Samples of each image that are merged in one go."""
 ROUNDED = 0.5 / 255
 """Of full scale: the error of a sample of 8 bits, where nothing is known of the camera's noise."""
 
@@ -92,12 +94,23 @@ def merge_brackets(
             "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
         )
     flat = [np.ascontiguousarray(image, np.float32).reshape(-1) for image in images]
-    counting = _counting(flat, exposures_s, noise, rounded)
-    estimate, _ = _weighted(flat, exposures_s, counting, np.zeros_like(flat[0]), noise)
-    radiance, weight = _weighted(flat, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
-    with np.errstate(divide="ignore"):
-        sigma = np.where(weight > 0, 1 / np.sqrt(weight), np.float32(np.nan))
+    radiance, sigma = np.empty_like(flat[0]), np.empty_like(flat[0])
+    # a part at a time, which stays in the cache
+    for part in strips(len(radiance), AT_ONCE):
+        _merge([image[part] for image in flat], exposures_s, noise, rounded, radiance[part], sigma[part])
     return MergedBracket(radiance.reshape(images[0].shape), sigma.reshape(images[0].shape))
+
+
+def _merge(
+    images: Sequence[FloatImage], exposures_s: Sequence[float], noise: CameraNoise, rounded: float,
+    radiance: FloatImage, sigma: FloatImage,
+) -> None:  # fmt: skip
+    """Fill ``radiance`` and ``sigma`` for some samples (samples,) of each image."""
+    counting = _counting(images, exposures_s, noise, rounded)
+    estimate, _ = _weighted(images, exposures_s, counting, np.zeros_like(radiance), noise)
+    radiance[:], weight = _weighted(images, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
+    with np.errstate(divide="ignore"):
+        sigma[:] = np.where(weight > 0, 1 / np.sqrt(weight), np.float32(np.nan))
 
 
 def _counting(
