@@ -77,8 +77,7 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
         phase_map = mosaic = spread = None
         if pixels is not None:
             phase_map, mosaic, spread = pixels.phase_map, pixels.known_mosaic, pixels.surface_spread
-        # in place: of a mapped file, only the pages with saturated pixels become memory of this process
-        white, radiometry = np.nan_to_num(light.white, copy=False), light.radiometry
+        white, radiometry = _known(light.white), light.radiometry
         gain = read_white_gain(folder, name) if found is None else found[number].white_gain
         if gain is not None:
             white = _times(white, gain, folder)
@@ -89,13 +88,22 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
             stripes = found[number].stripes
         metapixels = read_metapixels(folder, name)
         parts.append(ProjectorCalibration(name, metapixels, radiometry, white, phase_map, indirect, stripes, spread))
-    black = np.nan_to_num(light.black, copy=False)
+    black = _known(light.black)
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)
     mask = object_mask(parts)
     if (points_m := known_points_m(folder)) is not None:
         mask &= ~room_pixels(points_m)
     return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
+
+
+def _known(image: FloatImage) -> FloatImage:
+    """The same picture, 0 where it was not measured.
+
+    In place: of a mapped file, only the pages with saturated pixels become memory of this process.
+    """
+    np.copyto(image, np.float32(0), where=np.isnan(image))
+    return image
 
 
 def _times(white: FloatImage, gain: npt.NDArray[np.floating], folder: Path) -> FloatImage:

@@ -222,14 +222,13 @@ def _deviations(
     """Lower edge of each well-filled bin of predicted levels below ``top``, rising, and how far its samples deviate."""
     edges = np.linspace(WELL_LIT[0], 1.0, BINS + 1)
     which = np.digitize(predicted, edges)
-    found = []
-    for number in range(1, BINS + 1):
-        inside = which == number
-        if edges[number] > 0.995 * top or np.count_nonzero(inside) < FEWEST_IN_BIN:
-            continue
-        ratio = np.mean(seen[inside], dtype=np.float64) / np.mean(predicted[inside], dtype=np.float64)
-        found.append((float(edges[number - 1]), float(ratio) - 1))
-    return found
+    counts = np.bincount(which, minlength=BINS + 1)
+    light, expected = (np.bincount(which, one, BINS + 1) for one in (seen, predicted))
+    return [
+        (float(edges[number - 1]), float(light[number] / expected[number]) - 1)
+        for number in range(1, BINS + 1)
+        if edges[number] <= 0.995 * top and counts[number] >= FEWEST_IN_BIN
+    ]
 
 
 def black_offset(series: Sequence[RawExposure], levels: SensorLevels) -> Float64:
