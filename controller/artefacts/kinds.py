@@ -58,8 +58,14 @@ OF_PROJECTORS: Final = (
 )  # fmt: skip
 """Kinds of which there is one step for each projector."""
 
+WHITE_ITEM: Final = "white"
 CALIBRATED: Final = StepId(StepKind.CALIBRATED)
 """The step whose row in the journal marks the run's calibration as complete."""
+
+
+def white_of(projector: str) -> StepId:
+    """The first part of the light of a projector, a step of its own: white, from which the camera is measured."""
+    return StepId(StepKind.LIGHT, projector, WHITE_ITEM)
 
 
 def of_projectors(names: Iterable[str], *kinds: StepKind) -> tuple[StepId, ...]:
@@ -67,4 +73,4 @@ def of_projectors(names: Iterable[str], *kinds: StepKind) -> tuple[StepId, ...]:
     return tuple(StepId(kind, projector) for projector in names for kind in kinds)
 
 
-__all__ = ["CALIBRATED", "OF_PROJECTORS", "StepKind", "of_projectors"]
+__all__ = ["CALIBRATED", "OF_PROJECTORS", "StepKind", "of_projectors", "white_of"]

@@ -14,7 +14,7 @@ class StepId:
     ----------
     kind : the work of the step, for example "radiometry" (``artefacts.kinds.StepKind``)
     projector : the name of its projector; None if it concerns all, or none
-    item : the name of its appearance or experiment
+    item : the name of its appearance or experiment, or of the part of the work that it is
     """
 
     kind: str

@@ -39,7 +39,7 @@ from controller.steps import costs
 from controller.steps.calibrate.indirect import indirect_step
 from controller.steps.calibrate.projector_glare import lens_troubles
 from controller.steps.capture.camera import camera_step
-from controller.steps.capture.patterns import capture_steps, code_step
+from controller.steps.capture.patterns import capture_steps, code_step, light_step
 from controller.steps.troubles import tell, tell_all
 
 
@@ -47,11 +47,13 @@ def calibration_steps(
     rig: Rig, prior: CameraPrior, *, longest_exposure_s: float, options: PhotographOptions | None = None
 ) -> list[Step]:
     """All steps from the first photograph to metapixels and geometry."""
-    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s, options=options)
+    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    # The camera and all responses are measured beside photographs, so that no photograph waits for them.
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
-    # All responses first: only that of the first projector is waited for, those of the others are measured beside.
-    steps += [_radiometry_step(projector) for projector in rig.projectors]
+    for projector in rig.projectors:
+        steps.append(light_step(rig, projector, options))
+        steps.append(_radiometry_step(projector))
     for projector in rig.projectors:
         steps.append(code_step(rig, projector, options))
         steps.append(_pixels_step(projector))

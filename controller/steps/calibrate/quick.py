@@ -21,7 +21,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.calibration import read_black
 from controller.artefacts.camera import Exposures
 from controller.artefacts.drift import read_drift
-from controller.artefacts.kinds import StepKind
+from controller.artefacts.kinds import StepKind, white_of
 from controller.artefacts.photographs import DRIFT, white_again_of
 from controller.artefacts.projectors import Indirect, Light, Pixels, mode_of
 from controller.calibrate.verify.drift import Drift, ProjectorDrift
@@ -121,7 +121,9 @@ def reuse_of(step: StepId, drift: Drift, mode: str = "fast") -> Reuse:
         return Reuse.RUN if drift.moved else Reuse.KEEP
     for moved in drift.projectors:
         if step.projector == moved.name:
-            return _reuse_of(step.kind, moved, mode)
+            way = _reuse_of(step.kind, moved, mode)
+            # white is photographed again by the step of the light
+            return Reuse.KEEP if way is Reuse.CORRECT and step == white_of(moved.name) else way
     return Reuse.KEEP
 
 
@@ -142,7 +144,8 @@ def copy_from_last(last: Path, step: StepId, context: Context) -> list[Path] | N
     with Journal(last) as journal:
         artefacts = journal.latest(step)
     if artefacts is None:
-        return None
+        # earlier versions photographed white in the step of the light, to whose artefacts it belongs, too
+        return [] if step.projector is not None and step == white_of(step.projector) else None
     paths = []
     for artefact in artefacts:
         path = context.folder / artefact.path.relative_to(last.resolve())

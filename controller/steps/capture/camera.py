@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.artefacts.camera import Delay, Exposures, write_camera_figures, write_response_figures
-from controller.artefacts.kinds import StepKind, of_projectors
+from controller.artefacts.kinds import StepKind, white_of
 from controller.artefacts.names import CAPTURES
 from controller.artefacts.photographs import BLACK, CAMERA_RESPONSE, Taken, light_of, white_bracket
 from controller.capture.acquire import Shot
@@ -85,9 +85,10 @@ def camera_step(rig: Rig) -> Step:
     return Step(
         StepId(StepKind.CAMERA),
         partial(_measure_camera, names),
-        after=(StepId(StepKind.BLACK), *of_projectors(names, StepKind.LIGHT), *response),
+        after=(StepId(StepKind.BLACK), *map(white_of, names), *response),
         title="Measuring the camera's noise and limits",
         weight=0.3 * scale,
+        calculates=True,
     )
 
 

@@ -64,6 +64,14 @@ def planned_pattern(
     return Planned(name or pattern.name, frames, exposure_s)
 
 
+def photograph_whites(rig: Rig, projector: RigProjector, context: Context) -> Sequence[Path]:
+    """Photograph the bracket of white. The index of the projector's light lists it, and is no artefact of this step:
+    ``photograph_light`` adds to it.
+    """
+    taking = _Taking(rig, projector, context)
+    return taking.take_whites()[1:]
+
+
 def photograph_light(rig: Rig, projector: RigProjector, options: PhotographOptions, context: Context) -> Sequence[Path]:
     """Photograph until the code is known; the last path is of ``PlanUsed``."""
     taking = _Taking(rig, projector, context)
@@ -98,6 +106,10 @@ class _Taking:
             for number, exposure_s in enumerate(self._exposures.white_s)
         ]
         self._paths: list[Path] = []
+
+    def take_whites(self) -> Sequence[Path]:
+        """The index and the photographs of white."""
+        return take_all(self.rig, self.context, self._planned, into=self.set)
 
     def take(self, plan: PatternPlan) -> None:
         """Photograph what this plan has and is not there."""
@@ -161,4 +173,12 @@ def _readable(taking: _Taking, plan: PatternPlan) -> float:
     return float(np.mean((cells[0].sure & cells[1].sure)[lit])) if lit.any() else 0.0
 
 
-__all__ = ["before_response", "expected_plan", "named", "photograph_light", "planned_pattern", "why_not"]
+__all__ = [
+    "before_response",
+    "expected_plan",
+    "named",
+    "photograph_light",
+    "photograph_whites",
+    "planned_pattern",
+    "why_not",
+]

@@ -1,4 +1,4 @@
-"""The steps that photograph patterns: exposure, black, white, Gray code, mosaics, then sinusoids."""
+"""The steps that photograph patterns: exposure, black, white, then Gray code, mosaics and sinusoids."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from controller.artefacts.camera import Delay, Exposures
-from controller.artefacts.kinds import StepKind
+from controller.artefacts.kinds import StepKind, white_of
 from controller.artefacts.pattern_plans import PhotographOptions
 from controller.artefacts.photographs import BLACK, codes_of
 from controller.artefacts.projectors import Light
@@ -20,7 +20,13 @@ from controller.run.step_id import StepId
 from controller.steps import costs
 from controller.steps.capture.camera import delay_step, response_steps
 from controller.steps.capture.exposure import White, bracket, white_exposures
-from controller.steps.capture.light import before_response, expected_plan, photograph_light, planned_pattern
+from controller.steps.capture.light import (
+    before_response,
+    expected_plan,
+    photograph_light,
+    photograph_whites,
+    planned_pattern,
+)
 from controller.steps.capture.photographs import Planned, take_all, use_delay
 
 WHITE_EXPOSURES = 3
@@ -31,9 +37,8 @@ BLACK_BRACKET = (8.0, 32.0)
 """Exposures of the HDR black image, relative to the one at which white is well exposed."""
 
 
-def capture_steps(rig: Rig, *, longest_exposure_s: float, options: PhotographOptions | None = None) -> list[Step]:
-    """All capture steps except the sinusoids, which need the radiometry (see ``code_step``)."""
-    options = options or PhotographOptions()
+def capture_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
+    """Exposures, delay, black and white of all projectors: what is needed to measure the camera."""
     inputs = {"longest_exposure_s": repr(longest_exposure_s), "sizes": _sizes(rig)}
     a_shot_s = _shot_s(rig)
     steps = [
@@ -56,22 +61,34 @@ def capture_steps(rig: Rig, *, longest_exposure_s: float, options: PhotographOpt
             weight=3 * a_shot_s,
         ),
     ]
-    # with few photographs, the first ones say which others are needed
-    after = [StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)]
-    after += [StepId(StepKind.BLACK)] if options.inputs() else []
     for projector in rig.projectors:
-        plan = expected_plan(projector.size_px, options)
         steps.append(
             Step(
-                StepId(StepKind.LIGHT, projector.name),
-                partial(photograph_light, rig, projector, options),
-                inputs={**inputs, "patterns": _patterns(plan), **options.inputs()},
-                after=tuple(after),
-                title=f"Photographing the light of {projector.name}",
-                weight=a_shot_s * (WHITE_EXPOSURES + len(before_response(plan))),
+                white_of(projector.name),
+                partial(photograph_whites, rig, projector),
+                inputs=inputs,
+                after=(StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY)),
+                title=f"Photographing the white of {projector.name}",
+                weight=a_shot_s * WHITE_EXPOSURES,
             )
         )
     return steps
+
+
+def light_step(rig: Rig, projector: RigProjector, options: PhotographOptions | None = None) -> Step:
+    """The step that photographs code and mosaics, for the radiometry."""
+    options = options or PhotographOptions()
+    plan = expected_plan(projector.size_px, options)
+    after = [StepId(StepKind.EXPOSURE), StepId(StepKind.DELAY), white_of(projector.name)]
+    return Step(
+        StepId(StepKind.LIGHT, projector.name),
+        partial(photograph_light, rig, projector, options),
+        inputs={"sizes": _sizes(rig), "patterns": _patterns(plan), **options.inputs()},
+        # with few photographs, the first ones say which others are needed
+        after=(*after, StepId(StepKind.BLACK)) if options.inputs() else tuple(after),
+        title=f"Photographing the light of {projector.name}",
+        weight=_shot_s(rig) * len(before_response(plan)),
+    )
 
 
 def code_step(rig: Rig, projector: RigProjector, options: PhotographOptions | None = None) -> Step:
@@ -158,4 +175,4 @@ def _sizes(rig: Rig) -> str:
     return " ".join(f"{p.name}:{p.output}:{p.size_px[0]}x{p.size_px[1]}" for p in rig.projectors)
 
 
-__all__ = ["capture_steps", "code_step", "linked"]
+__all__ = ["capture_steps", "code_step", "light_step", "linked"]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.drift import write_drift
+from controller.artefacts.kinds import white_of
 from controller.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.calibrate.verify.drift_report import advice, drift_from_json, drift_to_json, sentences
 from controller.calibrate.verify.registration import Motion, no_motion
@@ -68,6 +69,31 @@ def test_only_the_projector_that_changed_is_repeated(bumped: ProjectorDrift, way
     assert {kind: reuse_of(StepId(kind, "b"), found) for kind in ways} == ways
     assert (reuse_of(StepId("light", "a"), found), reuse_of(StepId("codes", "a"), found)) == (Reuse.KEEP, Reuse.KEEP)
     assert (reuse_of(StepId("geometry"), found) is Reuse.RUN) == bool(found.moved)
+
+
+def test_white_is_photographed_by_the_step_of_the_light_where_a_projector_dimmed() -> None:
+    assert reuse_of(white_of("b"), drift(projector("b", gain=0.9))) is Reuse.KEEP
+    assert reuse_of(white_of("b"), drift(projector("b", LOST))) is Reuse.RUN
+    assert reuse_of(white_of("a"), drift(projector("b", LOST))) is Reuse.KEEP
+
+
+def test_a_calibration_whose_light_has_its_white_is_kept_without_photographs(tmp_path: Path) -> None:
+    """As earlier versions photographed it."""
+    last, now = tmp_path / "last", tmp_path / "now"
+    for folder in (last, now):
+        folder.mkdir()
+
+    def fails(context: Context) -> list[Path]:
+        raise AssertionError("white was photographed again")
+
+    with Journal(last):
+        pass
+    write_drift(now, drift(projector("b", gain=0.9)), calibration="last", photographs=3)
+    with Journal(now) as journal:
+        before = Step(StepId("drift"), lambda context: [])
+        steps = [chosen(cast("Rig", None), Calibrated(last, ["a", "b"]), Step(white_of(name), fails)) for name in "ab"]
+        results = Runner([before, *steps], journal).run("recalibrate", deadline=in_seconds(60))
+    assert [results[white_of(name)] for name in "ab"] == [(), ()]
 
 
 def test_a_projector_measured_with_dots_gets_new_ones_when_it_moved() -> None:

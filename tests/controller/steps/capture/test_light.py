@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from controller.artefacts.camera import Exposures
-from controller.artefacts.kinds import StepKind
+from controller.artefacts.kinds import StepKind, white_of
 from controller.artefacts.pattern_plans import (
     PhotographOptions,
     Photographs,
@@ -228,6 +228,21 @@ def test_a_projector_is_measured_from_few_photographs(
     assert np.abs(light.response - SCENE.response()).max() < 0.01
     assert abs(float(np.median(indirect.share[pixels.seen]))) < 0.015
     assert photographs_sentence(run, [NAME]) == f"left {number} ({photographs})"
+
+
+def test_white_is_photographed_once_and_the_camera_measured_from_it(tmp_path: Path, journal: Journal) -> None:
+    stage = stage_of(tmp_path, SCENE, journal)
+    steps = {step.id: step for step in calibration_steps(stage.rig, cast("CameraPrior", None), longest_exposure_s=4.0)}
+    white, light, camera = steps[white_of(NAME)], steps[StepId(StepKind.LIGHT, NAME)], steps[StepId(StepKind.CAMERA)]
+    assert set(white.run(stage.context)) == {photograph.path for photograph in light_of(NAME).read(journal.folder)}
+    assert stage.camera.taken[-2:] == ["white-0", "white-1"]
+    assert camera.calculates
+    camera.run(stage.context)
+    light.run(stage.context)
+    assert stage.camera.taken.count("white-0") == 1
+    assert {"white-0", "white-1", "gray-x-0"} <= stage.names()
+    order = list(steps)
+    assert order.index(white.id) < order.index(camera.id) < order.index(light.id)
 
 
 def test_a_code_waits_for_no_response_but_its_own(tmp_path: Path, journal: Journal) -> None:
