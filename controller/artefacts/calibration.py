@@ -37,14 +37,7 @@ LIT_SHARE = 0.004
 def merge_photographs(taken: Sequence[Taken]) -> FloatImage:
     """HDR radiance in full scales per second from photographs of one picture."""
     noise = taken[0].profile.noise if taken and taken[0].profile is not None else None
-    return merge_brackets([_measured(t) for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
-
-
-def _measured(taken: Taken) -> FloatImage:
-    """As ``Photograph.measured``, without a copy: this picture is of no further use."""
-    photograph = taken.read()
-    photograph.image[photograph.saturated] = np.nan
-    return photograph.image
+    return merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
 
 
 def read_black(folder: Path) -> FloatImage:

@@ -39,12 +39,17 @@ class Taken:
     def read(self) -> Photograph:
         return read_photograph(self.path, profile=self.profile)
 
+    def measured(self) -> FloatImage:
+        """(rows, columns, 3) float32: full scales, NaN where saturated."""
+        photograph = self.read()
+        # not ``Photograph.measured``, which copies: this photograph has no other use
+        photograph.image[photograph.saturated] = np.nan
+        return photograph.image
+
     def per_second(self) -> FloatImage:
         """(rows, columns, 3) float32: full scales per second, NaN where saturated."""
-        photograph = self.read()
-        image = photograph.image
+        image = self.measured()
         image /= np.float32(self.exposure_s)
-        image[photograph.saturated] = np.nan
         return image
 
 

@@ -95,7 +95,7 @@ def _pack(photograph: _Photograph, run: Path, folder: Path) -> Mapping[str, Any]
     taken = photograph.taken
     original = _copy(taken.path, folder / "originals" / photograph.kind / taken.path.name)
     light = folder / "photographs" / photograph.kind / f"{taken.path.stem}.exr"
-    write_atomically(light, exr_bytes({"RGB": taken.read().measured()}, half=True))
+    write_atomically(light, exr_bytes({"RGB": taken.measured()}, half=True))
     return {
         "name": taken.name,
         "kind": photograph.kind,

@@ -83,7 +83,7 @@ def take_hdr(
     exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder), light=light)
     taken = take_bracket(rig, context, kind, name, exposures_s, shown_at_s=shown_at_s, of=of)
     merged = merge_brackets(
-        [photograph.read().measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
+        [photograph.measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
     ).radiance
     return taken, merged
 

@@ -246,7 +246,7 @@ class _Round:
             shown_at_s=presented_s, of={"frames": frames_digest(shown)},
         )  # fmt: skip
         exposures_s = [one.exposure_s for one in taken]
-        images = [one.read().measured() for one in taken]
+        images = [one.measured() for one in taken]
         noise = taken[0].profile.noise if taken[0].profile is not None else None
         merged = merge_brackets(images, exposures_s, noise=noise)
         first, last = (images[n] / np.float32(exposures_s[n]) for n in (0, -1))

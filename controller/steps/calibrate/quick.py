@@ -188,7 +188,7 @@ def _correct_light(folder: Path, name: str, one: ProjectorDrift) -> None:
     light = dataclasses.replace(light, black=read_black(folder))
     if one.moved or one.dimmed:
         taken = white_again_of(name).read(folder)
-        white = merge_brackets([t.read().measured() for t in taken], [t.exposure_s for t in taken]).radiance
+        white = merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken]).radiance
         light = dataclasses.replace(light, white=np.maximum(white - light.black, 0).astype(np.float32))
     if one.dimmed:
         light = dataclasses.replace(light, mixing=update_radiometry(light.radiometry, one.gain).mixing)

@@ -237,7 +237,7 @@ def _of_colours(
     for series in whites:
         ordered = sorted(series, key=lambda one: one.exposure_s)
         if len(ordered) > 1:
-            first, second = (one.read().measured()[:, :, 1] for one in ordered[:2])
+            first, second = (one.measured()[:, :, 1] for one in ordered[:2])
             pairs.append((first, second))
     noise = measure_noise(pairs)
     if noise is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.solve.targets.files import load_target, shipped_photograph
 from controller.solve.targets.patterns import checkerboard, replace_pattern
+from controller.solve.targets.pieces import in_box
 from controller.solve.targets.relight import gloss, recolour
 from controller.solve.targets.values import Target, linear_to_srgb, srgb_to_linear, through_camera
 from controller.solve.targets.wrap import object_space, wrap_photograph
@@ -315,3 +318,19 @@ def test_a_print_reflects_from_its_ink_to_its_paper() -> None:
     with pytest.raises(UsageError) as refused:
         wrap_photograph(photo, geometry, mask, ink=0.9, paper=0.2)
     assert refused.value.code == "print-range-invalid"
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.sampled_from([checkerboard, replace_pattern, gloss, partial(wrap_photograph, shipped_photograph())]),
+    st.integers(0, 60), st.integers(80, 150), st.integers(0, 90), st.integers(120, 230), st.booleans(),
+)  # fmt: skip
+def test_a_target_of_an_objects_box_is_that_of_the_whole_picture(
+    make: Callable[[Geometry, Mask], Target], top: int, bottom: int, left: int, right: int, upright: bool
+) -> None:
+    geometry, mask = quadric(0.15, upright=upright)
+    mask[:top] = mask[bottom:] = mask[:, :left] = mask[:, right:] = False
+    boxed, whole = in_box(geometry, mask, make), make(geometry, mask)
+    assert np.array_equal(boxed.mask, whole.mask)
+    np.testing.assert_allclose(boxed.image[mask], whole.image[mask], atol=1e-6)
+    assert not boxed.image[~mask].any()
