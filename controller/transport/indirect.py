@@ -139,9 +139,8 @@ class IndirectLight:
         direct = np.zeros(total.shape, np.float32)
         size = self._approach(direct, total, unpainted, np.zeros((*self.grid, 3), np.float32), NOTHING)
         for _ in range(ROUNDS):
-            if self._approach(direct, total, unpainted, *self._falling_shown(direct, most)) < CONVERGED * max(
-                size, 1e-30
-            ):
+            change = self._approach(direct, total, unpainted, *self._falling_shown(direct, most))
+            if change < CONVERGED * max(size, 1e-30):
                 break
         return direct
 
