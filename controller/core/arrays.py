@@ -14,7 +14,7 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, BinaryIO, Final, TypeAlias, TypeVar, cast
 
@@ -56,6 +56,14 @@ _DAMAGED: Final = (
 def strips(rows: int, at_once: int = STRIP_ROWS) -> Iterator[slice]:
     """All rows of a picture, some at a time."""
     return (slice(first, min(first + at_once, rows)) for first in range(0, rows, at_once))
+
+
+def summed(pictures: Sequence[FloatImage]) -> FloatImage:
+    """The sum of one picture or more, without a copy of all of them, as ``np.sum(pictures, axis=0)`` makes."""
+    whole = pictures[0].copy()
+    for picture in pictures[1:]:
+        whole += picture
+    return whole
 
 
 def save_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:

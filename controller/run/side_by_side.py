@@ -1,9 +1,10 @@
-"""Work on several projectors at the same time, as far as cores and memory allow."""
+"""Work on several projectors at the same time, as far as cores and memory allow; a calculation beside a photograph."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final, TypeVar
 
 from hal.runtime.compute import threads_may_compute, usable_cpus
@@ -28,6 +29,29 @@ def side_by_side(work: Callable[[int], T], count: int, *, bytes_each: int) -> It
         yield from pool.map(work, range(count))
 
 
+def beside(calculation: Callable[[], T], meanwhile: Callable[[], object]) -> T:
+    """The result of ``calculation``, which a thread does while ``meanwhile`` is done here.
+
+    ``calculation`` writes nothing that is kept. One after the other where two threads may not run kernels.
+    Raises what either raises; an error of ``meanwhile`` does not wait for the calculation.
+    """
+    if not threads_may_compute():
+        found = calculation()
+        meanwhile()
+        return found
+    future: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(calculation())
+        except BaseException as error:  # noqa: BLE001 - it is raised to the caller
+            future.set_exception(error)
+
+    threading.Thread(target=run, name="velatura-beside", daemon=True).start()
+    meanwhile()
+    return future.result()
+
+
 def threads_at_once(bytes_each: int) -> int:
     """How many threads have a core and ``bytes_each`` of memory."""
     if not threads_may_compute():
@@ -36,4 +60,4 @@ def threads_at_once(bytes_each: int) -> int:
     return usable_cpus() if free is None else max(1, min(usable_cpus(), int(MOST_MEMORY * free) // max(bytes_each, 1)))
 
 
-__all__ = ["side_by_side", "threads_at_once"]
+__all__ = ["beside", "side_by_side", "threads_at_once"]

@@ -12,7 +12,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.artefacts.geometry import has_geometry, projectors_of, read_geometry
 from controller.artefacts.projectors import Light, Pixels
 from controller.calibrate.values import Geometry
-from controller.core.arrays import ByteImage, FloatImage
+from controller.core.arrays import ByteImage, FloatImage, summed
 from controller.core.errors import UsageError
 from controller.exchange.content import Content
 from controller.exchange.formats import format_of
@@ -88,7 +88,7 @@ def _picture(run: Path, names: tuple[str, ...]) -> ByteImage | None:
     """The object in all projectors' white light, sRGB (rows, columns, 3); None if the run has no white images."""
     if not all(Light.path(run, name).is_file() for name in names):
         return None
-    white = np.sum([np.nan_to_num(Light.read(run, name).white) for name in names], axis=0)
+    white = summed([np.nan_to_num(Light.read(run, name).white) for name in names])
     linear = np.clip(white / max(float(np.quantile(white, 0.995)), 1e-12), 0.0, 1.0)
     curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(255.0 * curve), dtype=np.uint8)

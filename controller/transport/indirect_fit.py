@@ -16,7 +16,7 @@ import numpy as np
 from controller.calibrate.photometry.surface_spread import typical_spread
 from controller.calibrate.values import Calibration, ProjectorCalibration
 from controller.capture.patterns import plan_patterns
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, summed
 from controller.transport.form_factors import form_factors
 from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_shape import shaped
@@ -51,13 +51,13 @@ def fit_indirect(
     if len(indirect) < len(calibration.projectors) or not indirect:
         return None if paint is None and surface is None else replace(_nothing(lit), paint=paint, surface=surface)
     grid, side = blocks_of(calibration.black.shape)
-    whole, stride = np.sum(indirect, axis=0), stride_of(calibration.black.shape)
+    whole, stride = summed(indirect), stride_of(calibration.black.shape)
     few = _View(lit[::stride, ::stride], grid, side // stride, thinned(whole, stride))
     kinds = [_even(grid), *(_near(grid, deviation) for deviation in NEAR_BLOCKS)]
     if points_m is not None and normals is not None:
         kinds.append(form_factors(thinned(points_m, stride), thinned(normals, stride), grid, few.side))
     factors = _factors(kinds, calibration.projectors, few, stride)
-    directly = np.sum([part.white for part in calibration.projectors], axis=0)
+    directly = summed([part.white for part in calibration.projectors])
     view = _View(lit, grid, side, whole)
     scale = view.scale(factors, parted(directly, lit, grid, side))
     return IndirectLight(factors[0], scale, lit, grid, side, factors[1], paint, surface)
@@ -139,7 +139,7 @@ def _surface(calibration: Calibration, lit: Mask) -> SurfaceLight | None:
     spread = typical_spread([part.spread for part in calibration.projectors])
     if spread is None:
         return None
-    return SurfaceLight.of(spread, np.sum([part.white for part in calibration.projectors], axis=0), lit)
+    return SurfaceLight.of(spread, summed([part.white for part in calibration.projectors]), lit)
 
 
 def _striped(part: ProjectorCalibration, white: FloatImage, view: _View, stride: int) -> list[BlockLight]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, strips
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
         plane = _plane(points_m, left, everything, thick, rng)
         if plane is None:
             break
-        near = left & (np.abs(points_m @ plane[:3] + plane[3]) < thick)
+        near = left & _near(points_m, plane, thick)
         if np.mean(near[border]) < AT_BORDER:
             break
         room |= near
@@ -71,16 +71,16 @@ def _plane(
     points_m: FloatImage, left: Mask, everything: Floats, thick: float, rng: np.random.Generator
 ) -> Floats | None:
     """The plane (normal towards the camera, offset) that holds most pixels ``left``, with nothing behind it."""
-    row, column = np.nonzero(left)
-    if not len(row):
+    at = np.flatnonzero(left)
+    if not at.size:
         return None
-    chosen = rng.integers(0, len(row), POINTS)
-    some = points_m[row[chosen], column[chosen]].astype(np.float64)
-    best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / len(row) * POINTS
+    some = points_m.reshape(-1, 3)[at[rng.integers(0, at.size, POINTS)]].astype(np.float64)
+    best, most = None, LEAST * float(np.count_nonzero(np.isfinite(points_m[..., 0]))) / at.size * POINTS
     apart = round(APART * left.shape[0])
-    for start in rng.integers(0, len(row), TRIALS):
+    for start in at[rng.integers(0, at.size, TRIALS)]:
+        row, column = divmod(int(start), left.shape[1])
         beside = rng.integers(-apart, apart + 1, (2, 3))
-        rows, columns = row[start] + beside[0], column[start] + beside[1]
+        rows, columns = row + beside[0], column + beside[1]
         if rows.min() < 0 or columns.min() < 0 or rows.max() >= left.shape[0] or columns.max() >= left.shape[1]:
             continue
         three = points_m[rows, columns].astype(np.float64)
@@ -96,6 +96,14 @@ def _plane(
         if count > most and np.mean(everything @ plane[:3] + plane[3] < -thick) < BEHIND:
             best, most = plane, count
     return best
+
+
+def _near(points_m: FloatImage, plane: Floats, thick: float) -> Mask:
+    """Pixels whose points lie no farther than ``thick`` from a plane."""
+    near = np.empty(points_m.shape[:2], np.bool_)
+    for rows in strips(len(near)):
+        near[rows] = np.abs(points_m[rows] @ plane[:3] + plane[3]) < thick
+    return near
 
 
 def _through(points: Floats) -> Floats:

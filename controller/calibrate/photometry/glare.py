@@ -16,7 +16,7 @@ import numpy as np
 from controller.calibrate.photometry.reflectance import own_reflectance, subset, subset_of
 from controller.calibrate.values import Calibration, Geometry
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, summed
 
 BLOCK_PX: Final = 24
 """Of the thinned picture."""
@@ -56,7 +56,7 @@ def veiling_glare(calibration: Calibration, geometry: Geometry | None) -> float:
     )
     shape = subset_of(geometry, thin)
     paint, indirect = own_reflectance(few, shape), np.sum(thrown, axis=0)
-    veil = spread_by_lens(np.asarray(indirect + np.sum([part.white for part in few.projectors], axis=0), np.float32))
+    veil = spread_by_lens(indirect + summed([part.white for part in few.projectors]))
     known: Mask = np.asarray(few.object_mask & channels.finite(paint))
     shares = _shares(indirect, paint, veil, known)
     if shares.size < FEWEST:

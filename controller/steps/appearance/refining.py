@@ -18,7 +18,7 @@ from controller.artefacts.projectors import IndirectFigures
 from controller.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
 from controller.capture.brackets import merge_brackets
 from controller.capture.profile import load_profile
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, summed
 from controller.rig.rig import Rig
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
@@ -206,7 +206,7 @@ class _Round:
     @property
     def _stage(self) -> RefinedStage:
         calibration = self.calibrated.calibration
-        white = np.sum([part.white for part in calibration.projectors], axis=0, dtype=np.float32)
+        white = summed([part.white for part in calibration.projectors])
         indirect = [part.indirect for part in calibration.projectors if part.indirect is not None]
         white = white + np.sum(indirect, axis=0, dtype=np.float32)
         return RefinedStage(calibration.black, np.maximum(white, 0))

@@ -7,6 +7,7 @@ With the fewest, no code is shown: the map of the last calibration stands for it
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -26,10 +27,13 @@ from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
 from controller.rig.rig import Rig, RigProjector
 from controller.run.runner import Context
+from controller.run.side_by_side import beside
 from controller.steps.capture.photographs import Planned, take_all
 
 LEAST_READABLE: Final = 0.95
 """Share of the lit camera pixels whose coloured code is clear; with less, the code is shown in grey, too."""
+CODE_AND_TILES: Final = (PatternKind.GRAY, PatternKind.COLOUR_GRAY, PatternKind.COLOUR_TILES)
+"""Kinds of the patterns for the response, in the order in which they are photographed."""
 LIT_SHARE: Final = 0.05
 """Of the 99th percentile of white's light: darker camera pixels are not asked."""
 
@@ -44,9 +48,7 @@ def expected_plan(size_px: tuple[int, int], options: PhotographOptions) -> Patte
 
 def before_response(plan: PatternPlan) -> tuple[Pattern, ...]:
     """Patterns for the response: the code finds the mosaics' tiles."""
-    return (
-        plan.of_kind(PatternKind.GRAY) + plan.of_kind(PatternKind.COLOUR_GRAY) + plan.of_kind(PatternKind.COLOUR_TILES)
-    )
+    return tuple(pattern for kind in CODE_AND_TILES for pattern in plan.of_kind(kind))
 
 
 def named(plan: PatternPlan, name: str) -> Pattern:
@@ -84,8 +86,9 @@ def photograph_light(rig: Rig, projector: RigProjector, options: PhotographOptio
         if known is not None:
             return taking.done(known)
     plan = plan_patterns(projector.size_px, few=True, code=Code.COLOURS)
-    taking.take(plan)
-    readable = _readable(taking, plan)
+    taking.take(plan, (PatternKind.COLOUR_GRAY,))
+    # The mosaics are needed with any code, so the camera works while the code is read.
+    readable = beside(partial(_readable, context.folder, taking.photographs(), plan), partial(taking.take, plan))
     if readable >= LEAST_READABLE:
         return taking.done(PlanUsed(few=True, code=Code.COLOURS, because=because))
     dark = f"The code in colours was clear on {100 * readable:.0f} % of the lit camera pixels: too dark paint."
@@ -111,22 +114,20 @@ class _Taking:
         """The index and the photographs of white."""
         return take_all(self.rig, self.context, self._planned, into=self.set)
 
-    def take(self, plan: PatternPlan) -> None:
-        """Photograph what this plan has and is not there."""
+    def take(self, plan: PatternPlan, kinds: Sequence[PatternKind] = CODE_AND_TILES) -> None:
+        """Photograph what this plan has of these kinds and is not there."""
         have = {planned.name for planned in self._planned}
         self._planned += [
             planned_pattern(self.projector, pattern, self._exposures.base_s, None)
-            for pattern in before_response(plan)
+            for kind in kinds
+            for pattern in plan.of_kind(kind)
             if pattern.name not in have
         ]
         self._paths = take_all(self.rig, self.context, self._planned, into=self.set)
 
-    def developed(self) -> tuple[Developed, Taken]:
-        """All of them, with black and white merged, and one of them."""
-        taken = self.set.by_name(self.context.folder)
-        black = read_black(self.context.folder)
-        bracket = white_bracket(list(taken.values()))
-        return Developed(taken, {"black": black, "white": merge_photographs(bracket)}), bracket[0]
+    def photographs(self) -> dict[str, Taken]:
+        """By name, those taken so far."""
+        return self.set.by_name(self.context.folder)
 
     def done(self, used: PlanUsed) -> Sequence[Path]:
         if used.because:
@@ -145,7 +146,7 @@ def _known_code(taking: _Taking, last: Path | None) -> tuple[PlanUsed | None, st
         return None, "The last calibration has no map of it."
     plan = plan_patterns(size_px, few=True, code=Code.KNOWN)
     taking.take(plan)
-    captures, _ = taking.developed()
+    captures, _ = _developed(taking.context.folder, taking.photographs())
     if captures["black"].shape[:2] != known_px.shape[:2]:
         return None, "The last calibration has another picture size."
     figures = IndirectFigures.read(last, name)
@@ -164,9 +165,15 @@ def why_not(check: MapCheck) -> str:
     )
 
 
-def _readable(taking: _Taking, plan: PatternPlan) -> float:
+def _developed(folder: Path, taken: Mapping[str, Taken]) -> tuple[Developed, Taken]:
+    """Photographs of a projector with black and white merged, and one of them."""
+    bracket = white_bracket(list(taken.values()))
+    return Developed(taken, {"black": read_black(folder), "white": merge_photographs(bracket)}), bracket[0]
+
+
+def _readable(folder: Path, taken: Mapping[str, Taken], plan: PatternPlan) -> float:
     """Share of the lit camera pixels whose coloured code is clear."""
-    captures, one = taking.developed()
+    captures, one = _developed(folder, taken)
     cells = decode_colours(captures, plan, noise_of(one))
     light = channels.total(np.nan_to_num(captures["white"] - captures["black"]))
     lit = light > LIT_SHARE * np.percentile(light[::7, ::7], 99)

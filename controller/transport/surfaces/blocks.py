@@ -88,6 +88,12 @@ def between(at_px: int, side: int, blocks: int) -> tuple[int, int, np.float32]:
     return first, min(first + 1, blocks - 1), np.float32(place - first)
 
 
+@compiled()
+def mixed(first: np.float32, second: np.float32, share: np.float32) -> np.float32:
+    """Between the first value and the second: the first with a share of 0."""
+    return first + share * (second - first)
+
+
 @compiled(parallel=True)
 def _spread(blocks: FloatImage, side: int, out: FloatImage) -> None:
     """Fill a picture with values of blocks (rows of blocks, columns of blocks, channels)."""
@@ -96,6 +102,6 @@ def _spread(blocks: FloatImage, side: int, out: FloatImage) -> None:
         for x in range(out.shape[1]):
             left, right, share = between(x, side, blocks.shape[1])
             for c in range(out.shape[2]):
-                first = blocks[above, left, c] + share * (blocks[above, right, c] - blocks[above, left, c])
-                second = blocks[below, left, c] + share * (blocks[below, right, c] - blocks[below, left, c])
-                out[y, x, c] = first + down_share * (second - first)
+                upper = mixed(blocks[above, left, c], blocks[above, right, c], share)
+                lower = mixed(blocks[below, left, c], blocks[below, right, c], share)
+                out[y, x, c] = mixed(upper, lower, down_share)

@@ -7,7 +7,7 @@ from numba import prange
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
-from controller.transport.surfaces.blocks import between
+from controller.transport.surfaces.blocks import between, mixed
 
 
 @compiled(parallel=True)
@@ -43,9 +43,9 @@ def approach(
             if lit[y, x]:
                 before, after, share = between(x, side, blocks.shape[1])
                 for c in range(3):
-                    upper = blocks[above, before, c] + share * (blocks[above, after, c] - blocks[above, before, c])
-                    lower = blocks[below, before, c] + share * (blocks[below, after, c] - blocks[below, before, c])
-                    left[c] = total[y, x, c] - scale[y, x, c] * (upper + down_share * (lower - upper))
+                    upper = mixed(blocks[above, before, c], blocks[above, after, c], share)
+                    lower = mixed(blocks[below, before, c], blocks[below, after, c], share)
+                    left[c] = total[y, x, c] - scale[y, x, c] * mixed(upper, lower, down_share)
                     if spread.shape[0]:
                         left[c] -= spread[y, x, c]
             for c in range(3):

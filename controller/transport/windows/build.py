@@ -11,7 +11,7 @@ from controller.core.arrays import Float64, FloatImage, Mask
 from controller.transport.windows.order import place_cells, settle, take_turns
 from controller.transport.windows.profiles import GROUP, Profiles, build_profiles, build_small_profiles
 from controller.transport.windows.sample_kernels import BEYOND, MOST_SHEAR, NEAR, OTHER, SORTS, Windows, kind_of
-from controller.transport.windows.walk import walk
+from controller.transport.windows.walk import BANDS, walk
 
 _Filled = tuple[
     npt.NDArray[np.int32],
@@ -46,10 +46,11 @@ def build_windows(
         for n, phase_map in enumerate(maps)
     ]
     # all are counted first, so that there is one array of each kind from the beginning
-    counts, rooms = [], []
+    bands, counts, rooms = [], [], []
     for n, arguments in enumerate(walks):
-        count = np.zeros(SORTS * int(cell_first[n + 1] - cell_first[n]), np.int64)
-        walk(*arguments, count, True, *_empty(0))
+        bands.append(np.zeros((BANDS, SORTS * int(cell_first[n + 1] - cell_first[n])), np.int64))
+        walk(*arguments, bands[n], True, *_empty(0))
+        count = bands[n].sum(axis=0)
         small = np.arange(count.size) % SORTS != OTHER
         counts.append(count)
         rooms.append(np.where(small, -(-count // GROUP) * GROUP, count))
@@ -61,7 +62,8 @@ def build_windows(
         own = first[cells] - first[cells.start]
         part = slice(int(first[cells.start]), int(first[cells.stop - 1]))
         mine = _part(filled, part)
-        walk(*arguments, own[:-1].copy(), False, *mine)
+        begins = own[:-1] + np.cumsum(bands[n], axis=0) - bands[n]
+        walk(*arguments, begins, False, *mine)
         settle(own, counts[n], *mine)
     turn, turn_first = take_turns(place, sizes, room.reshape(-1, SORTS).sum(axis=1), cell_first)
     start = np.cumsum([0, *(int(rows * columns) for rows, columns in sizes)]).astype(np.int64)

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import prange
 
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
@@ -38,12 +39,14 @@ from controller.transport.windows.sample_kernels import (
     kind_of,
 )
 
+BANDS: Final = 16
+"""Of rows of the camera's picture, which are walked over at the same time."""
 UPRIGHT_BELOW: Final = (LEAST_SHEAR + 0.5) / SHEARS
 Shape = tuple[int, int, int, int]
 """Sort, table rows across and down, and skew."""
 
 
-@compiled()
+@compiled(parallel=True)
 def walk(
     position: FloatImage,
     spread: FloatImage,
@@ -63,48 +66,49 @@ def walk(
     skew: npt.NDArray[np.int8],
     gain: FloatImage,
 ) -> None:
-    """Count the windows of each cell and sort in ``fill``, or write them from there on; arrays as in ``Windows``.
+    """Count the windows of each band, cell and sort in ``fill`` (bands, cells), or write them from there on.
 
-    ``apart`` (3, 5): what is added to place and spread of each of the camera's colours
+    Arrays as in ``Windows``; ``apart`` (3, 5): what is added to place and spread of each of the camera's colours
     """
     rows, columns = spread.shape[:2]
     tiles_across = (columns + TILE - 1) // TILE
     tiles = (rows + TILE - 1) // TILE * tiles_across
-    pixels = use.size
-    for r in range(use.shape[0]):
-        for c in range(use.shape[1]):
-            if not use[r, c]:
-                continue
-            for colour in range(3):
-                one = colours.size > 0
-                if (one and colours[r & 1, c & 1] != colour) or not white[r, c, colour] > 0:
+    one = colours.size > 0
+    for band in prange(BANDS):
+        for r in range(band * use.shape[0] // BANDS, (band + 1) * use.shape[0] // BANDS):
+            for c in range(use.shape[1]):
+                if not use[r, c]:
                     continue
-                x, y = position[r, c, 0] + apart[colour, 0], position[r, c, 1] + apart[colour, 1]
-                # NaN fails every comparison
-                if not (-BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
-                    continue
-                left, top = int(np.floor(x)), int(np.floor(y))
-                near = spread[
-                    min(max(int(np.floor(y + 0.5)), 0), rows - 1), min(max(int(np.floor(x + 0.5)), 0), columns - 1)
-                ]
-                xx, xy, yy = near[0] + apart[colour, 2], near[1] + apart[colour, 3], near[2] + apart[colour, 4]
-                if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
-                    continue
-                shape = _shape(xx, xy, yy, x - left, y - top, table.small[0])
-                inside = _inside(table, small, left, top, shape, rows, columns)
-                if inside == 0:
-                    continue
-                tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
-                tile_column = min(max(left // TILE, 0), tiles_across - 1)
-                cell = SORTS * (colour * tiles + tile_row * tiles_across + tile_column) + shape[0]
-                e = fill[cell]
-                fill[cell] = e + 1
-                if counting:
-                    continue
-                site[e] = r * use.shape[1] + c + (0 if one else colour * pixels)
-                at[e] = _buffer_place(table, shape, top - tile_row * TILE, left - tile_column * TILE, halo)
-                across[e], down[e], skew[e] = shape[1], shape[2], shape[3]
-                gain[e] = white[r, c, colour] / inside
+                for colour in range(3):
+                    if (one and colours[r & 1, c & 1] != colour) or not white[r, c, colour] > 0:
+                        continue
+                    x, y = position[r, c, 0] + apart[colour, 0], position[r, c, 1] + apart[colour, 1]
+                    # NaN fails every comparison
+                    if not (-BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
+                        continue
+                    left, top = int(np.floor(x)), int(np.floor(y))
+                    near_row = min(max(int(np.floor(y + 0.5)), 0), rows - 1)
+                    near_column = min(max(int(np.floor(x + 0.5)), 0), columns - 1)
+                    xx = spread[near_row, near_column, 0] + apart[colour, 2]
+                    xy = spread[near_row, near_column, 1] + apart[colour, 3]
+                    yy = spread[near_row, near_column, 2] + apart[colour, 4]
+                    if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
+                        continue
+                    shape = _shape(xx, xy, yy, x - left, y - top, table.small[0])
+                    inside = _inside(table, small, left, top, shape, rows, columns)
+                    if inside == 0:
+                        continue
+                    tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
+                    tile_column = min(max(left // TILE, 0), tiles_across - 1)
+                    cell = SORTS * (colour * tiles + tile_row * tiles_across + tile_column) + shape[0]
+                    e = fill[band, cell]
+                    fill[band, cell] = e + 1
+                    if counting:
+                        continue
+                    site[e] = r * use.shape[1] + c + (0 if one else colour * use.size)
+                    at[e] = _buffer_place(table, shape, top - tile_row * TILE, left - tile_column * TILE, halo)
+                    across[e], down[e], skew[e] = shape[1], shape[2], shape[3]
+                    gain[e] = white[r, c, colour] / inside
 
 
 @compiled()

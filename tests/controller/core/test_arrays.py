@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from controller.core.arrays import ALIGNMENT, array_in_file, load_arrays, save_arrays
+from controller.core.arrays import ALIGNMENT, array_in_file, load_arrays, save_arrays, summed
 from controller.core.errors import UsageError
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="/\\\0", exclude_categories=["Cs"]), min_size=1)
@@ -114,3 +114,14 @@ def test_an_array_in_a_file_is_an_array_and_leaves_nothing(tmp_path: Path, from_
 
 def test_without_a_disk_memory_takes_its_place(tmp_path: Path) -> None:
     array_in_file(tmp_path / "missing", (2, 2), from_bytes=0)[:] = 1
+
+
+@given(
+    st.lists(
+        hnp.arrays(np.float32, (3, 4, 3), elements=st.floats(-1e6, 1e6, width=32)), min_size=1, max_size=4
+    )
+)  # fmt: skip
+def test_a_sum_of_pictures_is_numpys_and_leaves_them_as_they_are(pictures: list[npt.NDArray[np.float32]]) -> None:
+    before = [picture.copy() for picture in pictures]
+    np.testing.assert_array_equal(summed(pictures), np.sum(pictures, axis=0))
+    np.testing.assert_array_equal(pictures, before)

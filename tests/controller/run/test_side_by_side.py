@@ -1,4 +1,4 @@
-"""Work on several projectors at once: in order, as memory allows, and an error ends it."""
+"""Work on several projectors at once: in order, as memory allows, and an error ends it. A calculation beside it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from controller.run.side_by_side import side_by_side, threads_at_once
+from controller.run.side_by_side import beside, side_by_side, threads_at_once
 
 LITTLE, ALL = 1, 1 << 60
 
@@ -54,3 +54,43 @@ def test_an_error_comes_through_and_the_rest_is_left(bytes_each: int) -> None:
     with pytest.raises(ZeroDivisionError):
         list(results)
     assert len(begun) < 50
+
+
+def test_a_calculation_runs_while_other_work_is_done() -> None:
+    begun, photographed = threading.Event(), threading.Event()
+
+    def calculation() -> int:
+        begun.set()
+        assert photographed.wait(10)
+        return 7
+
+    def photograph() -> None:
+        assert begun.wait(10)
+        photographed.set()
+
+    assert beside(calculation, photograph) == 7
+
+
+def test_an_error_of_the_other_work_does_not_wait_for_the_calculation() -> None:
+    ended = threading.Event()
+
+    def photograph() -> None:
+        raise ZeroDivisionError
+
+    try:
+        with pytest.raises(ZeroDivisionError):
+            beside(lambda: ended.wait(60), photograph)
+        assert not ended.is_set()
+    finally:
+        ended.set()
+
+
+def test_an_error_of_the_calculation_comes_once_the_other_work_is_done() -> None:
+    done: list[str] = []
+
+    def calculation() -> int:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        beside(calculation, lambda: done.append("photograph"))
+    assert done == ["photograph"]

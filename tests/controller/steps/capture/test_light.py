@@ -37,6 +37,7 @@ from controller.steps.calibrate.full import calibration_steps
 from controller.steps.capture.light import photograph_light
 from controller.steps.capture.photographs import Planned, take_all
 from hal.deadline import Deadline, in_seconds
+from hal.errors import DeviceError
 from hal.values import CapturedFile, FileKind, OutputInfo
 from tests.controller.calibrate.simulator import Scene, Stage, positions
 from tests.controller.rig.lamp_model import Lamp, Shelf, World, soon
@@ -62,8 +63,11 @@ class SimulatedCamera(ModelCamera):
     display: OneOutput = field(default_factory=OneOutput)
     stages: dict[float, Stage] = field(default_factory=dict)
     scene: Scene = SCENE
+    fails_at: str = ""
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        if destination.name == self.fails_at:
+            raise DeviceError("camera-lost", what="The camera does not answer.", remedy="Check its cable.")
         exposure_s = self.configured[-1].exposure_s
         if exposure_s not in self.stages:
             self.stages[exposure_s] = Stage(replace(self.scene, exposure=self.scene.exposure * exposure_s))
@@ -162,6 +166,22 @@ def test_the_code_in_colours_is_enough_where_the_paint_is_bright(tmp_path: Path,
     stage = stage_of(tmp_path, SCENE, journal)
     assert stage.light("few") == PlanUsed(few=True, code=Code.COLOURS)
     assert stage.names() == {"white-0", "white-1", "gray-rgb-0", "gray-rgb-1", "gray-rgb-2", "mosaic-0", "mosaic-1"}
+
+
+def test_mosaics_are_photographed_last_while_the_code_in_colours_is_read(tmp_path: Path, journal: Journal) -> None:
+    stage = stage_of(tmp_path, SCENE, journal)
+    stage.light("few")
+    assert stage.camera.taken[-5:] == ["gray-rgb-0", "gray-rgb-1", "gray-rgb-2", "mosaic-0", "mosaic-1"]
+
+
+def test_a_camera_that_fails_while_the_code_is_read_ends_the_step(tmp_path: Path, journal: Journal) -> None:
+    stage = stage_of(tmp_path, SCENE, journal)
+    stage.camera.fails_at = "mosaic-1"
+    with pytest.raises(DeviceError):
+        stage.light("few")
+    stage.camera.fails_at = ""
+    assert stage.light("few") == PlanUsed(few=True, code=Code.COLOURS)
+    assert stage.camera.taken.count("mosaic-0") == 1
 
 
 def test_the_code_is_shown_in_grey_too_where_the_paint_is_dark_in_a_colour(tmp_path: Path, journal: Journal) -> None:
