@@ -56,7 +56,7 @@ OF_PROJECTORS: Final = (
     StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT, StepKind.DOTS,
     StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.STUDY_SHARES, StepKind.EDGE_DOTS, StepKind.EDGES,
 )  # fmt: skip
-"""Kinds of which there is one step for each projector."""
+"""Kinds of the steps that each projector has of its own."""
 
 WHITE_ITEM: Final = "white"
 CALIBRATED: Final = StepId(StepKind.CALIBRATED)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.calibration import read_black
+from controller.artefacts.calibration import merge_photographs, read_black
 from controller.artefacts.camera import Exposures
 from controller.artefacts.drift import read_drift
 from controller.artefacts.kinds import StepKind, white_of
@@ -27,7 +27,6 @@ from controller.artefacts.projectors import Indirect, Light, Pixels, mode_of
 from controller.calibrate.verify.drift import Drift, ProjectorDrift
 from controller.calibrate.verify.drift_report import advice, sentences
 from controller.calibrate.verify.homography_update import update_positions, update_radiometry
-from controller.capture.brackets import merge_brackets
 from controller.core.arrays import ByteImage
 from controller.core.errors import CalibrationError
 from controller.rig.rig import Rig, RigProjector
@@ -187,8 +186,7 @@ def _correct_light(folder: Path, name: str, one: ProjectorDrift) -> None:
     light = Light.read(folder, name)
     light = dataclasses.replace(light, black=read_black(folder))
     if one.moved or one.dimmed:
-        taken = white_again_of(name).read(folder)
-        white = merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken]).radiance
+        white = merge_photographs(white_again_of(name).read(folder))
         light = dataclasses.replace(light, white=np.maximum(white - light.black, 0).astype(np.float32))
     if one.dimmed:
         light = dataclasses.replace(light, mixing=update_radiometry(light.radiometry, one.gain).mixing)
