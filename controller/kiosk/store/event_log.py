@@ -320,8 +320,9 @@ class EventLog:
         return database
 
     def _load(self) -> list[EventRow]:
-        newest = "SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC LIMIT 2000"
-        rows = self._query(newest, int, float, str, str, str)
+        newest = "SELECT number, unix_s, level, text, code FROM events ORDER BY number DESC"
+        # Not a limit of the statement, which would count rows that can't be read.
+        rows = self._query(newest, int, float, str, str, str, most=SHOWN)
         return [EventRow(n, s, _LEVELS.get(level, "info"), text, code) for n, s, level, text, code in reversed(rows)]
 
     def _last_number(self) -> int:
@@ -334,13 +335,15 @@ class EventLog:
         lost = newest or self._unavailable or self._torn or list(self.path.parent.glob("*.damaged-*"))
         return max(newest, int(self._wall())) if lost else 0
 
-    def _query(self, statement: str, *kinds: type) -> list[tuple]:  # type: ignore[type-arg]
-        """Its rows with values of these kinds; of a damaged file those before the damage: where the newest come first,
-        these are the newest.
+    def _query(self, statement: str, *kinds: type, most: int | None = None) -> list[tuple]:  # type: ignore[type-arg]
+        """Its rows with values of these kinds, at most ``most``; of a damaged file those before the damage: where the
+        newest come first, these are the newest.
         """
         rows: list[tuple] = []  # type: ignore[type-arg]
         try:
             for row in self._database.execute(statement):
+                if len(rows) == most:
+                    break
                 if all(map(isinstance, row, kinds)):
                     rows.append(row)
                 else:
