@@ -139,16 +139,21 @@ def bundle_damaged(life: Living, item: Item) -> None:
     witness.disturb_player(repaired_s)
 
     def repair() -> None:
-        publish(STAGE, int(world.truth_s))
-        written = current(bundles)
-        if written is not None:
-            # Twice in one second gives the same name, and a sound file in the place of a bad one.
-            witness.bundles.spoilt.pop(written.name, None)
+        publish_again(life)
         witness.disturb(0.0, PLAYER_S)
 
     life.later(repaired_s, repair)
     if item.arguments == POWER_CUT:
         power_cut(life, 0.0)
+
+
+def publish_again(life: Living) -> None:
+    """The appearances, by another computer."""
+    publish(STAGE, int(life.world.truth_s))
+    written = current(STAGE / "bundles")
+    if written is not None:
+        # Twice in one second gives the same name, and a sound file in the place of a bad one.
+        life.witness.bundles.spoilt.pop(written.name, None)
 
 
 def bundles_unreadable(life: Living, item: Item) -> None:

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
-from controller.simulate.disk import STAGE, TOTAL_BYTES
+from controller.simulate.disk import TOTAL_BYTES
 from controller.simulate.happen.commands import settings_edited
-from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged
+from controller.simulate.happen.damage import bundle_damaged, bundles_unreadable, file_damaged, publish_again
 from controller.simulate.happen.living import Living
 from controller.simulate.happen.power import clock_lost, clock_set, display_away, power_cut
 from controller.simulate.happen.script import Item
 from controller.simulate.judge.witness import PLAYER_S
 from controller.simulate.lamps import RULES, Lamp
-from controller.simulate.stage import OUTPUTS, publish
+from controller.simulate.stage import OUTPUTS
 
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
@@ -224,7 +224,7 @@ def _drift(life: Living, item: Item) -> None:
 
 def _published(life: Living, item: Item) -> None:
     """Appearances that were made on another computer."""
-    publish(STAGE, int(life.world.truth_s))
+    publish_again(life)
     life.witness.disturb_picture(0.0)
 
 
