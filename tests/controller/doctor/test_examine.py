@@ -28,8 +28,8 @@ from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from tests.controller.rig.lamp_model import World
 from tests.controller.rig.rig_model import ModelCamera, ModelDisplay
 from tests.controller.rig.test_mains_relays import Board
+from tests.controller.stage.run_models import Told
 from tests.controller.stage.test_relays_and_light import Sensor
-from tests.controller.stage.test_run import Told
 
 LAMP = LampTiming(0.2, 0.2)
 STAGE = """\

@@ -18,7 +18,7 @@ from hal.deadline import Deadline, in_seconds
 from hal.values import CapturedFile, ExposureSettings, FileKind, Presented, ProjectorCapabilities
 from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World, soon
 from tests.controller.rig.rig_model import EXPOSURES_S, ModelCamera, ModelDisplay
-from tests.controller.stage.test_run import Told
+from tests.controller.stage.run_models import Told
 
 NAMES = ("left", "right")
 SIZE_PX = (4, 3)

@@ -14,7 +14,7 @@ from plugins.dousers.sacn_douser import DRIVER
 from plugins.emulated.optics.truth import DouserTruth
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from tests.controller.stage.test_run import STAGE, Models
+from tests.controller.stage.run_models import STAGE, Models
 from tests.waiting import wait_for
 
 DOUSER = """\

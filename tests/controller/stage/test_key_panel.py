@@ -17,7 +17,7 @@ from controller.stage.open import technicians_panel
 from hal.deadline import Deadline, in_seconds
 from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity, PanelCapabilities
-from tests.controller.stage.test_run import STAGE, Models
+from tests.controller.stage.run_models import STAGE, Models
 
 TABLE = """
 [key_panel]

@@ -22,7 +22,7 @@ from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity
 from tests.controller.rig.lamp_model import World, soon
 from tests.controller.rig.test_mains_relays import Board
-from tests.controller.stage.test_run import STAGE, Models
+from tests.controller.stage.run_models import STAGE, Models
 
 RELAYS = """
 [[relays]]

@@ -15,7 +15,7 @@ from controller.stage.session import OwnSession
 from hal.errors import DeviceRefused
 from hal.registry import Drivers, load_drivers
 from plugins.emulated.usb.process import UsbBusProcess
-from tests.controller.stage.test_run import STAGE, Models
+from tests.controller.stage.run_models import STAGE, Models
 
 TABLES = """
 [[relays]]

@@ -21,7 +21,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.registry import Driver, Drivers
 from hal.values import ProjectorCapabilities, ProjectorStatus
-from tests.controller.stage.test_run import Models, QuickLamp
+from tests.controller.stage.run_models import Models, QuickLamp
 
 
 @pytest.fixture
