@@ -30,7 +30,9 @@ class Wanted:
         self._wrong_until_s = self._unsure_until_s = 0.0
         self._forgotten = False
         self._ran_s = 0.0
-        """When the kiosk was last seen to run with a time."""
+        """When the kiosk was last seen to run with a time, and with a disk that takes what it has to remember."""
+        self._ended_s = -1.0
+        """When what people said ended last."""
 
     def open(self) -> bool:
         """Whether it is to be open now."""
@@ -39,7 +41,7 @@ class Wanted:
             self._open, self._edge_s = self._calendar.open(truth_s), self._calendar.changes_s(truth_s)
         said = self._said
         if said is not None and not self.unknown and said[1] is not None and truth_s >= said[1]:
-            said = self._said = None
+            self._ended_s, said, self._said = said[1], None, None
         return said[0] if said is not None else self._open and not self.unknown
 
     def edge_s(self) -> float:
@@ -54,9 +56,9 @@ class Wanted:
 
     # -- what happens to it
 
-    def ran(self) -> None:
-        """The kiosk runs now."""
-        if not self.unknown:
+    def ran(self, *, remembers: bool) -> None:
+        """The kiosk runs now. ``remembers``: its disk takes what it has to know after a restart."""
+        if not self.unknown and remembers:
             self._ran_s = self._truth()
 
     def say(self, wanted: bool) -> None:
@@ -81,10 +83,11 @@ class Wanted:
     def lose_time(self) -> None:
         """The kiosk knows that it has no time. For one of which everything is sure.
 
-        But what people said when nothing was sure still holds, if it had no power when that was to end.
+        But what people said may still hold, if it had no power, or nothing could be written, when that was to end.
         """
         self.unknown = True
-        self._forgotten = self._forgotten and self._ran_s <= self._unsure_until_s
+        unsure = self._forgotten and self._ran_s <= self._unsure_until_s
+        self._forgotten = unsure or self._ran_s <= self._ended_s
 
     def find_time(self) -> None:
         """It has the right one again."""

@@ -137,7 +137,7 @@ class Witness:
         if now_s - self._stepped_s > DECIDES_S and not self.paused_long:
             raise Broken("decides always", f"it did not for {now_s - self._stepped_s:.1f} s")
         self._stepped_s = now_s
-        self.wanted.ran()
+        self.wanted.ran(remembers=not world.disk.full and service.log.problem is None)
         news = self.log.listen(service, self._check_may_begin)
         for row in news:
             self.lamps.off(row)
