@@ -73,6 +73,9 @@ class LampLedger(Protocol):
         """As ``write``, of what has happened already: what can't be stored is read from now on, and goes with the next
         write. Returns whether it is durable."""
 
+    def forgive(self, name: str) -> None:
+        """After the technician's repair: none of the lamp's attempts counts as failed. As ``keep``."""
+
 
 _UNKNOWN: Final = ""
 _UNREADABLE: Final = (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError)
@@ -91,7 +94,7 @@ class LampFile:
 
     def __init__(self, path: Path) -> None:
         self._path, self._copy = path, path.with_name(self.COPY)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self.damaged = False
         self._records = self._load()
 
@@ -117,6 +120,12 @@ class LampFile:
                 self._records = {**self._records, name: record}
             return False
         return True
+
+    def forgive(self, name: str) -> None:
+        with self._lock:
+            record = self._records.get(name)
+            if record is not None and record.failed:
+                self.keep(name, replace(record, failed=0))
 
     def _load(self) -> Mapping[str, LampRecord]:
         gone = False

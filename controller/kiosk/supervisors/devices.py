@@ -179,7 +179,8 @@ class Devices:
         record = self._ledger.read(table.name)
         maybe_lit = record is not None and record.lit and record.boot in ("", self._world.boot())
         return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
-                                   deadline=self._world.deadline, maybe_lit=maybe_lit)  # fmt: skip
+                                   deadline=self._world.deadline, maybe_lit=maybe_lit,
+                                   keep_forgiven=partial(self._ledger.forgive, table.name))  # fmt: skip
 
     def _unfed(self, projector: str) -> Decision | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]

@@ -44,6 +44,7 @@ class ProjectorSupervisor:
     unfed : the problem of the relays that supply it, which may be the reason for its silence
     deadline : one that ends in so many seconds
     maybe_lit : whether its lamp may be lit before it was looked at
+    keep_forgiven : keeps over a restart that all attempts are allowed again, even while the line is broken
     """
 
     def __init__(
@@ -57,12 +58,13 @@ class ProjectorSupervisor:
         unfed: Callable[[], Decision | None] | None = None,
         deadline: Callable[[float], Deadline] = in_seconds,
         maybe_lit: bool = False,
+        keep_forgiven: Callable[[], None] | None = None,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
         self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
-        self._deadline = deadline
+        self._deadline, self._keep_forgiven = deadline, keep_forgiven or (lambda: None)
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
         self._view = ProjectorView(name, maybe_lit=maybe_lit)
@@ -109,6 +111,7 @@ class ProjectorSupervisor:
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
         self._failed_strikes, self._faulty_since_s, self._remembered = 0, float("-inf"), True
+        self._keep_forgiven()
 
     def step(self) -> None:
         """Read the status once, and act on it. Blocks for a few answers at most; device errors are not raised."""

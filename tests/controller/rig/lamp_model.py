@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
@@ -157,6 +157,10 @@ class Shelf:
     def keep(self, name: str, record: LampRecord) -> bool:
         self.records[name] = record
         return not self.full
+
+    def forgive(self, name: str) -> None:
+        if name in self.records:
+            self.keep(name, replace(self.records[name], failed=0))
 
 
 def soon() -> Deadline:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
@@ -92,8 +93,9 @@ class Kept:
     def begin_anew(self, *, maybe_lit: bool = False) -> None:
         """As a service that was killed and starts."""
         self.supervisor = ProjectorSupervisor(
-            "left", self._opened, self.told.append, clock=self.world, maybe_lit=maybe_lit
-        )
+            "left", self._opened, self.told.append, clock=self.world, maybe_lit=maybe_lit,
+            keep_forgiven=partial(self.shelf.forgive, "left"),
+        )  # fmt: skip
 
     def _opened(self, deadline: Deadline) -> LampGuard:
         if not self.there:
@@ -231,6 +233,19 @@ def test_a_service_that_is_restarted_again_and_again_strikes_no_dead_lamp_anew(k
         kept.supervisor.want_lit = True
         assert kept.run(5.0) is Condition.LIT
         assert kept.lamp.strikes == MOST_STRIKES + 2
+
+
+def test_a_repair_that_was_told_while_the_line_was_away_outlives_a_kill(kept: Kept) -> None:
+    kept.lamp.dud = True
+    kept.supervisor.want_lit = True
+    kept.run(400.0)
+    kept.lamp.dud, kept.there, kept.lamp.trouble = False, False, "gone"
+    assert kept.run(60.0) is Condition.LOST
+    kept.supervisor.forgive()
+    kept.begin_anew()
+    kept.there, kept.lamp.trouble = True, ""
+    kept.supervisor.want_lit = True
+    assert kept.run(400.0) is Condition.LIT
 
 
 def test_kills_soon_after_each_strike_do_not_lose_count(kept: Kept) -> None:
