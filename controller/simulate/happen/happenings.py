@@ -18,6 +18,8 @@ from controller.simulate.stage import OUTPUTS
 
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
+LOOKS_AGAIN_S: Final = 300.0
+"""Who switched a lamp by hand looks at the panel after so long."""
 RETURNS_S: Final = 60.0
 """Somebody who finds no kiosk at the panel comes back after so long."""
 
@@ -97,6 +99,8 @@ def _by_hand(life: Living, item: Item) -> None:
     elif not lamp.lit and not lamp.bad and now_s - lamp.off_at_s >= RULES.minimum_off_s:
         lamp.lit_at_s, lamp.by_hand = now_s, True
     life.witness.disturb_lamps(0.0)
+    # Three times in a row, or one that is switched on when the kiosk is killed, is a lamp that gives no light.
+    life.later(LOOKS_AGAIN_S, partial(_open_if_given_up, life, item.who))
 
 
 def _player(life: Living, item: Item) -> None:
