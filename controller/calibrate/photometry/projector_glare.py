@@ -8,6 +8,7 @@ another projector tells, which throws no shadow there.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -39,15 +40,24 @@ LEAST_DARK: Final = 0.15
 """Of a block: pixels that the projector lights, and where its picture is dark."""
 LEAST_VEIL: Final = 0.1
 """Of white's light: less would be spread by no veil that counts."""
-FEWEST: Final = 12
-"""Blocks."""
+AGREED: Final = 0.5
+"""Standard deviation of what one block says by picture and colour, of its share: a veil is the same in all of them.
+Light that spreads under the surface or falls back from near things, and gloss, are not."""
+AGREED_LIGHT: Final = 0.02, 0.03
+"""The same, of the projector's light: at least for noise, and at most, as no lens spreads much more than this."""
+FEWEST: Final = 6, 2
+"""Blocks, and groups of them."""
+ENOUGH: Final = 4
+"""Groups: fewer, which are near each other, do not show how far they err. What their blocks are apart does."""
 GROUP_PX: Final = 3 * BLOCK_PX
-"""Blocks overlap by half, and neighbours err alike: the median's error is found by draws of groups, so large."""
+"""Blocks overlap by half, and neighbours err alike: each group, so large, has one share, the median of its blocks."""
+APART: Final = 0.003
+"""Blocks of two groups differ by so much even where pictures and colours agree."""
 DRAWS: Final = 200
 SURE: Final = 4.0
 """Standard errors from which it is believed."""
 NAMED: Final = 0.008
-"""Of the projector's light; stages without such glare had 0.005 at most, which was not believed."""
+"""Of the projector's light; stages without such glare had 0.004 at most, which was not believed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,16 +75,20 @@ class DarkPart:
 
 @dataclass(frozen=True, slots=True)
 class Glare:
-    """``share`` of the projector's light that goes astray, with its standard error; ``blocks`` that tell it."""
+    """``share`` of the projector's light that goes astray, with its standard error; ``blocks`` that tell it, in so many
+    ``groups``.
+    """
 
     share: float
     error: float
     blocks: int
+    groups: int
 
     @property
     def sure(self) -> float:
         """The share; 0 where it is not beyond doubt."""
-        return self.share if self.blocks >= FEWEST and self.share > SURE * self.error else 0.0
+        enough = self.blocks >= FEWEST[0] and self.groups >= FEWEST[1]
+        return self.share if enough and self.share > SURE * self.error else 0.0
 
 
 def projector_glare(whites: Sequence[FloatImage], n: int, parts: Sequence[DarkPart], depth_m: FloatImage) -> Glare:
@@ -85,8 +99,24 @@ def projector_glare(whites: Sequence[FloatImage], n: int, parts: Sequence[DarkPa
     whites : (rows, columns, 3) of each projector alone, less black, in the unit of ``parts``; NaN where not known
     depth_m : (rows, columns), NaN where not known
     """
+    groups = _groups(whites, n, parts, depth_m)
+    if not groups:
+        return Glare(0.0, 0.0, 0, 0)
+    shares, apart = np.array([np.median(group, axis=0) for group in groups]).T
+    counts = np.array([len(group) for group in groups])
+    weights = np.sqrt(counts) / np.hypot(apart, APART)
+    share, error = _median(shares, weights)
+    if len(groups) < ENOUGH:
+        error = float(np.hypot(error, np.average(apart, weights=weights)))
+    return Glare(share, error, int(counts.sum()), len(groups))
+
+
+def _groups(
+    whites: Sequence[FloatImage], n: int, parts: Sequence[DarkPart], depth_m: FloatImage
+) -> Sequence[Sequence[tuple[float, float]]]:
+    """What the blocks of each group say, as ``_agreed``."""
     brightness = [_brightness(white) for white in whites]
-    found, groups = [], []
+    found = defaultdict[tuple[int, int], list[tuple[float, float]]](list)
     for here in _on_one_surface(depth_m):
         own = brightness[n][here]
         if not _may_be_an_edge(own):
@@ -95,25 +125,35 @@ def projector_glare(whites: Sequence[FloatImage], n: int, parts: Sequence[DarkPa
         if low > SHADOW * high:
             continue
         others = [m for m in range(len(whites)) if m != n and _shows_an_edge(own, brightness[m][here])]
-        sums = [_sums(whites[n][here], whites[m][here], own > UNLIT, parts, here) for m in others]
-        veil, of_all = np.sum(sums, axis=0) if sums else (0.0, 0.0)
-        if of_all > 0:
-            found.append(veil / of_all)
-            groups.append((here[0].start // GROUP_PX, here[1].start // GROUP_PX))
-    if not found:
-        return Glare(0.0, 0.0, 0)
-    return Glare(float(np.median(found)), _error(np.array(found), groups), len(found))
+        sums = [each for m in others for each in _sums(whites[n][here], whites[m][here], own > UNLIT, parts, here)]
+        if len(sums) > 1 and (agreed := _agreed(sums)) is not None:
+            found[here[0].start // GROUP_PX, here[1].start // GROUP_PX].append(agreed)
+    return list(found.values())
 
 
-def _error(shares: Float64, groups: Sequence[tuple[int, int]]) -> float:
-    """Standard error of the median: half of what 68 % of the draws of groups with replacement span (bootstrap)."""
-    number = np.unique(np.array(groups), axis=0, return_inverse=True)[1].ravel()
-    members = [shares[number == group] for group in range(int(number.max()) + 1)]
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(len(members), size=(DRAWS, len(members)))
-    medians = [np.median(np.concatenate([members[group] for group in one])) for one in drawn]
-    low, high = np.percentile(medians, (16, 84))
-    return float(high - low) / 2
+def _agreed(sums: Sequence[tuple[Float64, Float64]]) -> tuple[float, float] | None:
+    """The share by a block, and how far pictures and colours are apart in it; None where they do not agree, or where
+    shadows are lighter by more than noise: near things light them.
+    """
+    seen, of_all = np.swapaxes(sums, 0, 1)
+    total = float(of_all.sum())
+    share = float(seen.sum()) / max(total, 1e-30)
+    each = np.divide(seen, of_all, out=np.full_like(seen, share), where=of_all > 0)
+    apart = float(np.sqrt(np.sum(of_all * (each - share) ** 2) / max(total, 1e-30)))
+    is_veil = share > -AGREED_LIGHT[0] and apart <= np.clip(AGREED * share, *AGREED_LIGHT)
+    return (share, apart) if is_veil else None
+
+
+def _median(shares: Float64, weights: Float64) -> tuple[float, float]:
+    """The weighted median, and its standard error: half of what 68 % of the draws with replacement span (bootstrap)."""
+    drawn = np.random.default_rng(0).integers(shares.size, size=(DRAWS, shares.size))
+    everyone = np.vstack([np.arange(shares.size), drawn])
+    everyone = np.take_along_axis(everyone, np.argsort(shares[everyone], axis=1, kind="stable"), axis=1)
+    below = np.cumsum(weights[everyone], axis=1)
+    at = np.argmax(below >= below[:, -1:] / 2, axis=1)
+    medians = shares[everyone[np.arange(at.size), at]]
+    low, high = np.percentile(medians[1:], (16, 84))
+    return float(medians[0]), float(high - low) / 2
 
 
 def lens_veils(name: str, share: float) -> str | None:
@@ -184,13 +224,13 @@ def _shows_an_edge(own: FloatImage, other: FloatImage) -> bool:
 
 def _sums(
     white: FloatImage, other: FloatImage, lit: Mask, parts: Sequence[DarkPart], here: Place
-) -> tuple[float, float]:
-    """What least squares need of a block: products of the veil with what is seen, and with itself.
+) -> Iterator[tuple[Float64, Float64]]:
+    """What least squares need of a block, for each picture that tells something: of each colour, (3,), the product of
+    the veil with what is seen, and with itself.
 
     What is seen is the veil on this projector's white; light of other surfaces on the paint, which changes along a
     slope; and light that no paint changes.
     """
-    seen = of_all = 0.0
     for part in parts:
         dark, light = part.dark[here], part.light[here]
         known = (dark | ~lit) & channels.finite(light)
@@ -199,14 +239,12 @@ def _sums(
         veil = float(part.veil[here][dark].mean())
         if veil < LEAST_VEIL:
             continue
-        paint, own, here_seen = (picture[known].T.astype(np.float64) for picture in (other, white, light))
+        paint, own, seen = (picture[known].T.astype(np.float64) for picture in (other, white, light))
         rest = np.stack([paint, paint * DOWN[known], paint * ACROSS[known], np.ones_like(paint)], axis=2)
         span = np.linalg.qr(rest)[0]
         own = veil * own[..., None]
         own -= span @ (span.transpose(0, 2, 1) @ own)
-        seen += float(np.sum(own[..., 0] * here_seen))
-        of_all += float(np.sum(own * own))
-    return seen, of_all
+        yield np.sum(own[..., 0] * seen, axis=1), np.sum(own[..., 0] ** 2, axis=1)
 
 
 __all__ = ["DarkPart", "Glare", "lens_veils", "projector_glare"]
