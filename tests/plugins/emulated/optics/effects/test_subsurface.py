@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import k0
 
+from plugins.emulated.optics.effects import subsurface
 from plugins.emulated.optics.effects.subsurface import Spread
 
 SIDE = 121
@@ -18,9 +19,9 @@ def plane(step_m: float = 5e-4, slant: float = 1.0) -> tuple[np.ndarray, np.ndar
 
 
 @pytest.mark.parametrize("slant", [1.0, 2.0])
-def test_a_point_of_light_spreads_by_k0(slant: float) -> None:
+@pytest.mark.parametrize("spread_m", [2.5e-3, 6e-3])
+def test_a_point_of_light_spreads_by_k0(spread_m: float, slant: float) -> None:
     pixels, points = plane(slant=slant)
-    spread_m = 2.5e-3
     spread = Spread.over(pixels, points, SIDE, spread_m)
     falling = np.zeros((SIDE * SIDE, 3), np.float32)
     middle = SIDE * SIDE // 2
@@ -32,11 +33,25 @@ def test_a_point_of_light_spreads_by_k0(slant: float) -> None:
     np.testing.assert_allclose(found[some], wanted, rtol=0.05)
 
 
-def test_no_light_is_lost_and_none_passes_a_depth_edge() -> None:
+def test_light_sought_at_fewer_places_is_nearly_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    pixels, points = plane()
+    points[:, 2] += 0.004 * np.sin(points[:, 0] * 300)
+    falling = np.repeat(((pixels // 9 + pixels // SIDE // 11) % 2).astype(np.float32)[:, None], 3, axis=1)
+    fewer = Spread.over(pixels, points, SIDE, 6e-3)
+    monkeypatch.setattr(subsurface, "FINEST", np.inf)
+    every = Spread.over(pixels, points, SIDE, 6e-3)
+    assert fewer.between.shape[1] < 0.5 * every.between.shape[1]
+    apart = fewer.of(falling) - every.of(falling)
+    assert np.sqrt(np.mean(apart**2)) < 0.01
+    assert np.abs(apart).max() < 0.05
+
+
+@pytest.mark.parametrize("spread_m", [2e-3, 6e-3])
+def test_no_light_is_lost_and_none_passes_a_depth_edge(spread_m: float) -> None:
     pixels, points = plane()
     behind = (pixels % SIDE) > 60
     points[behind, 2] += 0.1
-    spread = Spread.over(pixels, points, SIDE, 2e-3)
+    spread = Spread.over(pixels, points, SIDE, spread_m)
     falling = np.random.default_rng(2).random((SIDE * SIDE, 3)).astype(np.float32)
     falling[behind] = 0.0
     found = spread.of(falling)
