@@ -79,25 +79,28 @@ def equations(
     """
     at = np.zeros(trusted.shape, np.bool_)
     at[::STEP_PX, ::STEP_PX] = trusted[::STEP_PX, ::STEP_PX]
-    parts = [transport.forward_part(n, frame) for n, frame in enumerate(frames)]
-    total = np.asarray(np.sum(parts, axis=0), np.float32)
-    scale = np.maximum(total, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
-    object_light, object_white = (image[transport.object_mask].mean(axis=0) for image in (total, stage.white))
-    surface = stage.white / np.maximum(object_white, 1e-12)
-    images: list[FloatImage] = []
-    for part in parts:
-        images += _by_colour(part)
+    # Of each image only what is looked at is kept: whole ones of all causes would be the most that a refinement needs.
+    own: list[FloatImage] = []
+    total: FloatImage | None = None
     for n, frame in enumerate(frames):
-        images.append(transport.forward_part(n, frame * np.log(np.maximum(frame, 1e-4))))
-    images.append(surface * object_light)
-    images += _by_colour(surface * object_white)
-    images.append(cv2.GaussianBlur(total, (0, 0), FOCUS_PX) - total)
-    columns = np.stack([(image[at] / scale[at]).ravel() for image in (*images, error)], axis=1).astype(np.float64)
+        part = transport.forward_part(n, frame)
+        own.append(part[at])
+        total = part if total is None else np.add(total, part, out=total)
+    assert total is not None
+    bent = [transport.forward_part(n, frame * np.log(np.maximum(frame, 1e-4)))[at] for n, frame in enumerate(frames)]
+    object_light, object_white = (image[transport.object_mask].mean(axis=0) for image in (total, stage.white))
+    surface = stage.white[at] / np.maximum(object_white, 1e-12)
+    lost = cv2.GaussianBlur(total, (0, 0), FOCUS_PX)[at] - total[at]
+    images = [image for part in own for image in _by_colour(part)]
+    images += [*bent, surface * object_light, *_by_colour(surface * object_white), lost, error[at]]
+    scale = np.maximum(total[at], 0) + FLOOR * stage.white[at] + 1e-6 * float(stage.white.max(initial=0))
+    columns = np.stack([(image / scale).ravel() for image in images], axis=1).astype(np.float64)
     return np.asarray(np.vstack([columns.T @ columns, np.full(columns.shape[1], float(len(columns)))]))
 
 
-def _by_colour(image: FloatImage) -> list[FloatImage]:
-    return [image * np.eye(3, dtype=np.float32)[c] for c in range(3)]
+def _by_colour(light: FloatImage) -> list[FloatImage]:
+    """Light (..., 3) of each colour alone."""
+    return [light * np.eye(3, dtype=np.float32)[c] for c in range(3)]
 
 
 def common_causes(photographs: Sequence[Float64], projectors: int) -> CommonCauses:

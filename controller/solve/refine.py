@@ -82,10 +82,11 @@ class RefinedStage:
     white: FloatImage
 
 
-def _counted_over(predicted: FloatImage, stage: RefinedStage) -> FloatImage:
-    """The light over which errors count: that of the picture and ``FLOOR`` of white."""
-    light = np.maximum(predicted - stage.black, 0) + FLOOR * stage.white + 1e-6 * float(stage.white.max(initial=0))
-    return np.asarray(light, np.float32)
+def _counted_over(predicted: FloatImage, stage: RefinedStage, at: Mask | None = None) -> FloatImage:
+    """The light over which errors count: that of the picture and ``FLOOR`` of white. ``at``: of these pixels alone."""
+    light, black, white = (one if at is None else one[at] for one in (predicted, stage.black, stage.white))
+    counted = np.maximum(light - black, 0) + FLOOR * white + 1e-6 * float(stage.white.max(initial=0))
+    return np.asarray(counted, np.float32)
 
 
 def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask) -> Mask:
@@ -154,13 +155,13 @@ def without_flicker(
     at = np.zeros(trusted.shape, np.bool_)
     at[::STEADY_STEP_PX, ::STEADY_STEP_PX] = trusted[::STEADY_STEP_PX, ::STEADY_STEP_PX]
     at &= channels.finite(photograph.first) & channels.finite(photograph.last)
-    scale = _counted_over(predicted, stage)
-    columns = np.stack([(part[at] / scale[at]).ravel() for part in parts], axis=1).astype(np.float64)
+    scale = _counted_over(predicted, stage, at)
+    columns = np.stack([(part[at] / scale).ravel() for part in parts], axis=1).astype(np.float64)
     if len(columns) <= len(parts):
         return photograph
     errors = [
-        (error[at] / scale[at]).ravel().astype(np.float64)
-        for error in (photograph.radiance - predicted, photograph.last - photograph.first)
+        ((one[at] - other[at]) / scale).ravel().astype(np.float64)
+        for one, other in ((photograph.radiance, predicted), (photograph.last, photograph.first))
     ]
     factors, between = np.linalg.lstsq(columns, np.stack(errors, axis=1), rcond=None)[0].T
     variances = [float(np.mean(between**2)) / 2]
@@ -172,8 +173,10 @@ def without_flicker(
     # must not change by parts of single lamps' changes, which may be large and opposite.
     together = np.linalg.svd(columns, full_matrices=False)[2][0]
     taken += (_by_flicker(together @ factors, spread) - together @ taken) * together
-    light = np.sum([np.float32(factor) * part for factor, part in zip(taken, parts, strict=True)], axis=0)
-    return replace(photograph, radiance=np.asarray(photograph.radiance - light, np.float32))
+    light = np.float32(taken[0]) * parts[0]
+    for factor, part in zip(taken[1:], parts[1:], strict=True):
+        light += np.float32(factor) * part
+    return replace(photograph, radiance=np.subtract(photograph.radiance, light, out=light))
 
 
 def _by_flicker(changes: Float64, spread: float) -> Float64:
@@ -195,14 +198,16 @@ def without_noise(error: FloatImage, sigma: FloatImage, mask: Mask) -> FloatImag
     In bands from wide to fine; of each, what its local energy has above the noise's (a Wiener filter in each band), so
     that a clear error keeps its edges, and nothing is made of noise.
     """
-    means = [np.where(mask[..., None], error, 0), *(masked_blur(error, mask, scale) for scale in SCALES_PX)]
     scales = (0.0, *SCALES_PX)
-    found = _shrunk(means[-1], sigma, mask, scales[-1], 2 * scales[-1])
+    wider = masked_blur(error, mask, scales[-1])
+    found = _shrunk(wider, sigma, mask, scales[-1], 2 * scales[-1])
     for finer in reversed(range(len(SCALES_PX))):
-        band = means[finer] - means[finer + 1]
+        narrower = masked_blur(error, mask, scales[finer]) if finer else np.where(mask[..., None], error, 0)
+        band = narrower - wider
         if finer == 0:
             band[~mask] = 0
         found += _shrunk(band, sigma, mask, scales[finer], 2 * scales[finer + 1])
+        wider = narrower
     return found
 
 

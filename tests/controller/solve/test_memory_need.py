@@ -15,6 +15,7 @@ from benchmarks.lab.synthetic import synthetic_calibration
 from controller.calibrate.values import Calibration, SurfaceSpread
 from controller.core.errors import WorkError
 from controller.solve.appearance import base_image, solve_base
+from controller.solve.common_causes import equations
 from controller.solve.memory_need import (
     PROGRAM,
     SPARE,
@@ -26,6 +27,7 @@ from controller.solve.memory_need import (
     solve_peak_bytes,
     stage_size,
 )
+from controller.solve.refine import ModelError, RefinedStage, corrected_target
 from controller.solve.request import SolveOptions, solve_appearance
 from controller.solve.targets.values import Target
 from controller.transport import build_transport
@@ -106,6 +108,29 @@ def test_the_need_of_an_appearance_covers_what_is_taken_and_is_not_far_above(
     taken = _appearance_bytes(calibration, know, tmp_path)
     stated = appearance_peak_bytes(size) - PROGRAM
     assert taken <= stated <= 1.25 * SPARE * taken
+
+
+def test_a_refinement_needs_few_pictures_at_once(calibration: Calibration) -> None:
+    transport, rng = build_transport(calibration), np.random.default_rng(0)
+    frames = [rng.random((*part.metapixels.valid.shape, 3), np.float32) for part in calibration.projectors]
+    white = np.maximum(np.sum([part.white for part in calibration.projectors], axis=0), 0)
+    stage, trusted = RefinedStage(calibration.black, white), calibration.object_mask
+    error = (0.01 * rng.standard_normal(white.shape)).astype(np.float32)
+    picture = 12 * trusted.size
+
+    def taken(work: Callable[[], object]) -> int:
+        gc.collect()
+        tracemalloc.start()
+        try:
+            work()
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    # before, all images of all causes and all bands of the error were there at once: 30 and 16 pictures
+    assert taken(lambda: equations(transport, frames, error, stage, trusted)) < 14 * picture
+    seen = ModelError(error, np.full_like(error, 0.005))
+    assert taken(lambda: corrected_target(0.3 * white, seen, stage)) < 14 * picture
 
 
 def test_four_projectors_of_3840_by_2160_are_within_8_gb() -> None:
