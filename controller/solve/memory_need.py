@@ -26,6 +26,8 @@ FITTED: Final = 75
 as many pixels as the camera."""
 PHOTOGRAPHED: Final = 17
 """The same of the photograph of the next projector that is read meanwhile."""
+REFINED: Final = 290
+"""Bytes of a camera pixel while a photograph of a result corrects the target: 24 pictures of light, and masks."""
 INDIRECT, PAINT, SPREAD = 13, 18, 16
 """Of what is known of a stage's indirect light, of colours that depend on the paint, and of light under the surface."""
 SPARE: Final = 1.1
@@ -119,6 +121,14 @@ def appearance_peak_bytes(size: StageSize) -> int:
 def solve_peak_bytes(size: StageSize) -> int:
     """Bytes at the peak of a base image and of the appearances after it."""
     return max(base_peak_bytes(size), appearance_peak_bytes(size))
+
+
+def refine_peak_bytes(size: StageSize) -> int:
+    """Bytes at the peak of correcting an appearance by a photograph of it."""
+    C, P = size.camera, size.projectors
+    known = INDIRECT * size.has_indirect + PAINT * size.has_paint + SPREAD * size.has_spread
+    kept = size.transport + (72 + known) * (C if 12 * C < MAPPED_FROM else 0) + 24 * P
+    return int(SPARE * (kept + REFINED * C)) + PROGRAM
 
 
 def calibration_peak_bytes(size: StageSize) -> int:

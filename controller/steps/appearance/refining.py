@@ -24,6 +24,7 @@ from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.solve.common_causes import equations
+from controller.solve.memory_need import check_memory, refine_peak_bytes, stage_size
 from controller.solve.refine import (
     ModelError,
     PhotographedError,
@@ -44,6 +45,7 @@ from controller.steps.appearance.exposure_times import brightest, speeds
 from controller.steps.appearance.photographing import take_bracket
 from controller.steps.appearance.solving import device_frames
 from controller.steps.capture.photographs import frames_digest
+from hal.runtime.memory import free_bytes
 
 WORSE: Final = "the last correction was no better"
 ENOUGH: Final = "the rest is noise"
@@ -115,6 +117,9 @@ def refine_steps(
 def _refine(
     rig: Rig, calibrated: Calibrated, name: str, number: int, options: RefineOptions, context: Context
 ) -> Sequence[Path]:
+    if number == 1:
+        need = refine_peak_bytes(stage_size(calibrated.calibration))
+        context.reporter.say(check_memory(need, free_bytes(), f"Refining {name}"))
     solved = read_solved(calibrated.folder, name, calibrated.projectors)
     before = _before(context.folder, solved, calibrated, name, number)
     if not before.ended:

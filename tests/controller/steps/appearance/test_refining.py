@@ -17,11 +17,13 @@ from controller.artefacts.solved import Refining, RequestedTarget, Solved, read_
 from controller.calibrate.values import Calibration
 from controller.capture.raw import develop
 from controller.core.arrays import FloatImage
+from controller.core.errors import WorkError
 from controller.run.journal import Journal
 from controller.run.progress import Level, Silent
 from controller.run.runner import Runner
 from controller.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.solve.metrics import compare
+from controller.steps.appearance import refining
 from controller.steps.appearance.refining import RefineOptions, refine_steps
 from controller.steps.appearance.solving import device_frames
 from controller.transport import build_transport
@@ -192,7 +194,8 @@ def test_one_photograph_corrects_the_frames_and_says_what_is_expected(stage: Sta
     assert figures["before"] == pytest.approx(before, rel=0.25)
     assert figures["after"] == pytest.approx(stage.error(), abs=0.3)
     assert stage.present().figures["refined"] == figures
-    (line,) = stage.told.said
+    need, line = stage.told.said
+    assert need.startswith("Refining gold needs about 0.3 GB of memory")
     assert line.startswith(f"Refined {NAME}: {figures['before']:.2f} to an expected {figures['after']:.2f}")
     assert line.endswith("with 1 photograph.")
 
@@ -260,7 +263,7 @@ def test_a_dark_photograph_is_not_used_and_said(stage: Stage) -> None:
     figures = stage.refine(1)
     assert same(stage.present(), stage.solved)
     assert figures["photographs"] == [{"refused": "it is too dark"}]
-    assert stage.told.said == [
+    assert stage.told.said[1:] == [
         f"A photograph of {NAME} was not used: it is too dark.",
         f"{NAME} was not refined: no photograph could be used (1 photograph).",
     ]
@@ -268,6 +271,19 @@ def test_a_dark_photograph_is_not_used_and_said(stage: Stage) -> None:
     stage.camera.taken.clear()
     assert len(stage.refine(2, "20260103-100000-refine")["photographs"]) == 2
     assert stage.error() < 0.4 * before
+
+
+def test_what_does_not_fit_into_memory_is_refused_before_a_photograph(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = stage.present()
+    monkeypatch.setattr(refining, "free_bytes", lambda: 100_000_000)
+    with pytest.raises(WorkError, match="Refining gold needs about") as refused:
+        stage.refine(1)
+    assert refused.value.code == "memory-too-small"
+    assert stage.camera.taken == []
+    for name in NAMES:
+        np.testing.assert_array_equal(stage.present().frames[name], before.frames[name])
 
 
 def test_a_camera_that_goes_away_costs_no_photograph_twice(stage: Stage) -> None:
