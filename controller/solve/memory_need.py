@@ -59,6 +59,11 @@ class StageSize:
         """Bytes of the light transport: windows, masks, and four numbers a projector pixel."""
         return WINDOW * self.windows + self.count * self.camera + 16 * self.projectors
 
+    @property
+    def known(self) -> int:
+        """Bytes of a camera pixel of what is known of the stage's light."""
+        return INDIRECT * self.has_indirect + PAINT * self.has_paint + SPREAD * self.has_spread
+
 
 def stage_size(calibration: Calibration) -> StageSize:
     """Of a calibration; as if every projector lit the whole object, so rather too large."""
@@ -105,17 +110,16 @@ def appearance_peak_bytes(size: StageSize) -> int:
     """Bytes at the peak of making a target reachable and solving it, its base ready to be scaled."""
     C, P, W, S = size.camera, size.projectors, size.windows, size.samples
     own = 12 * P // max(size.count, 1)
-    known = INDIRECT * size.has_indirect + PAINT * size.has_paint + SPREAD * size.has_spread
     # Small images stay in memory: light of white, the base, what is known, and the target.
     here = C if 12 * C < MAPPED_FROM else 0
-    kept = size.transport + C + (36 * P if own < MAPPED_FROM else 0) + (36 + 36 + known) * here
+    kept = size.transport + C + (36 * P if own < MAPPED_FROM else 0) + (36 + 36 + size.known) * here
     aimed = kept + 12 * C + 12 * here + 7 * C
-    floor = 12 * C if known else 0
+    floor = 12 * C if size.known else 0
     adapted = aimed + floor + 12 * C + 12 * C + 12 * C + 24 * C
     apart = aimed + 12 * here + (12 + 12 + 12 + 12 + 24) * C + (PAINT * size.has_paint + 16 * size.has_spread) * C
     begun = kept + 36 * here + floor + (14 + 1 + 4) * C + 24 * P + 12 * C + 12 * P + 2 * own + 4 * W + 4 * S
     swept = kept + 36 * here + floor + (14 + 1 + 8) * C + 24 * P + 36 * P + 20 * S
-    return int(SPARE * max(adapted, apart if known else 0, begun, swept)) + PROGRAM
+    return int(SPARE * max(adapted, apart if size.known else 0, begun, swept)) + PROGRAM
 
 
 def solve_peak_bytes(size: StageSize) -> int:
@@ -126,8 +130,7 @@ def solve_peak_bytes(size: StageSize) -> int:
 def refine_peak_bytes(size: StageSize) -> int:
     """Bytes at the peak of correcting an appearance by a photograph of it."""
     C, P = size.camera, size.projectors
-    known = INDIRECT * size.has_indirect + PAINT * size.has_paint + SPREAD * size.has_spread
-    kept = size.transport + (72 + known) * (C if 12 * C < MAPPED_FROM else 0) + 24 * P
+    kept = size.transport + (72 + size.known) * (C if 12 * C < MAPPED_FROM else 0) + 24 * P
     return int(SPARE * (kept + REFINED * C)) + PROGRAM
 
 
