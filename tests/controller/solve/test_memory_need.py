@@ -43,15 +43,23 @@ def calibration() -> Calibration:
     return made
 
 
-def _solved_bytes(calibration: Calibration) -> int:
+def _peak_bytes(work: Callable[[], object]) -> int:
+    """Of arrays, while this is done, or since ``work`` last reset the peak."""
     gc.collect()
     tracemalloc.start()
     try:
-        base = solve_base(build_transport(calibration), base_image(calibration), calibration.black, tolerance=0.1)
-        assert base.solution.iterations < 10
+        work()
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
+
+
+def _solved_bytes(calibration: Calibration) -> int:
+    def solve() -> None:
+        base = solve_base(build_transport(calibration), base_image(calibration), calibration.black, tolerance=0.1)
+        assert base.solution.iterations < 10
+
+    return _peak_bytes(solve)
 
 
 def _indirect(calibration: Calibration, *, has_paint: bool, has_spread: bool) -> IndirectLight:
@@ -66,9 +74,7 @@ def _indirect(calibration: Calibration, *, has_paint: bool, has_spread: bool) ->
 
 
 def _appearance_bytes(calibration: Calibration, know: Callable[[], IndirectLight | None], folder: Path) -> int:
-    gc.collect()
-    tracemalloc.start()
-    try:
+    def solve() -> None:
         transport = build_transport(calibration)
         base = solve_base(transport, base_image(calibration), calibration.black, tolerance=0.1).in_files(folder)
         indirect = know()
@@ -83,9 +89,8 @@ def _appearance_bytes(calibration: Calibration, know: Callable[[], IndirectLight
             indirect=None if indirect is None else indirect.in_files(folder),
             folder=folder,
         )
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+
+    return _peak_bytes(solve)
 
 
 def test_the_need_stated_covers_what_is_taken_and_is_not_far_above(calibration: Calibration) -> None:
@@ -118,19 +123,10 @@ def test_a_refinement_needs_few_pictures_at_once(calibration: Calibration) -> No
     error = (0.01 * rng.standard_normal(white.shape)).astype(np.float32)
     picture = 12 * trusted.size
 
-    def taken(work: Callable[[], object]) -> int:
-        gc.collect()
-        tracemalloc.start()
-        try:
-            work()
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-
     # before, all images of all causes and all bands of the error were there at once: 30 and 16 pictures
-    assert taken(lambda: equations(transport, frames, error, stage, trusted)) < 14 * picture
+    assert _peak_bytes(lambda: equations(transport, frames, error, stage, trusted)) < 14 * picture
     seen = ModelError(error, np.full_like(error, 0.005))
-    assert taken(lambda: corrected_target(0.3 * white, seen, stage)) < 14 * picture
+    assert _peak_bytes(lambda: corrected_target(0.3 * white, seen, stage)) < 14 * picture
 
 
 def test_four_projectors_of_3840_by_2160_are_within_8_gb() -> None:
