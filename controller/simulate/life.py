@@ -27,7 +27,7 @@ from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import State
 from controller.simulate.disk import STAGE, watched
 from controller.simulate.happen import happenings
-from controller.simulate.happen.commands import arguments_of, believe, whole
+from controller.simulate.happen.commands import arguments_of, believe, look_at_hours, whole
 from controller.simulate.happen.draw import draw
 from controller.simulate.happen.places import setting
 from controller.simulate.happen.script import Item, Setting
@@ -113,6 +113,7 @@ class Life:
         self.sound: dict[str, bytes] = {}
         """What people will write again into files that are damaged."""
         self.repaired_s, self.renewed_s = 0.0, -1e9
+        self.doubtful_hours: Item | None = None
         self._keep_by_s: float | None = None
         self._looked_s = 0.0
         self._order = itertools.count()
@@ -281,6 +282,7 @@ class Life:
         self.service = service
         self._keep_by_s = None
         self.witness.begins()
+        look_at_hours(self, kiosk)
         refresh = service.changed
 
         def stepped() -> None:
@@ -351,7 +353,7 @@ class Life:
             return
 
         def asked() -> None:
-            with contextlib.suppress(VelaturaError, DeviceError), whole(self):
+            with contextlib.suppress(VelaturaError, DeviceError), whole(self, item):
                 values = arguments_of(self, item, kiosk)
                 socket_table({"kiosk": kiosk})[item.who](**values)
                 believe(self, item, values)

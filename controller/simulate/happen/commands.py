@@ -20,13 +20,27 @@ CHANGES: Final = ("comment", "projector", "display")
 
 
 @contextlib.contextmanager
-def whole(life: Living) -> Iterator[None]:
+def whole(life: Living, item: Item) -> Iterator[None]:
     """Of a command in the middle of which the program is killed, nobody knows whether it was kept."""
     try:
         yield
     except Killed:
         life.witness.wanted.unsure_until_hours()
+        if item.who == "set-schedule":
+            life.doubtful_hours = item
         raise
+
+
+def look_at_hours(life: Living, kiosk: StageKiosk) -> None:
+    """Who saved hours and got no answer looks at the panel, which serves again: were they kept?"""
+    item, life.doubtful_hours = life.doubtful_hours, None
+    if item is None:
+        return
+    values = json.loads(item.arguments)
+    now = kiosk.schedule()
+    rows = [{"day": row.day, "opens": row.opens, "closes": row.closes} for row in now.rows]
+    if (now.time_zone, rows) == (values["time_zone"], values["rows"]):
+        believe(life, item, values)
 
 
 def arguments_of(life: Living, item: Item, kiosk: StageKiosk) -> dict[str, Any]:

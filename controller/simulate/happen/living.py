@@ -23,6 +23,7 @@ class Living(Protocol):
     unreadable: set[str]
     sound: dict[str, bytes]
     repaired_s: float
+    doubtful_hours: Item | None
     news: Event
 
     def later(self, seconds: float, repair: Callable[[], None]) -> None: ...
