@@ -152,11 +152,6 @@ class LampGuard:
             if self._record.lit or power not in (Power.OFF, Power.COOLING):
                 self._went_off()
 
-    @property
-    def failed_strikes(self) -> int:
-        """What ``keep_failed`` kept last since the computer was started."""
-        return self._record.failed
-
     def keep_failed(self, count: int) -> None:
         """Keep how many attempts in a row gave no light, so that a restart does not start the count again."""
         with self._lock:

@@ -59,6 +59,10 @@ class LampRecord:
     lit_s: float = 0.0
     failed: int = 0
 
+    def failed_in(self, boot: str) -> int:
+        """Those failed attempts that count in this boot: a computer that was started anew allows all again."""
+        return self.failed if self.boot == boot else 0
+
 
 class LampLedger(Protocol):
     """Where lamp records survive."""

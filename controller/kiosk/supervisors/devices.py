@@ -178,8 +178,10 @@ class Devices:
         # which nothing is known, because the ledger was damaged: its record has no boot.
         record = self._ledger.read(table.name)
         maybe_lit = record is not None and record.lit and record.boot in ("", self._world.boot())
+        # Before its projector is reached: an opening may come first.
+        failed = 0 if record is None else record.failed_in(self._world.boot())
         return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
-                                   deadline=self._world.deadline, maybe_lit=maybe_lit,
+                                   deadline=self._world.deadline, maybe_lit=maybe_lit, failed=failed,
                                    keep_forgiven=partial(self._ledger.forgive, table.name))  # fmt: skip
 
     def _unfed(self, projector: str) -> Decision | None:

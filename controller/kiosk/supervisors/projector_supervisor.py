@@ -44,6 +44,7 @@ class ProjectorSupervisor:
     unfed : the problem of the relays that supply it, which may be the reason for its silence
     deadline : one that ends in so many seconds
     maybe_lit : whether its lamp may be lit before it was looked at
+    failed : attempts in a row that gave no light, before this service began
     keep_forgiven : keeps over a restart that all attempts are allowed again, even while the line is broken
     """
 
@@ -58,6 +59,7 @@ class ProjectorSupervisor:
         unfed: Callable[[], Decision | None] | None = None,
         deadline: Callable[[float], Deadline] = in_seconds,
         maybe_lit: bool = False,
+        failed: int = 0,
         keep_forgiven: Callable[[], None] | None = None,
     ) -> None:
         self.name = name
@@ -74,7 +76,7 @@ class ProjectorSupervisor:
         self._struck_at_s: float | None = None
         """Since when its light is awaited: the attempt, then the first answer that it warms up."""
         self._warms = False
-        self._failed_strikes, self._remembered = 0, False
+        self._failed_strikes = failed
         self._burning = False
         self._faulty_since_s: float | None = None
 
@@ -103,14 +105,14 @@ class ProjectorSupervisor:
         if wanted and self._want_lit is False:
             # A lamp that stays off after failed attempts gets one more attempt at every opening, and for work on a dark
             # stage. A service that begins while the stage is open is no opening.
-            self._failed_strikes, self._remembered = min(self._failed_strikes, MOST_STRIKES - 1), True
+            self._failed_strikes = min(self._failed_strikes, MOST_STRIKES - 1)
         if wanted and not self._want_lit:
             self._faulty_since_s = float("-inf")
         self._want_lit = wanted
 
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
-        self._failed_strikes, self._faulty_since_s, self._remembered = 0, float("-inf"), True
+        self._failed_strikes, self._faulty_since_s = 0, float("-inf")
         self._keep_forgiven()
 
     def step(self) -> None:
@@ -165,8 +167,6 @@ class ProjectorSupervisor:
             if self._clock.now_s() < self._reopen_at_s:
                 return None
             self._guard = self._open_guard(self._deadline(ANSWER_S))
-            if not self._remembered:
-                self._failed_strikes, self._remembered = self._guard.failed_strikes, True
             if self._closed:
                 # Closed while it was being opened: release the line, because the next service needs it.
                 self._release(self._guard)

@@ -14,6 +14,7 @@ from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.rig.lamp_guard import LampGuard
+from controller.rig.lamp_ledger import LampRecord
 from controller.run.state_machine import State
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -181,7 +182,10 @@ class Kiosk:
                 raise DeviceGone("port-gone", what=f"The cable of {name} is away.", remedy="Plug it in.")
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
-        return ProjectorSupervisor(name, open_guard, self.log.add, clock=self.world)
+        record = self.shelf.read(name) or LampRecord()
+        return ProjectorSupervisor(
+            name, open_guard, self.log.add, clock=self.world, failed=record.failed_in(self.world.boot())
+        )
 
     def power_cut(self, seconds: float) -> None:
         """Everything goes dark for so long."""

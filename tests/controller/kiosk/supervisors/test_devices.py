@@ -15,7 +15,9 @@ from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors import projector_supervisor
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
+from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES
 from controller.kiosk.world import World
+from controller.rig.lamp_ledger import LampFile, LampRecord
 from controller.stage.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -118,6 +120,22 @@ def test_devices_that_fail_to_close_or_raise_anything_are_told_and_the_others_go
     assert [one.reason for one in told if one.code == "projector-answer-odd"] == [models.odd_in]
     faults = [decision for decision in told if decision.code == "driver-fault"]
     assert any("projector left raised OSError" in fault.reason for fault in faults)
+
+
+def test_an_opening_before_a_projector_was_reached_counts_on_from_the_file_of_the_lamps(
+    models: Models, tmp_path: Path
+) -> None:
+    file = models.folder / LampFile.NAME
+    LampFile(file).write("left", LampRecord(since_s=0.0, boot=World().boot(), strikes=7, failed=MOST_STRIKES))
+    found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, lambda _: None)
+    with contextlib.closing(found):
+        left = found.projectors[0]
+        left.want_lit = False
+        left.want_lit = True
+        left.step()
+    record = LampFile(file).read("left")
+    assert record is not None
+    assert (record.strikes, record.failed) == (8, MOST_STRIKES)
 
 
 class SlowLamp(QuickLamp):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +15,7 @@ from controller.kiosk.supervisors.projector_supervisor import (
     ProjectorSupervisor,
 )
 from controller.rig.lamp_guard import LampGuard
+from controller.rig.lamp_ledger import LampFile, LampLedger, LampRecord
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import Power, ProjectorStatus
@@ -82,25 +84,33 @@ class ShutMeanwhile(FragileLamp):
 class Kept:
     """A supervisor with its lamp, in virtual time."""
 
-    def __init__(self, kind: type[FragileLamp] = FragileLamp) -> None:
+    def __init__(self, kind: type[FragileLamp] = FragileLamp, *, file: Path | None = None) -> None:
         self.world = World()
         self.lamp = kind(self.world)
         self.there = True
         self.told: list[Decision] = []
-        self.shelf = Shelf()
+        self.file, self.shelf = file, Shelf()
         self.begin_anew()
 
     def begin_anew(self, *, maybe_lit: bool = False) -> None:
         """As a service that was killed and starts."""
+        self.ledger: LampLedger = self.shelf if self.file is None else LampFile(self.file)
+        record = self.ledger.read("left") or LampRecord()
         self.supervisor = ProjectorSupervisor(
             "left", self._opened, self.told.append, clock=self.world, maybe_lit=maybe_lit,
-            keep_forgiven=partial(self.shelf.forgive, "left"),
+            failed=record.failed_in(self.world.boot()), keep_forgiven=partial(self.ledger.forgive, "left"),
         )  # fmt: skip
 
     def _opened(self, deadline: Deadline) -> LampGuard:
         if not self.there:
             raise DeviceGone("port-gone", what="The cable is away.", remedy="Plug it in.")
-        return LampGuard("left", self.lamp, self.shelf, clock=self.world)
+        return LampGuard("left", self.lamp, self.ledger, clock=self.world)
+
+    def lose_line(self) -> None:
+        self.there, self.lamp.trouble = False, "gone"
+
+    def mend_line(self) -> None:
+        self.there, self.lamp.trouble = True, ""
 
     def run(self, seconds: float) -> Condition:
         ends_s = self.world.time_s + seconds
@@ -118,6 +128,18 @@ class Kept:
 @pytest.fixture
 def kept() -> Kept:
     return Kept()
+
+
+@pytest.fixture
+def given_up(tmp_path: Path) -> Kept:
+    """A lamp that stays off after its last attempt, behind a line that broke then."""
+    kept = Kept(file=tmp_path / LampFile.NAME)
+    kept.lamp.dud = True
+    kept.supervisor.want_lit = True
+    assert kept.run(400.0) is Condition.BROKEN
+    kept.lose_line()
+    assert kept.run(60.0) is Condition.LOST
+    return kept
 
 
 def test_nothing_is_done_until_somebody_says_what_is_wanted(kept: Kept) -> None:
@@ -246,6 +268,17 @@ def test_a_repair_that_was_told_while_the_line_was_away_outlives_a_kill(kept: Ke
     kept.there, kept.lamp.trouble = True, ""
     kept.supervisor.want_lit = True
     assert kept.run(400.0) is Condition.LIT
+
+
+def test_an_opening_before_the_projector_was_reached_gives_one_attempt_more(given_up: Kept) -> None:
+    given_up.begin_anew()
+    given_up.supervisor.want_lit = False
+    given_up.run(30.0)
+    given_up.supervisor.want_lit = True
+    given_up.run(30.0)
+    given_up.mend_line()
+    assert given_up.run(800.0) is Condition.BROKEN
+    assert given_up.lamp.strikes == MOST_STRIKES + 1
 
 
 def test_kills_soon_after_each_strike_do_not_lose_count(kept: Kept) -> None:
