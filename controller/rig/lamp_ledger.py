@@ -77,8 +77,8 @@ class LampLedger(Protocol):
         """As ``write``, of what has happened already: what can't be stored is read from now on, and goes with the next
         write. Returns whether it is durable."""
 
-    def forgive(self, name: str) -> None:
-        """After the technician's repair: none of the lamp's attempts counts as failed. As ``keep``."""
+    def forgive(self, name: str, most: int) -> None:
+        """After a technician's repair, or at an opening: at most so many attempts count as failed. As ``keep``."""
 
 
 _UNKNOWN: Final = ""
@@ -125,11 +125,11 @@ class LampFile:
             return False
         return True
 
-    def forgive(self, name: str) -> None:
+    def forgive(self, name: str, most: int) -> None:
         with self._lock:
             record = self._records.get(name)
-            if record is not None and record.failed:
-                self.keep(name, replace(record, failed=0))
+            if record is not None and record.failed > most:
+                self.keep(name, replace(record, failed=most))
 
     def _load(self) -> Mapping[str, LampRecord]:
         gone = False

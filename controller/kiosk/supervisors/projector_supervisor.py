@@ -45,7 +45,7 @@ class ProjectorSupervisor:
     deadline : one that ends in so many seconds
     maybe_lit : whether its lamp may be lit before it was looked at
     failed : attempts in a row that gave no light, before this service began
-    keep_forgiven : keeps over a restart that all attempts are allowed again, even while the line is broken
+    keep_forgiven : keeps over a restart that at most so many attempts count, even while the line is broken
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class ProjectorSupervisor:
         deadline: Callable[[float], Deadline] = in_seconds,
         maybe_lit: bool = False,
         failed: int = 0,
-        keep_forgiven: Callable[[], None] | None = None,
+        keep_forgiven: Callable[[int], None] | None = None,
     ) -> None:
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
         self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
-        self._deadline, self._keep_forgiven = deadline, keep_forgiven or (lambda: None)
+        self._deadline, self._keep_forgiven = deadline, keep_forgiven or (lambda most: None)
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
         self._view = ProjectorView(name, maybe_lit=maybe_lit)
@@ -106,6 +106,7 @@ class ProjectorSupervisor:
             # A lamp that stays off after failed attempts gets one more attempt at every opening, and for work on a dark
             # stage. A service that begins while the stage is open is no opening.
             self._failed_strikes = min(self._failed_strikes, MOST_STRIKES - 1)
+            self._keep_forgiven(MOST_STRIKES - 1)
         if wanted and not self._want_lit:
             self._faulty_since_s = float("-inf")
         self._want_lit = wanted
@@ -113,7 +114,7 @@ class ProjectorSupervisor:
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
         self._failed_strikes, self._faulty_since_s = 0, float("-inf")
-        self._keep_forgiven()
+        self._keep_forgiven(0)
 
     def step(self) -> None:
         """Read the status once, and act on it. Blocks for a few answers at most; device errors are not raised."""

@@ -158,9 +158,9 @@ class Shelf:
         self.records[name] = record
         return not self.full
 
-    def forgive(self, name: str) -> None:
+    def forgive(self, name: str, most: int) -> None:
         if name in self.records:
-            self.keep(name, replace(self.records[name], failed=0))
+            self.keep(name, replace(self.records[name], failed=min(self.records[name].failed, most)))
 
 
 def soon() -> Deadline:

@@ -126,12 +126,14 @@ def test_an_opening_before_a_projector_was_reached_counts_on_from_the_file_of_th
     models: Models, tmp_path: Path
 ) -> None:
     file = models.folder / LampFile.NAME
-    LampFile(file).write("left", LampRecord(since_s=0.0, boot=World().boot(), strikes=7, failed=MOST_STRIKES))
+    given_up = LampRecord(since_s=0.0, boot=World().boot(), strikes=7, failed=MOST_STRIKES)
+    LampFile(file).write("left", given_up)
     found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, lambda _: None)
     with contextlib.closing(found):
         left = found.projectors[0]
         left.want_lit = False
         left.want_lit = True
+        assert LampFile(file).read("left") == replace(given_up, failed=MOST_STRIKES - 1), "before it is reached"
         left.step()
     record = LampFile(file).read("left")
     assert record is not None

@@ -281,6 +281,19 @@ def test_an_opening_before_the_projector_was_reached_gives_one_attempt_more(give
     assert given_up.lamp.strikes == MOST_STRIKES + 1
 
 
+def test_the_attempt_of_an_opening_outlives_a_kill_before_the_projector_answers(given_up: Kept) -> None:
+    given_up.supervisor.want_lit = False
+    given_up.run(30.0)
+    given_up.supervisor.want_lit = True
+    for _ in range(2):
+        given_up.begin_anew()
+        given_up.supervisor.want_lit = True
+        given_up.run(30.0)
+    given_up.mend_line()
+    assert given_up.run(800.0) is Condition.BROKEN
+    assert given_up.lamp.strikes == MOST_STRIKES + 1
+
+
 def test_kills_soon_after_each_strike_do_not_lose_count(kept: Kept) -> None:
     kept.lamp.dud = True
     for _ in range(8):
