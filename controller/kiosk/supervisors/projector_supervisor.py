@@ -153,6 +153,9 @@ class ProjectorSupervisor:
                 self._darken(guard, status)
         except (DeviceError, VelaturaError) as error:
             self._see(self._view.condition, status, _decision(error))
+        self._keep_failed(guard)
+
+    def _keep_failed(self, guard: LampGuard) -> None:
         guard.keep_failed(self._failed_strikes + (self._struck_at_s is not None))
 
     def close(self) -> None:
@@ -185,6 +188,9 @@ class ProjectorSupervisor:
         if self._silent_since_s is None:
             self._silent_since_s = now_s
         guard = self._guard
+        if guard is not None:
+            # Attempts may be allowed again while it is silent. With its own count, its next record would undo that.
+            self._keep_failed(guard)
         if guard is not None and self._want_lit is False and guard.may_be_lit:
             # It may receive the command, even if it does not answer.
             with contextlib.suppress(DeviceError, VelaturaError):

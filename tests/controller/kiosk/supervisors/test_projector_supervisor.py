@@ -294,6 +294,24 @@ def test_the_attempt_of_an_opening_outlives_a_kill_before_the_projector_answers(
     assert given_up.lamp.strikes == MOST_STRIKES + 1
 
 
+def test_a_repair_that_was_told_just_after_the_line_broke_outlives_a_kill(tmp_path: Path) -> None:
+    kept = Kept(file=tmp_path / LampFile.NAME)
+    kept.supervisor.want_lit = True
+    kept.run(10.0)
+    kept.lamp.burst()
+    kept.lamp.reports = FAULT
+    assert kept.run(400.0) is Condition.BROKEN
+    kept.lose_line()
+    kept.run(2.0)
+    kept.lamp.dud, kept.lamp.reports = False, None
+    kept.supervisor.forgive()
+    assert kept.run(60.0) is Condition.LOST
+    kept.begin_anew()
+    kept.mend_line()
+    kept.supervisor.want_lit = True
+    assert kept.run(800.0) is Condition.LIT
+
+
 def test_kills_soon_after_each_strike_do_not_lose_count(kept: Kept) -> None:
     kept.lamp.dud = True
     for _ in range(8):
