@@ -172,6 +172,9 @@ class EventLog:
         try:
             if self._unavailable:
                 self._end_replacing()
+                if self._torn:
+                    # It would take new events, and lose some of them.
+                    self._replace()
                 self._database, self._unavailable = self._connected(self.path), False
             with self._database as database:
                 self._write(database, self._waiting, self._unwritten)
@@ -234,21 +237,29 @@ class EventLog:
         """
         with contextlib.suppress(sqlite3.Error):
             self._database.close()
-        known = [("done", key) for key in self._done] + [("kept", key) for key in self._kept]
+        self._torn = True
         try:
-            self._remove(self._new)
-            with contextlib.closing(self._connected(self._new)) as database:
-                with database:
-                    self._write(database, self._recent, known)
-                    database.execute(f"PRAGMA user_version={_WHOLE}")
-                _without_write_ahead_log(database)
-            self._take_new()
+            self._replace()
             self._database, self._unavailable = self._connected(self.path), False
         except (sqlite3.Error, OSError):
             self._database, self._unavailable = self._connected(Path(":memory:")), True
-            self._waiting, self._unwritten = deque(self._recent, SHOWN), dict.fromkeys(known)
+            self._waiting, self._unwritten = deque(self._recent, SHOWN), dict.fromkeys(self._known())
         else:
             self._all_written()
+
+    def _known(self) -> list[tuple[str, str]]:
+        return [("done", key) for key in self._done] + [("kept", key) for key in self._kept]
+
+    def _replace(self) -> None:
+        """Raises sqlite3.Error and OSError; then the old file is still in its place, or the new one is whole."""
+        self._remove(self._new)
+        with contextlib.closing(self._connected(self._new)) as database:
+            with database:
+                self._write(database, self._recent, self._known())
+                database.execute(f"PRAGMA user_version={_WHOLE}")
+            _without_write_ahead_log(database)
+        self._take_new()
+        self._torn = False
 
     def _end_replacing(self) -> None:
         """Of a file that was being replaced when the power failed: a new one that is whole takes its place."""

@@ -19,7 +19,7 @@ from controller.simulate.stage import OUTPUTS
 GOES_OUT_S: Final = 35.0
 """Longer than a lamp takes to give light, and shorter than its light takes to be stable."""
 LOOKS_AGAIN_S: Final = 300.0
-"""Who switched a lamp by hand looks at the panel after so long."""
+"""Who switched a lamp by hand, or repaired a line, looks at the panel after so long."""
 RETURNS_S: Final = 60.0
 """Somebody who finds no kiosk at the panel comes back after so long."""
 
@@ -38,6 +38,8 @@ def _line(life: Living, item: Item) -> None:
     def repair() -> None:
         line.trouble = ""
         _open_if_given_up(life, item.who)
+        # It is asked again only now and then, and an attempt may still be waited for.
+        life.later(LOOKS_AGAIN_S, partial(_open_if_given_up, life, item.who))
 
     life.later(item.for_s, repair)
 

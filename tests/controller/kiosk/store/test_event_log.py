@@ -106,6 +106,42 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
 
 
+def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk_has_space(tmp_path: Path) -> None:
+    path, is_full = tmp_path / EventLog.FILE, [True]
+    log = EventLog(path, durable=False)
+    for _ in range(400):
+        log.add(Decision("before", "One. " * 50))
+    log.close()
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2 // 4096 * 4096
+    content[middle : middle + 4096] = bytes(byte ^ 0xA5 for byte in content[middle : middle + 4096])
+    path.write_bytes(content)
+
+    def full(database: Any, **options: Any) -> sqlite3.Connection:
+        if is_full and str(database) != ":memory:":
+            error = sqlite3.OperationalError("database or disk is full")
+            error.sqlite_errorcode = sqlite3.SQLITE_FULL
+            raise error
+        found: sqlite3.Connection = sqlite3.connect(database, **options)
+        return found
+
+    now_s = [0.0]
+    log = EventLog(path, durable=False, connect=full, monotonic=lambda: now_s[0])
+    newest = [row for row in log.after(0) if row.code == "before"]
+    assert newest
+    log.add(Decision("full", "Two."))
+    is_full.clear()
+    now_s[0] += 31.0
+    log.add(Decision("after", "Three."))
+    assert log.problem is None
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
+    log = EventLog(path, durable=False)
+    assert [row.number for row in log.after(0)][: len(newest)] == [row.number for row in newest]
+    assert [row.code for row in log.after(0)][len(newest) :] == ["full", "after"]
+    log.close()
+
+
 @pytest.mark.parametrize("length", [50, 5000])
 def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length: int) -> None:
     path = tmp_path / EventLog.FILE
