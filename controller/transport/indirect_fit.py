@@ -103,11 +103,11 @@ def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibrat
     every = np.sum([one.own for one in whites], axis=0), np.sum([one.room for one in whites], axis=0)
     first = (kinds[-1], kinds[-1])
     back = view.back(first, every)
-    stripes = [
-        _with_indirect(one, first, back)
-        for part, direct in zip(projectors, directs, strict=True)
-        for one in _striped(part, direct, view, stride)
-    ]
+    stripes = _with_indirect(
+        [one for part, direct in zip(projectors, directs, strict=True) for one in _striped(part, direct, view, stride)],
+        first,
+        back,
+    )
     # Only stripes tell the light of the object from that of table and walls.
     parts: tuple[Part, ...] = ("object", "room") if stripes else ("all",)
     terms = [Term(kind, part) for kind in kinds for part in parts]
@@ -123,10 +123,14 @@ def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibrat
     return by_all_ways((own, room), view.back((own, room), every))
 
 
-def _with_indirect(one: BlockLight, factors: Both, back: Both) -> BlockLight:
-    """With what surfaces throw back of the direct light of a picture, as far as is known yet."""
-    own, room = with_bounces((one.own, one.room), factors, back)
-    return replace(one, own=own, room=room)
+def _with_indirect(pictures: Sequence[BlockLight], factors: Both, back: Both) -> list[BlockLight]:
+    """With what surfaces throw back of the direct light of each picture, as far as is known yet."""
+    if not pictures:
+        return []
+    # all pictures at once: the factors are read for all of them, not for each
+    direct = tuple(np.stack(lights, axis=1) for lights in zip(*((one.own, one.room) for one in pictures), strict=True))
+    own, room = with_bounces((direct[0], direct[1]), factors, (back[0][:, None], back[1][:, None]))
+    return [replace(one, own=own[:, n], room=room[:, n]) for n, one in enumerate(pictures)]
 
 
 def _nothing(lit: Mask) -> IndirectLight:

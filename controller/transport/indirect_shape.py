@@ -52,7 +52,7 @@ def shaped(
     known = known * ((whole > 0) & (pictures[0].whole > 0) & (bright > FAINTEST * bright.max(initial=0)))
     left = parts - np.divide(seen, whole, out=np.zeros_like(parts), where=known > 0)
     coloured = _Coloured(colours, both, every)
-    smooth = _smooth_factors(grid)
+    smooth = _SmoothFactors(grid)
     out = both.copy()
     for block in range(len(both)):
         picture, channel = np.nonzero(known[:, block])
@@ -104,28 +104,40 @@ class _Coloured:
         return _Equations(sources, part - self._falling[block] / total, COLOUR_NOISE)
 
 
-def _change(equations: _Equations, smooth: FloatImage) -> FloatImage:
+def _change(equations: _Equations, smooth: _SmoothFactors) -> FloatImage:
     """The change of each source's factor (sources,), by equations in units of their noise.
 
-    ``smooth`` (blocks, k): see ``_smooth_factors``; object and room have factors of their own.
+    Object and room have factors of their own.
     """
-    count = len(smooth)
-    by_part = [UNSURE * (equations.sources[:, first : first + count] @ smooth) for first in (0, count)]
+    by_part = [UNSURE * smooth.of(one) for one in np.split(equations.sources, 2, axis=1)]
     gram = sum(one @ one.T for one in by_part) + np.eye(len(equations.left))
     answer = np.linalg.solve(gram, equations.left)
-    return np.asarray(UNSURE * np.concatenate([smooth @ (one.T @ answer) for one in by_part]), np.float32)
+    return np.asarray(UNSURE * np.concatenate([smooth.back(one.T @ answer) for one in by_part]), np.float32)
 
 
-def _smooth_factors(grid: tuple[int, int]) -> FloatImage:
-    """(blocks, k) B with B B' the correlation between blocks of the ``grid``."""
-    along = []
-    for count in grid:
-        apart = np.subtract.outer(np.arange(count), np.arange(count)) / ALIKE_BLOCKS
-        values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
-        use = values > LEAST_VARIANCE * values.max()
-        root: Float64 = vectors[:, use] * np.sqrt(values[use])
-        along.append(root)
-    return np.asarray(np.kron(*along), np.float32)
+class _SmoothFactors:
+    """B (blocks, k) with B B' the correlation between blocks of a ``grid``: of its rows times that of its columns."""
+
+    def __init__(self, grid: tuple[int, int]) -> None:
+        self._rows, self._columns = (_root(count) for count in grid)
+
+    def of(self, sources: FloatImage) -> FloatImage:
+        """``sources`` (equations, blocks) times B."""
+        image = sources.reshape(len(sources), len(self._rows), len(self._columns))
+        return np.asarray(np.matmul(self._rows.T, image @ self._columns).reshape(len(sources), -1), np.float32)
+
+    def back(self, values: Float64) -> Float64:
+        """B times ``values`` (k,)."""
+        along = values.reshape(self._rows.shape[1], self._columns.shape[1])
+        return np.asarray((self._rows @ along @ self._columns.T).reshape(-1), np.float64)
+
+
+def _root(count: int) -> FloatImage:
+    """(count, k) R with R R' the correlation along so many blocks."""
+    apart = np.subtract.outer(np.arange(count), np.arange(count)) / ALIKE_BLOCKS
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
+    use = values > LEAST_VARIANCE * values.max()
+    return np.asarray(vectors[:, use] * np.sqrt(values[use]), np.float32)
 
 
 __all__ = ["shaped"]

@@ -15,14 +15,16 @@ DOUBLED: Final = 3
 
 
 def with_bounces(direct: Both, factors: Both, back: Both) -> Both:
-    """All light that leaves blocks (blocks, 3), where ``direct`` light is that of projectors.
+    """All light that leaves blocks (blocks, pictures, 3), where ``direct`` light is that of projectors.
 
-    ``factors`` (blocks, blocks): light that falls from blocks of object and room; ``back`` (blocks, 3): what they make
-    of light that falls on them
+    ``factors`` (blocks, blocks): light that falls from blocks of object and room; ``back`` (blocks, 1, 3): what they
+    make of light that falls on them
     """
     own, room = direct
+    shape = own.shape
     for _ in range(2**DOUBLED):
-        falling = factors[0] @ own + factors[1] @ room
+        falling = sum(one @ light.reshape(len(light), -1) for one, light in zip(factors, (own, room), strict=True))
+        falling = np.asarray(falling, np.float32).reshape(shape)
         own, room = direct[0] + back[0] * falling, direct[1] + back[1] * falling
     return own, room
 
