@@ -18,7 +18,7 @@ from controller.artefacts.geometry import read_geometry
 from controller.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.blender.run import find_blender, render
 from controller.core.arrays import ByteImage, Mask
-from controller.kiosk.api.scenes import SHIPPED
+from controller.kiosk.preview.scenes import SHIPPED
 from controller.solve.targets.files import read_picture
 from controller.solve.targets.values import linear_to_srgb
 

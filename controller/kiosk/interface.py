@@ -35,6 +35,7 @@ from controller.kiosk.values import (
     Aiming,
     Appearance,
     Comparison,
+    Computed,
     Finding,
     Fit,
     FoundDevice,
@@ -120,6 +121,13 @@ class Kiosk(Protocol):
     def reach(self, target: Path) -> Reach:
         """How much of the target can be made, and what the object will look like. Seconds. Raises UsageError without
         a calibration.
+        """
+
+    def computed(self, target: Path) -> Computed:
+        """What the object will look like by a whole solve on a graphics processor. Seconds; more at the first target.
+
+        Raises UsageError("no-graphics-processor", "not-calibrated"), WorkError("preview-ended") while a job runs,
+        WorkError("memory-too-small", "preview-slow").
         """
 
     def scenes(self) -> Sequence[Scene]:
@@ -254,6 +262,7 @@ __all__ = [
     "Change",
     "Changes",
     "Comparison",
+    "Computed",
     "DeviceRow",
     "DriftCheck",
     "EventLevel",

@@ -48,7 +48,8 @@ class Reach:
     """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
     ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
     not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
-    ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all.
+    ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all. ``computes``: a graphics processor
+    may be there for ``Computed``.
     """
 
     share: float
@@ -57,6 +58,25 @@ class Reach:
     too_colourful: float
     pictures: dict[str, Path] = field(default_factory=dict)
     coarse: int = 1
+    computes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """What the object will look like by a whole solve of a target on a graphics processor, as the computation makes it.
+    Calculated, not photographed: ``delta_e`` and ``delta_e_p95`` median and 95th percentile of the colour difference
+    (CIEDE2000) from the target on the whole visible object, ``in_reach`` the median where the target can be reached,
+    which is ``in_reach_share`` of the object; each None without such pixels. ``seconds`` it took on ``device``;
+    ``pictures`` of the object: "result".
+    """
+
+    delta_e: float | None
+    delta_e_p95: float | None
+    in_reach: float | None
+    in_reach_share: float
+    seconds: float
+    device: str
+    pictures: dict[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,16 +21,23 @@ from controller.artefacts.geometry import read_geometry
 from controller.artefacts.solved import read_solved
 from controller.blender.job import own_paint
 from controller.blender.run import find_blender
+from controller.config.models import SolveTable
 from controller.core.arrays import load_arrays
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.interface import Job
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Computed
 from controller.panel.uploads import Targets, UploadLimits
+from controller.report.pictures import crop_around, to_screen
+from controller.solve.judged import by_pixels, visible_object
+from controller.solve.request import solve_appearance
+from controller.solve.targets.files import load_target
 from controller.solve.targets.values import srgb_to_linear
 from controller.stage.calibrations import finished_calibration
 from controller.stage.check import check_stage
+from controller.steps.appearance.solving import options_of, solved_base
 from tests.controller.blender.test_render import PAINT_SCENE
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
 from tests.controller.panel.served import served
@@ -53,6 +62,7 @@ def kiosk(finished_demo: FinishedDemo, tmp_path: Path) -> Iterator[StageKiosk]:
     kiosk.attach(Service(check_stage(stage), log))
     yield kiosk
     kiosk.service.jobs.close(60)
+    kiosk.detach()
     log.close()
 
 
@@ -274,3 +284,91 @@ def test_a_new_appearance_that_can_not_be_solved_is_taken_out_of_stage_toml(kios
     assert "cut was not solved" in found.outcome
     assert "cut" not in kiosk.settings()
     assert "checkerboard" in [one.name for one in kiosk.appearances()]
+
+
+def test_a_graphics_processor_shows_what_the_computation_will_make(kiosk: StageKiosk, tmp_path: Path) -> None:
+    """Mesa's lavapipe; the judge is the processor, at all pixels. By base times scale, which spares the device in
+    software most of its sweeps. The end of the process that solves, by a driver or for a job, is none of the kiosk's.
+    """
+    target = tmp_path / "squares.png"
+    rows, columns = np.indices((CAMERA_PX[1], CAMERA_PX[0])) // 40
+    cv2.imwrite(str(target), np.where(((rows + columns) % 2)[..., None], (90, 120, 150), (150, 110, 80)))
+    solves_on(kiosk, "gpu")
+    assert kiosk.reach(target).computes
+    with ThreadPoolExecutor(1) as other:
+        looking = other.submit(kiosk.computed, target)
+        wait_for(lambda: bool(preview_processes()))
+        os.kill(preview_processes()[0], signal.SIGKILL)
+        assert code_of(looking.result) == "preview-ended"
+    found = kiosk.computed(target)
+    assert kiosk.computed(target) == found, "it is kept"
+    agrees_with_the_processor(found, kiosk, target)
+    assert len(preview_processes()) == 1, "it stays for the next target"
+    job = kiosk.compute("squares", target)
+    wait_for(lambda: kiosk.service.jobs.running is not None or moved_once(kiosk))
+    assert code_of(lambda: kiosk.computed(tmp_path / "squares.png")) == "preview-ended"
+    assert preview_processes() == []
+    kiosk.cancel()
+    ended(kiosk, job)
+    solves_on(kiosk, "cpu")
+    assert not kiosk.reach(target).computes
+
+
+def agrees_with_the_processor(found: Computed, kiosk: StageKiosk, target: Path) -> None:
+    names, options = kiosk.service.checked.names, options_of(SolveTable(mode="scale"))
+    calibrated = Calibrated(finished_calibration(kiosk.stage), names)
+    black, transport = calibrated.calibration.black, calibrated.transport
+    made = solve_appearance(
+        transport, solved_base(calibrated, options), black, load_target(target, CAMERA_PX), options,
+        drive=calibrated.drive, indirect=calibrated.indirect,
+    )  # fmt: skip
+    seen = calibrated.predicted_light(made.frames) + black
+    exposure, whole = float(made.figures["exposure"] or 0), visible_object(transport.object_mask)
+    judged = by_pixels(
+        seen, made.asked, calibrated.calibration.camera_to_xyz, exposure, reachable=made.asked_reachable,
+        valid=made.valid, lit=transport.object_mask,
+    )  # fmt: skip
+    assert found.delta_e == pytest.approx(judged["visible"].delta_e00_median, rel=0.02)
+    assert found.in_reach == pytest.approx(judged["in_reach"].delta_e00_median, rel=0.02)
+    assert found.in_reach_share == pytest.approx(1 - judged["in_reach"].left_out_share, abs=1e-3)
+    picture, box = cv2.imread(str(found.pictures["result"])), crop_around(whole)
+    assert picture is not None
+    wanted = to_screen(seen, calibrated.calibration.camera_to_xyz, white=exposure)[box.rows, box.columns, ::-1]
+    inside = cv2.erode(whole.astype(np.uint8), np.ones((9, 9), np.uint8))[box.rows, box.columns] > 0
+    assert np.abs(picture.astype(int) - wanted)[inside].mean() < 3, "but for the compression as JPEG"
+
+
+def moved_once(kiosk: StageKiosk) -> bool:
+    kiosk.service.reconciler.step()
+    kiosk.service.changed()
+    return False
+
+
+def code_of(call: Callable[[], object]) -> str:
+    with pytest.raises(WorkError) as caught:
+        call()
+    return caught.value.code
+
+
+def solves_on(kiosk: StageKiosk, device: str) -> None:
+    """A new service with this device, as after a change of stage.toml."""
+    toml = kiosk.stage / "stage.toml"
+    text = toml.read_text()
+    toml.write_text(text.partition("\n[solve]")[0] + f'\n[solve]\nmode = "scale"\ndevice = "{device}"\n')
+    log = kiosk.service.log
+    kiosk.detach()
+    kiosk.attach(Service(check_stage(kiosk.stage), log))
+
+
+def preview_processes() -> list[int]:
+    """This process's own."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(status.read_text().rpartition(")")[2].split()[1])
+            command = (status.parent / "cmdline").read_bytes()
+        except OSError:
+            continue  # it has ended
+        if parent == os.getpid() and b"kiosk.preview.computing" in command:
+            found.append(int(status.parent.name))
+    return found

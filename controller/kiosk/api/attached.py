@@ -15,6 +15,7 @@ from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.api.snapshot import Snapshots
 from controller.kiosk.interface import EventLevel, EventRow, KioskState, Unsubscribe
 from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.preview.computed import ComputedPreviews
 from controller.kiosk.service import Service
 from controller.kiosk.store.accounts import Accounts, stage_accounts
 from controller.kiosk.store.event_log import Decision
@@ -47,6 +48,7 @@ class AttachedKiosk(FolderKiosk):
             0, stage.name, "off", "The stage is not set up yet.", self._world.wall(), needs_setup=True
         )
         self._events = 0
+        self._previews = ComputedPreviews()
         self._snapshots = Snapshots(stage, self._world)
         self._examinations = finding.Examinations(lambda: finding.findings(stage, self._service))
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
@@ -74,6 +76,7 @@ class AttachedKiosk(FolderKiosk):
     def detach(self) -> None:
         """Stop using the service, which has ended: the next one may have read its files already."""
         self._service = None
+        self._previews.end()
 
     def held_accounts(self) -> Accounts:
         """The one copy that panel and socket share: a second one would overwrite its changes."""
@@ -147,6 +150,8 @@ class AttachedKiosk(FolderKiosk):
         if service is None:
             return
         self._end_notice(service)
+        if service.jobs.running is not None:
+            self._previews.end()
         now = self._snapshots.of(service, self._last.revision)
         with self._lock:
             # Read once: an event logged between two reads would never be sent to the panel.

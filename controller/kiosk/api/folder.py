@@ -51,7 +51,7 @@ class FolderKiosk:
         return projector_picture(self._bundles(), check_stage(self.stage), name, projector)
 
     def view(self) -> Path:
-        from controller.kiosk.api.preview_light import view_picture
+        from controller.kiosk.preview.preview_light import view_picture
 
         return view_picture(self.stage, finished_calibration(self.stage), check_stage(self.stage).names)
 
@@ -75,17 +75,17 @@ class FolderKiosk:
         return since_good(self.stage, take(self.stage, tables, (), Machine(), ""))
 
     def reach(self, target: Path) -> Reach:
-        from controller.kiosk.api.reach import reach
+        from controller.kiosk.preview.reach import reach
 
         return reach(check_stage(self.stage), target)
 
     def scenes(self) -> Sequence[Scene]:
-        from controller.kiosk.api.scenes import scenes
+        from controller.kiosk.preview.scenes import scenes
 
         return scenes(self.stage)
 
     def scene_reach(self, scene: str) -> Reach:
-        from controller.kiosk.api.scenes import scene_reach
+        from controller.kiosk.preview.scenes import scene_reach
 
         return scene_reach(check_stage(self.stage), scene)
 

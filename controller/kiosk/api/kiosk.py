@@ -24,6 +24,7 @@ from controller.kiosk.interface import (
     Appearance,
     Changes,
     Comparison,
+    Computed,
     Finding,
     Fit,
     FoundDevice,
@@ -123,13 +124,22 @@ class StageKiosk(AttachedKiosk):
         return None if self._service is None else targets.camera_view_px(self.stage, self._service.checked.names)
 
     def reach(self, target: Path) -> Reach:
-        from controller.kiosk.api.reach import reach
+        from controller.kiosk.preview.reach import reach
 
-        return reach(self.service.checked, target)
+        checked = self.service.checked
+        return replace(reach(checked, target), computes=self._previews.possible(checked))
+
+    def computed(self, target: Path) -> Computed:
+        service = self.service
+        if service.jobs.running is not None:
+            # Both would need the memory of a whole solve.
+            raise WorkError("preview-ended", what="A job of the kiosk runs, which may need all of the memory.",
+                            remedy="Look at the picture again when the job has ended.")  # fmt: skip
+        return self._previews.of(service.checked, target)
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         if fit == "wrap":
-            from controller.kiosk.api.wrapped import wrapped
+            from controller.kiosk.preview.wrapped import wrapped
 
             return wrapped(finished_calibration(self.stage), self.service.checked.names, target)
         picture, size_px = target.read_bytes(), self.view_px()
@@ -148,7 +158,7 @@ class StageKiosk(AttachedKiosk):
 
     def compute_scene(self, name: str, scene: str) -> Job:
         from controller.blender.run import find_blender
-        from controller.kiosk.api.scenes import entry
+        from controller.kiosk.preview.scenes import entry
 
         service = self.service
         settings.check_name(name)

@@ -32,6 +32,11 @@ def camera_view_px(stage: Path, names: tuple[str, ...]) -> tuple[int, int] | Non
         return None
 
 
+def png_size(png: bytes) -> tuple[int, int]:
+    """(width, height) from a PNG's head."""
+    return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
+
+
 def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill", "crop", "stretch"] = "fit") -> bytes:
     """``picture`` (PNG) as a PNG of the size of the camera's view; unchanged if it has that size already.
 

@@ -132,6 +132,13 @@ class Pages:
                 "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
             ),
             Entry(
+                "GET",
+                "/late/computed/{target}",
+                "session",
+                Role.OPERATOR,
+                self._late("late_computed.html", self._computed),
+            ),
+            Entry(
                 "GET", "/late/scenes/{scene}", "session", Role.OPERATOR, self._late("late_reach.html", self._rendered)
             ),
         ]
@@ -344,6 +351,18 @@ class Pages:
         file = self._panel.targets.path(target)
         found = self._panel.kiosk.reach(file)
         return {"target": target, "reach": found, "at": f"/see/targets/{target}/reach", **self._drawn_on(target)}
+
+    def _computed(self, request: Request) -> dict[str, Any]:
+        """A whole solve; without one, why, and the quick preview stays."""
+        target = request.path_params["target"]
+        file = self._panel.targets.path(target)
+        found, problem = None, ""
+        try:
+            found = self._panel.kiosk.computed(file)
+        except answers.FAILURES as error:
+            problem = error.what
+        picture = f"/see/targets/{target}/{'computed/picture' if found else 'reach/result'}"
+        return {"computed": found, "problem": problem, "picture": picture, "stamp": file.stat().st_mtime_ns}
 
     def _accounts(self, _: Request) -> dict[str, Any]:
         return self.accounts()

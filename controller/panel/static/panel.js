@@ -90,13 +90,16 @@
   // What takes seconds comes after the page.
   async function late(place) {
     let html = "";
+    for (const waiting of place.querySelectorAll(".waiting")) waiting.hidden = false;
     try {
       const answer = await fetch(place.dataset.late, { redirect: "manual" });
       if (answer.type === "opaqueredirect") { location.assign("/login"); return; }
       html = await answer.text();
     } catch { /* not reachable */ }
-    if (html) place.innerHTML = html;
-    else place.querySelector(".waiting").textContent = body.dataset.lateLost;
+    if (html) {
+      place.innerHTML = html;
+      for (const inner of place.querySelectorAll("[data-late]")) late(inner);
+    } else place.querySelector(".waiting").textContent = body.dataset.lateLost;
   }
   for (const place of document.querySelectorAll("[data-late]")) late(place);
 

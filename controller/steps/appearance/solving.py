@@ -20,7 +20,7 @@ from controller.core.errors import UsageError
 from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.solve.appearance import BaseChoice, base_image, solve_base
+from controller.solve.appearance import Base, BaseChoice, base_image, solve_base
 from controller.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.solve.scaling.dither import to_device
@@ -123,14 +123,20 @@ def random_pattern(size_px: tuple[int, int]) -> Pattern:
 def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
     need = solve_peak_bytes(stage_size(calibrated.calibration))
     context.reporter.say(check_memory(need, free_bytes()))
+    base = solved_base(calibrated, options, _watched(context))
+    calibrated.keep_base(base)
+    return SolvedBase(base.image, base.solution).write(context.folder, calibrated.projectors)
+
+
+def solved_base(
+    calibrated: Calibrated, options: SolveOptions, progress: Callable[[int, float], None] | None = None
+) -> Base:
+    """The base image for these options. Raises as ``solve_bounded``."""
     black = calibrated.calibration.black
     image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
-    base = solve_base(
-        calibrated.transport, image, black, smoothness=options.smoothness, progress=_watched(context),
-        engine=calibrated.engine,
-    )  # fmt: skip
-    calibrated.keep_base(base)
-    return SolvedBase(image, base.solution).write(context.folder, calibrated.projectors)
+    return solve_base(
+        calibrated.transport, image, black, smoothness=options.smoothness, progress=progress, engine=calibrated.engine
+    )
 
 
 def _watched(context: Context) -> Callable[[int, float], None]:

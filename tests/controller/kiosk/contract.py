@@ -40,7 +40,9 @@ from tests.controller.kiosk import vase
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
 """Every kiosk of these tests plays PLAYING, has OTHER installed as well, and the finished calibration RUN."""
 TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
-NEEDS_A_CALIBRATION = {"feasibility", "reach", "reach-picture", "scene-reach-picture", "view"}
+NEEDS_A_CALIBRATION = {
+    "computed-picture", "computed-preview", "feasibility", "reach", "reach-picture", "scene-reach-picture", "view",
+}  # fmt: skip
 """What no stage of these tests can do: tests/end_to_end/test_kiosk_targets.py asks it of a calibrated one."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError
-from controller.kiosk.api.reach import BRIGHT, COLOURFUL, DARK, FOLDER, UNLIT, kinds_of, map_of, reach
+from controller.kiosk.preview.reach import BRIGHT, COLOURFUL, DARK, FOLDER, UNLIT, kinds_of, map_of, reach
 from controller.solve.feasibility import Feasibility
 from controller.stage.check import check_stage
 from tests.controller.kiosk.vase import graded_run, vase

@@ -11,17 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays
 from controller.core.storage import write_atomically
-from controller.kiosk.store.targets import fitted
+from controller.kiosk.store.targets import fitted, png_size
 from controller.kiosk.values import Reach
 from controller.stage.calibrations import finished_calibration
 from controller.stage.check import Checked
 
 if TYPE_CHECKING:
-    from controller.kiosk.api.preview_light import PreviewLight
+    from controller.kiosk.preview.preview_light import PreviewLight
     from controller.solve.feasibility import Feasibility
     from controller.solve.request import Aim
     from controller.solve.targets.values import Target
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 FOLDER, KEPT = "kiosk/feasibility", 20
 FIGURES: Final = "reach.json"
 FILES: Final = {"target": "target.jpg", "result": "result.jpg", "map": "map.png"}
-LONGEST_PX: Final = 960
-"""The longer side of the pictures, which are for a screen."""
 BRIGHT, DARK, COLOURFUL, UNLIT = (240, 179, 90), (90, 140, 255), (216, 96, 190), (58, 60, 66)
 """Colours of the map, as in the page's legend: too bright, too dark, too saturated, and not lit or not asked for."""
 _one_at_a_time = threading.Lock()
@@ -69,7 +66,8 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 
 
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
-    from controller.kiosk.api.preview_light import preview_light
+    from controller.kiosk.preview.pictures import write_picture
+    from controller.kiosk.preview.preview_light import preview_light
     from controller.solve.judged import visible_object
     from controller.solve.request import aim_at
     from controller.steps.appearance.solving import options_of
@@ -85,11 +83,13 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     kinds = kinds_of(aim.asked_possible, lit & wanted.mask)
     folder.mkdir(parents=True, exist_ok=True)
     grey = _drawn(folder, light, aim, seen)
-    _write(folder / FILES["map"], map_of(kinds, grey), seen)
+    write_picture(folder / FILES["map"], map_of(kinds, grey), seen)
     area = max(1, int(seen.sum()))
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
     pictures = {name: folder / file for name, file in FILES.items()}
-    return Reach(**share, pictures=pictures, coarse=round(light.step))
+    return Reach(
+        share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step)
+    )
 
 
 def _wanted(light: PreviewLight, target: Path) -> Target:
@@ -111,15 +111,10 @@ def _wanted(light: PreviewLight, target: Path) -> Target:
         small = Path(scratch) / "target.png"
         # Made small before its colours become light: on a whole picture that alone takes a second.
         picture = target.read_bytes()
-        if _size_px(picture) != light.camera_px:
+        if png_size(picture) != light.camera_px:
             picture = fitted(picture, light.camera_px)
         small.write_bytes(fitted(picture, (columns, rows), "stretch"))
         return load_target(small, (columns, rows))
-
-
-def _size_px(png: bytes) -> tuple[int, int]:
-    """(width, height) from a PNG's head."""
-    return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
 
 
 def _shrunk(image: FloatImage, size_px: tuple[int, int]) -> FloatImage:
@@ -144,13 +139,14 @@ def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
 
 def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
     """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
+    from controller.kiosk.preview.pictures import write_picture
     from controller.report.pictures import to_screen
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
     made = light if of.indirect is None else light + of.indirect.forward(light)
     asked, result = (to_screen(image, of.camera_to_xyz, white=aim.exposure) for image in (aim.asked, of.black + made))
-    _write(folder / FILES["target"], asked, seen)
-    _write(folder / FILES["result"], result, seen)
+    write_picture(folder / FILES["target"], asked, seen)
+    write_picture(folder / FILES["result"], result, seen)
     return np.asarray(asked.mean(axis=2), np.uint8)
 
 
@@ -161,21 +157,6 @@ def map_of(kinds: dict[str, Mask], grey: ByteImage) -> ByteImage:
     for name, colour in (("too_bright", BRIGHT), ("too_dark", DARK), ("too_colourful", COLOURFUL)):
         picture[kinds[name]] = colour
     return picture
-
-
-def _write(path: Path, rgb: ByteImage, seen: Mask) -> None:
-    """Only the object, with black around it, small enough for a screen."""
-    import cv2
-
-    from controller.report.pictures import crop_around
-
-    box = crop_around(seen)
-    cut: npt.NDArray[np.uint8] = np.where(seen[..., None], rgb, 0).astype(np.uint8)[box.rows, box.columns, ::-1]
-    scale = LONGEST_PX / max(cut.shape[:2])
-    if scale < 1:
-        size_px = (max(1, round(cut.shape[1] * scale)), max(1, round(cut.shape[0] * scale)))
-        cut = np.asarray(cv2.resize(cut, size_px, interpolation=cv2.INTER_AREA), np.uint8)
-    write_atomically(path, cv2.imencode(path.suffix, cut)[1].tobytes())
 
 
 def _keep_newest(folder: Path, most: int) -> None:

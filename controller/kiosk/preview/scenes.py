@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of, write_atomically
-from controller.kiosk.api import reach
+from controller.kiosk.preview import reach
 from controller.kiosk.values import Reach, Scene
 from controller.stage.calibrations import finished_calibration
 from controller.stage.check import Checked
 
 if TYPE_CHECKING:
     from controller.calibrate.values import Pinhole
-    from controller.kiosk.api.preview_light import PreviewLight
+    from controller.kiosk.preview.preview_light import PreviewLight
 
 FOLDER: Final = "kiosk/scenes"
 OWN: Final = "scenes"
@@ -102,7 +102,7 @@ def _render(checked: Checked, run: Path, kept: Path, *, builtin: str | None, sce
     from controller.blender.job import RenderSettings, as_seen, write_job
     from controller.blender.run import find_blender, render
     from controller.core.arrays import save_arrays
-    from controller.kiosk.api.preview_light import preview_light
+    from controller.kiosk.preview.preview_light import preview_light
     from controller.solve.targets.files import read_picture
 
     blender = find_blender()

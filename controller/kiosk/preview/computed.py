@@ -1,0 +1,175 @@
+"""Whole solves of targets before they are computed, where a graphics processor makes them fast.
+
+A process of its own solves (`computing`): a driver that ends it ends no kiosk, and its memory goes with it. It stays
+for the next target, until nobody asks, a job of the kiosk needs the memory, or calibration or settings change.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.storage import write_atomically
+from controller.kiosk.preview.reach import FOLDER
+from controller.kiosk.values import Computed
+from controller.solve.engines.graphics import MODULE
+from controller.stage.calibrations import finished_calibration
+from controller.stage.check import Checked
+
+FIGURES: Final = "computed.json"
+PICTURE: Final = "computed.jpg"
+IDLE_S: Final = 120.0
+LONGEST_S: Final = 180.0
+"""For one answer, with what is read first: a driver may hang."""
+NO_DEVICE: Final = "no-graphics-processor"
+
+
+class ComputedPreviews:
+    """Of one stage. Any thread may call; one target is solved at a time."""
+
+    def __init__(self) -> None:
+        self._one_at_a_time = threading.Lock()
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._stage = ""
+        self._idle: threading.Timer | None = None
+        self._none_for: set[str] = set()
+        """Values of [solve] device for which this computer has none; it is not looked for again."""
+
+    def possible(self, checked: Checked) -> bool:
+        """Whether a graphics processor may be there; known for certain after the first target."""
+        device = checked.stage.tables.solve.device
+        return device != "cpu" and device not in self._none_for and importlib.util.find_spec(MODULE) is not None
+
+    def of(self, checked: Checked, target: Path) -> Computed:
+        """Solve ``target`` (PNG or EXR); kept until target, calibration or settings change.
+
+        Seconds, more at the first target. Raises UsageError("no-graphics-processor", "not-calibrated",
+        "target-unreadable"), WorkError("memory-too-small", "preview-ended", "preview-slow").
+        """
+        table = checked.stage.tables.solve
+        run = finished_calibration(checked.stage.folder)
+        if not self.possible(checked):
+            raise UsageError(NO_DEVICE, what="This computer has no graphics processor that can solve.",
+                             remedy="Use the quick preview, or compute the appearance.")  # fmt: skip
+        folder = checked.stage.folder / FOLDER / target.stem[:64]
+        about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": repr(table)}
+        with self._one_at_a_time:
+            if (known := _kept(folder, about)) is not None:
+                return known
+            folder.mkdir(parents=True, exist_ok=True)
+            stage = json.dumps({"run": str(run), "names": checked.names, "solve": table.model_dump(mode="json")})
+            try:
+                found = self._asked(stage, {"target": str(target), "picture": str(folder / PICTURE)})
+            except VelaturaError as error:
+                if error.code == NO_DEVICE:
+                    self._none_for.add(table.device)
+                    self.end()
+                raise
+            write_atomically(folder / FIGURES, json.dumps({"of": about, "figures": found}).encode())
+            return _read(found, folder)
+
+    def end(self) -> None:
+        """End the process, if there is one, and so free all that it holds; a solve that runs is lost."""
+        if self._process is None:
+            return
+        with self._lock:
+            process, self._process = self._process, None
+            if self._idle is not None:
+                self._idle.cancel()
+        if process is not None:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    def _asked(self, stage: str, task: dict[str, str]) -> dict[str, Any]:
+        process = self._ready(stage)
+        assert process.stdin is not None
+        assert process.stdout is not None
+        slow = threading.Event()
+
+        def give_up() -> None:
+            slow.set()
+            process.kill()
+
+        limit = threading.Timer(LONGEST_S, give_up)
+        limit.daemon = True
+        limit.start()
+        line = ""
+        try:
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except (OSError, ValueError):
+            pass  # it has ended, or was ended
+        finally:
+            limit.cancel()
+        if not line:
+            self.end()
+            raise _slow() if slow.is_set() else _ended()
+        self._rest()
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            failure = answer["error"]
+            kind = UsageError if failure["usage"] else WorkError
+            raise kind(failure["code"], what=failure["what"], remedy=failure["remedy"])
+        return answer
+
+    def _ready(self, stage: str) -> subprocess.Popen[str]:
+        """The process that has this stage."""
+        if self._stage != stage:
+            self.end()
+        with self._lock:
+            if self._idle is not None:
+                self._idle.cancel()
+            if self._process is not None:
+                return self._process
+            process = subprocess.Popen(
+                [sys.executable, "-m", "controller.kiosk.preview.computing"], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, text=True, encoding="utf-8",
+            )  # fmt: skip
+            self._process, self._stage = process, stage
+        assert process.stdin is not None
+        with contextlib.suppress(OSError):  # that it has ended is seen when it is asked
+            process.stdin.write(stage + "\n")
+            process.stdin.flush()
+        return process
+
+    def _rest(self) -> None:
+        """End the process later, unless it is asked again."""
+        with self._lock:
+            self._idle = threading.Timer(IDLE_S, self.end)
+            self._idle.daemon = True
+            self._idle.start()
+
+
+def _ended() -> WorkError:
+    return WorkError("preview-ended", what="The preview on the graphics processor was ended before it was there.",
+                     remedy="Look at the picture again when no job of the kiosk runs.")  # fmt: skip
+
+
+def _slow() -> WorkError:
+    return WorkError("preview-slow", what=f"The graphics processor gave no preview within {LONGEST_S:.0f} seconds.",
+                     remedy='Set device = "cpu" under [solve] in stage.toml if this happens again.')  # fmt: skip
+
+
+def _kept(folder: Path, about: dict[str, Any]) -> Computed | None:
+    try:
+        content = json.loads((folder / FIGURES).read_text())
+        return _read(content["figures"], folder) if content["of"] == about and (folder / PICTURE).is_file() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _read(figures: dict[str, Any], folder: Path) -> Computed:
+    return Computed(**figures, pictures={"result": folder / PICTURE})
