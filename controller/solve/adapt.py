@@ -19,12 +19,13 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numba import prange
 
-from controller.core.arrays import FloatImage, Mask, strips
-from controller.core.channels import largest, smallest
+from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
+from controller.core.jit import compiled
 from controller.solve.bounded.solver import check_target
-from controller.solve.drive_levels import DriveLevels
+from controller.solve.drive_levels import Colour, DriveLevels, levels_at, light_at
 from controller.solve.smooth_limits import SmoothLimits
 from controller.transport import LightTransport
 
@@ -34,14 +35,12 @@ TOGETHER: Final = 0.8
 """How far channels are dimmed together, from 0 (each by itself, which colours highlights) to 1."""
 DEEPEST: Final = 2.5
 """Largest logarithm of the brightest target's light over a ceiling: what hardly any light reaches is given up."""
-POWER: Final = 4
-"""Of the means that stand for a soft maximum of a target and its floor."""
 CLEAR: Final = 1.0
 """Chroma counts in full where a target is brighter than its floor by this part of it; in the dark it hardly shows."""
 FORGIVEN: Final = 1e-3
 """Drive beyond [0, 1] that is no lack of light."""
-GREY: Final = np.array([0.25, 0.5, 0.25], np.float32)
-"""Lightness from the camera's channels, of which green is that of the eye."""
+LEAST: Final = np.float32(1e-12)
+NOT_DIMMED: Final = np.zeros((3, 0, 0), np.float32)
 
 
 def adapted_target(
@@ -82,28 +81,23 @@ def adapted_target(
 
 
 class _Bent:
-    """A target on its way. The steps work on strips of rows, and keep what a whole picture has to be known for.
+    """A target on its way, ``wanted`` and its ``floor`` (rows, columns, 3).
 
     ``lowest``, ``level`` (rows, columns): the darkest grey of each pixel, and what the smooth floor makes of it;
     ``chroma`` (rows, columns): what is left of the saturation, from 0 to 1
     """
 
     def __init__(self, wanted: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits) -> None:
-        self._wanted, self._floor, self._drive, self._limits = wanted, floor, drive, limits
+        self._wanted, self._floor = np.ascontiguousarray(wanted), np.ascontiguousarray(floor)
+        self._stage = drive.matrices, drive.segment_share, drive.mask
+        self._limits = limits
         self._lowest = self._level = np.zeros(drive.mask.shape, np.float32)
         self._chroma: FloatImage = np.ones(drive.mask.shape, np.float32)
 
     def lift(self) -> None:
         """Raise the darkest parts by grey light, where the stage can make a grey that bright at all."""
         need = np.zeros_like(self._lowest)
-        for rows in strips(len(need)):
-            floor, wanted = self._floor[rows], np.maximum(self._wanted[rows], 0)
-            of_floor, of_grey = self._drive.of(floor, rows), self._drive.of(np.ones_like(floor), rows)
-            self._lowest[rows] = np.maximum(largest(_quotient(of_floor, of_grey, otherwise=0.0)), 0)
-            brightest = smallest(_quotient(of_floor + 1, of_grey, otherwise=np.inf))
-            shown = self._lowest[rows] <= brightest
-            lacking = self._drive.mask[rows] & shown & (wanted @ GREY < self._lowest[rows])
-            need[rows] = np.where(lacking, self._lowest[rows], 0)
+        _lift_needs(*self._stage, self._wanted, self._floor, self._lowest, need)
         self._level = self._limits.above(need)
         np.maximum(self._lowest, self._level, out=self._lowest)
 
@@ -113,96 +107,222 @@ class _Bent:
         A channel's share of grey light says how saturated a colour is; the limit is on the smallest of these shares.
         """
         needs = np.zeros((3, *self._chroma.shape), np.float32)
-        for rows in strips(self._chroma.shape[0]):
-            needs[:, rows] = self._chroma_needed(rows)
-        for channel in range(3):
-            needs[channel] = self._limits.above(needs[channel])
-        for rows in strips(self._chroma.shape[0]):
-            chroma = np.ones_like(self._chroma[rows])
-            lifted, grey = self._lifted(rows)
-            for channel, limit in enumerate(needs[:, rows]):
-                own = lifted[..., channel] / grey
-                raised = np.minimum(_soft_maximum(own, limit), 1)
-                chroma = np.minimum(chroma, _quotient(1 - raised, 1 - own, otherwise=1.0, where=own < 1))
-            self._chroma[rows] = np.clip(chroma, 0, 1)
-
-    def _chroma_needed(self, rows: slice) -> FloatImage:
-        """(3, rows, columns): the least share of grey light that each channel can show, 0 where it can show its own."""
-        lifted, grey = self._lifted(rows)
-        floor = self._floor[rows]
-        of_grey = np.maximum(self._drive.of(grey[..., None] - floor, rows), 0)
-        of_colour = self._drive.of(lifted - floor, rows)
-        with np.errstate(invalid="ignore"):
-            # both are infinite where a colour of light is none
-            lost = of_grey - of_colour
-        kept = _quotient(of_grey, lost, otherwise=1.0)
-        clear = np.clip((grey / np.maximum(self._lowest[rows], np.float32(1e-12)) - 1) / CLEAR, 0, 1)[..., None]
-        own = lifted / grey[..., None]
-        need = own + clear * (1 - kept) * (1 - own)
-        lacking = self._drive.mask[rows][..., None] & (of_colour < -FORGIVEN) & (own < 1)
-        return np.moveaxis(np.where(lacking, need, 0), 2, 0).astype(np.float32)
+        _chroma_needs(*self._stage, self._wanted, self._floor, self._level, self._lowest, needs)
+        if needs.any():
+            for channel in range(3):
+                needs[channel] = self._limits.above(needs[channel])
+            _chroma_left(self._stage[-1], self._wanted, self._level, needs, self._chroma)
 
     def dimmed(self, strength: float) -> FloatImage:
         """Bend the brightest parts below a smooth ceiling; all steps together, as strong as ``strength``."""
-        rows_of, mask = list(strips(len(self._wanted))), self._drive.mask
-        top = np.float32(max(self._paler(rows)[mask[rows]].max(initial=0) for rows in rows_of) / KNEE)
-        depths = np.empty((3, *mask.shape), np.float32)
-        for rows in rows_of:
-            depths[:, rows] = np.moveaxis(self._depth(rows, top), 2, 0)
-        is_dimmed = bool(depths.any())
-        for channel in range(3 if is_dimmed else 0):
-            depths[channel] = self._limits.above(depths[channel])
+        mask = self._stage[-1]
+        brightest = _brightest(mask, self._wanted, self._level, self._chroma)
+        top = np.float32(brightest.max(initial=0) / KNEE)
+        depths = np.zeros((3, *mask.shape), np.float32)
+        _depths(*self._stage, self._wanted, self._floor, self._level, self._chroma, top, depths)
+        if depths.any():
+            for channel in range(3):
+                depths[channel] = self._limits.above(depths[channel])
+        else:
+            depths = NOT_DIMMED
         changed = self._wanted.copy()
-        for rows in rows_of:
-            bent = self._paler(rows)
-            if is_dimmed:
-                of_ceiling = np.asarray(bent / (top * np.exp(-np.moveaxis(depths[:, rows], 0, 2))), np.float32)
-                gain = _quotient(_shoulder(of_ceiling), of_ceiling, otherwise=1.0)
-                together = gain.min(axis=2, keepdims=True)
-                bent *= gain ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER)
-            wanted = self._wanted[rows]
-            changed[rows] = np.where(mask[rows][..., None], wanted + np.float32(strength) * (bent - wanted), wanted)
+        _bend(mask, self._wanted, self._level, self._chroma, depths, top, np.float32(strength), changed)
         return changed
 
-    def _depth(self, rows: slice, top: np.float32) -> FloatImage:
-        """(rows, columns, 3): how far the ceiling is below ``top``; 0 where light is not lacking."""
-        target, floor = self._paler(rows), self._floor[rows]
-        levels = self._drive.of(target - floor, rows)
-        over = self._drive.mask[rows][..., None] & (levels > 1 + FORGIVEN)
-        most = np.maximum(floor + self._drive.light(np.clip(levels, 0, 1), rows), np.float32(1e-12))
-        return np.where(over, np.clip(np.log(top / most), 0, DEEPEST), 0).astype(np.float32)
 
-    def _lifted(self, rows: slice) -> tuple[FloatImage, FloatImage]:
-        """The target after ``lift``, and (rows, columns) its grey."""
-        wanted = np.maximum(self._wanted[rows], 0)
-        grey = wanted @ GREY
-        lifted = np.asarray(wanted + (_soft_maximum(grey, self._level[rows]) - grey)[..., None], np.float32)
-        return lifted, np.maximum(lifted @ GREY, np.float32(1e-12))
+@compiled(parallel=True)
+def _lift_needs(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    lowest: FloatImage, need: FloatImage,
+) -> None:  # fmt: skip
+    """The darkest grey at each pixel, and where a target is darker and that grey can be made."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            of_floor = levels_at(matrices, segment_share, y, x, floor[y, x, 0], floor[y, x, 1], floor[y, x, 2])
+            of_grey = levels_at(matrices, segment_share, y, x, one, one, one)
+            darkest, brightest = np.float32(0), np.float32(np.inf)
+            for c in range(3):
+                darkest = max(darkest, _quotient(of_floor[c], of_grey[c], np.float32(0)))
+                brightest = min(brightest, _quotient(of_floor[c] + one, of_grey[c], np.float32(np.inf)))
+            lowest[y, x] = darkest
+            if darkest <= brightest and _grey(wanted, y, x) < darkest:
+                need[y, x] = darkest
 
-    def _paler(self, rows: slice) -> FloatImage:
-        """The target after ``pale``. Full chroma leaves every bit as it is."""
-        lifted, grey = self._lifted(rows)
-        return np.asarray(lifted + (1 - self._chroma[rows])[..., None] * (grey[..., None] - lifted), np.float32)
+
+@compiled(parallel=True)
+def _chroma_needs(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    level: FloatImage, lowest: FloatImage, needs: FloatImage,
+) -> None:  # fmt: skip
+    """The least share of grey light (3, rows, columns) that a channel can show, where it can't show its own."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t, grey = _lifted(wanted, level, y, x)
+            dark = floor[y, x, 0], floor[y, x, 1], floor[y, x, 2]
+            of_grey = levels_at(matrices, segment_share, y, x, grey - dark[0], grey - dark[1], grey - dark[2])
+            of_colour = levels_at(matrices, segment_share, y, x, r - dark[0], s - dark[1], t - dark[2])
+            over = (grey / max(lowest[y, x], LEAST) - one) / np.float32(CLEAR)
+            clear = min(max(over, np.float32(0)), one)
+            lifted = r, s, t
+            for c in range(3):
+                own = lifted[c] / grey
+                if of_colour[c] < -FORGIVEN and own < one:
+                    most = max(of_grey[c], np.float32(0))
+                    # both are infinite where a colour of light is none
+                    kept = _quotient(most, most - of_colour[c], one)
+                    needs[c, y, x] = own + clear * (one - kept) * (one - own)
 
 
-def _shoulder(value: FloatImage) -> FloatImage:
+@compiled(parallel=True)
+def _chroma_left(mask: Mask, wanted: FloatImage, level: FloatImage, limits: FloatImage, chroma: FloatImage) -> None:
+    """What is left of each pixel's saturation by the ``limits`` (3, rows, columns) of its channels' shares of grey."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t, grey = _lifted(wanted, level, y, x)
+            lifted = r, s, t
+            left = one
+            for c in range(3):
+                own = lifted[c] / grey
+                if own < one:
+                    raised = min(_soft_maximum(own, limits[c, y, x]), one)
+                    left = min(left, _quotient(one - raised, one - own, one))
+            chroma[y, x] = max(left, np.float32(0))
+
+
+@compiled(parallel=True)
+def _brightest(mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage) -> FloatImage:
+    """(rows,): the brightest channel of the paler target in each row."""
+    rows, columns = mask.shape
+    out = np.zeros(rows, np.float32)
+    for y in prange(rows):
+        most = np.float32(0)
+        for x in range(columns):
+            if mask[y, x]:
+                r, s, t = _paler(wanted, level, chroma, y, x)
+                most = max(most, r, s, t)
+        out[y] = most
+    return out
+
+
+@compiled(parallel=True)
+def _depths(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    level: FloatImage, chroma: FloatImage, top: np.float32, depths: FloatImage,
+) -> None:  # fmt: skip
+    """How far the ceiling (3, rows, columns) is below ``top``, where light is lacking."""
+    rows, columns = mask.shape
+    none, one = np.float32(0), np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t = _paler(wanted, level, chroma, y, x)
+            dark = floor[y, x, 0], floor[y, x, 1], floor[y, x, 2]
+            levels = levels_at(matrices, segment_share, y, x, r - dark[0], s - dark[1], t - dark[2])
+            if max(levels[0], levels[1], levels[2]) > 1 + FORGIVEN:
+                first, second, third = levels
+                most = light_at(
+                    matrices, segment_share, y, x, min(max(first, none), one), min(max(second, none), one),
+                    min(max(third, none), one),
+                )  # fmt: skip
+                for c in range(3):
+                    if levels[c] > 1 + FORGIVEN:
+                        depth = np.log(top / max(dark[c] + most[c], LEAST))
+                        depths[c, y, x] = min(max(depth, none), np.float32(DEEPEST))
+
+
+@compiled(parallel=True)
+def _bend(
+    mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage, depths: FloatImage, top: np.float32,
+    strength: np.float32, out: FloatImage,
+) -> None:  # fmt: skip
+    """The target (rows, columns, 3) on the object, paler and below its ceiling; none with ``depths`` of 0 rows."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        gain = np.ones(3, np.float32)
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            paler = _paler(wanted, level, chroma, y, x)
+            together = one
+            for c in range(3 if depths.shape[1] else 0):
+                of_ceiling = paler[c] / (top * np.exp(-depths[c, y, x]))
+                gain[c] = _quotient(_shoulder(of_ceiling), of_ceiling, one)
+                together = min(together, gain[c])
+            for c in range(3):
+                bent = paler[c]
+                if together < one:
+                    bent *= gain[c] ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER)
+                out[y, x, c] += strength * (bent - out[y, x, c])
+
+
+@compiled()
+def _grey(wanted: FloatImage, y: int, x: int) -> np.float32:
+    """Lightness from the camera's channels, of which green is that of the eye."""
+    none = np.float32(0)
+    return _grey_of(max(wanted[y, x, 0], none), max(wanted[y, x, 1], none), max(wanted[y, x, 2], none))
+
+
+@compiled()
+def _grey_of(r: np.float32, s: np.float32, t: np.float32) -> np.float32:
+    return np.float32(0.25) * r + np.float32(0.5) * s + np.float32(0.25) * t
+
+
+@compiled()
+def _lifted(
+    wanted: FloatImage, level: FloatImage, y: int, x: int
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """A pixel of the target after ``lift``, and its grey."""
+    none = np.float32(0)
+    r, s, t = max(wanted[y, x, 0], none), max(wanted[y, x, 1], none), max(wanted[y, x, 2], none)
+    grey = _grey_of(r, s, t)
+    more = _soft_maximum(grey, level[y, x]) - grey
+    r, s, t = r + more, s + more, t + more
+    return r, s, t, max(_grey_of(r, s, t), LEAST)
+
+
+@compiled()
+def _paler(wanted: FloatImage, level: FloatImage, chroma: FloatImage, y: int, x: int) -> Colour:
+    """A pixel of the target after ``pale``. Full chroma leaves every bit as it is."""
+    r, s, t, grey = _lifted(wanted, level, y, x)
+    lost = np.float32(1) - chroma[y, x]
+    return r + lost * (grey - r), s + lost * (grey - s), t + lost * (grey - t)
+
+
+@compiled()
+def _shoulder(value: np.float32) -> np.float32:
     """The identity up to ``KNEE``, then towards 1 with the same slope at the knee."""
-    room = np.float32(1 - KNEE)
-    above = np.maximum(value - np.float32(KNEE), 0) / room
-    return np.asarray(np.minimum(value, np.float32(KNEE)) + room * (1 - np.exp(-above)), np.float32)
+    knee, room = np.float32(KNEE), np.float32(1 - KNEE)
+    above = max(value - knee, np.float32(0)) / room
+    bent: np.float32 = min(value, knee) + room * (np.float32(1) - np.exp(-above))
+    return bent
 
 
-def _soft_maximum(value: FloatImage, level: FloatImage) -> FloatImage:
+@compiled()
+def _soft_maximum(value: np.float32, level: np.float32) -> np.float32:
     """At least the larger of both; ``value`` itself where ``level`` is 0."""
-    found = np.asarray(np.maximum(value, 0), np.float32)
+    found = max(value, np.float32(0))
     # elsewhere a root of a power is not the number itself, by a bit or two that differ from processor to processor
-    raised = level > 0
-    found[raised] = (found[raised] ** POWER + level[raised] ** POWER) ** np.float32(1 / POWER)
+    if level > 0:
+        one, other = found * found, level * level
+        found = np.sqrt(np.sqrt(one * one + other * other))
     return found
 
 
-def _quotient(above: FloatImage, below: FloatImage, *, otherwise: float, where: Mask | None = None) -> FloatImage:
-    """``above`` / ``below`` where that is positive (and ``where``), else ``otherwise``."""
-    possible = (below > 1e-9) & np.isfinite(above) & np.isfinite(below)
-    out = np.full(above.shape, otherwise, np.float32)
-    return np.asarray(np.divide(above, below, out=out, where=possible if where is None else possible & where))
+@compiled()
+def _quotient(above: np.float32, below: np.float32, otherwise: np.float32) -> np.float32:
+    """``above`` / ``below`` where that is positive, else ``otherwise``."""
+    return above / below if below > 1e-9 and np.isfinite(above) and np.isfinite(below) else otherwise

@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 from numba import prange
 
-from controller.core.arrays import FloatImage, Mask, array_in_file, strips
-from controller.core.channels import smallest
+from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.jit import compiled
 from controller.transport import LightTransport
 
 ALL: Final = slice(None)
+Colour = tuple[np.float32, np.float32, np.float32]
+NO_SEGMENTS: Final = np.zeros((0, 0), np.float32)
 
 
 class DriveLevels:
@@ -23,6 +24,9 @@ class DriveLevels:
     surely within reach where B^-1 light lies in [0, 1]: brightness and the crosstalk of the colours in one. (Where the
     primaries of the projectors differ, a little more can be reached by unequal frames.) White segments make part of
     what the three colours have in common: levels are those of the colours' own light.
+
+    ``matrices`` (3, 3, rows, columns): B; ``segment_share`` (rows, columns): what white segments are of all light,
+    0 x 0 where no projector has one
     """
 
     def __init__(self, transport: LightTransport, folder: Path | None = None) -> None:
@@ -31,19 +35,20 @@ class DriveLevels:
         pixels = sum(rows * columns for rows, columns in transport.sizes)
         ones = np.ones((3, pixels), np.float32)
         shape = (3, 3, *transport.camera_shape)
-        self._light = array_in_file(folder, shape)
-        self._light[:] = 0
+        self.matrices = array_in_file(folder, shape)
+        self.matrices[:] = 0
         segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
         for n, mixing in enumerate(transport.mixing):
             white = transport.forward_planes(ones, projectors=(n, n + 1))
             for channel in range(3):
                 for colour in range(3):
-                    self._light[channel, colour] += mixing[channel, colour] * white[channel]
+                    self.matrices[channel, colour] += mixing[channel, colour] * white[channel]
             if transport.segments:
                 segment += np.float32(transport.segment(n)) * white.sum(axis=0)
                 total += white.sum(axis=0)
         # projectors of one kind stand together: where they differ, the mean by their light
-        self._segment = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else None
+        share = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else NO_SEGMENTS
+        self.segment_share: FloatImage = share
 
     def of(self, light: FloatImage, rows: slice = ALL) -> FloatImage:
         """(rows, columns, 3) float32 for a light of that shape, without the black image; 0 outside the object.
@@ -52,46 +57,85 @@ class DriveLevels:
         """
         out = np.zeros(light.shape, np.float32)
         first = rows.indices(len(self.mask))[0]
-        _solve(self._light, np.ascontiguousarray(light, np.float32), self.mask, first, out)
-        if self._segment is not None:
-            for part in strips(len(out)):
-                share = self._segment[rows][part][..., None]
-                # what is below none has no white in it, and an infinite level stays one
-                least = smallest(out[part])[..., None]
-                out[part] -= share * np.where(np.isfinite(least), np.maximum(least, 0), 0)
-                out[part] /= 1 - share
+        light = np.ascontiguousarray(light, np.float32)
+        _levels(self.matrices, self.segment_share, light, self.mask, first, out)
         return out
 
     def light(self, levels: FloatImage, rows: slice = ALL) -> FloatImage:
         """The light (rows, columns, 3) float32 of such a colour (rows, columns, 3): the inverse of ``of``."""
         out = np.empty(levels.shape, np.float32)
-        if self._segment is not None:
-            share = self._segment[rows][..., None]
-            common = np.maximum(levels.min(axis=2, keepdims=True), 0)
-            levels = np.asarray((1 - share) * levels + share * common, np.float32)
-        for channel in range(3):
-            parts = (self._light[channel, colour, rows] * levels[..., colour] for colour in range(3))
-            out[..., channel] = sum(parts)
+        first = rows.indices(len(self.mask))[0]
+        _lights(self.matrices, self.segment_share, np.ascontiguousarray(levels, np.float32), first, out)
         return out
 
 
 @compiled(parallel=True)
-def _solve(B: FloatImage, light: FloatImage, mask: Mask, first: int, out: FloatImage) -> None:
-    """Cramer's rule at each pixel of ``mask``; ``light`` and ``out`` begin at its row ``first``."""
+def _levels(
+    matrices: FloatImage, segment_share: FloatImage, light: FloatImage, mask: Mask, first: int, out: FloatImage
+) -> None:
+    """``levels_at`` each pixel of ``mask``; ``light`` and ``out`` begin at its row ``first``."""
     rows, columns = light.shape[:2]
     for y in prange(rows):
         for x in range(columns):
-            j = first + y
-            if not mask[j, x]:
-                continue
-            a, b, c = B[0, 0, j, x], B[0, 1, j, x], B[0, 2, j, x]
-            d, e, f = B[1, 0, j, x], B[1, 1, j, x], B[1, 2, j, x]
-            g, h, i = B[2, 0, j, x], B[2, 1, j, x], B[2, 2, j, x]
-            r, s, t = light[y, x, 0], light[y, x, 1], light[y, x, 2]
-            det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-            if det == 0.0:
-                out[y, x] = np.inf
-                continue
-            out[y, x, 0] = (r * (e * i - f * h) - b * (s * i - f * t) + c * (s * h - e * t)) / det
-            out[y, x, 1] = (a * (s * i - f * t) - r * (d * i - f * g) + c * (d * t - s * g)) / det
-            out[y, x, 2] = (a * (e * t - s * h) - b * (d * t - s * g) + r * (d * h - e * g)) / det
+            if mask[first + y, x]:
+                found = levels_at(matrices, segment_share, first + y, x, light[y, x, 0], light[y, x, 1], light[y, x, 2])
+                for c in range(3):
+                    out[y, x, c] = found[c]
+
+
+@compiled(parallel=True)
+def _lights(matrices: FloatImage, segment_share: FloatImage, levels: FloatImage, first: int, out: FloatImage) -> None:
+    """``light_at`` each pixel; ``levels`` and ``out`` begin at row ``first``."""
+    rows, columns = levels.shape[:2]
+    for y in prange(rows):
+        for x in range(columns):
+            one, two, three = levels[y, x, 0], levels[y, x, 1], levels[y, x, 2]
+            found = light_at(matrices, segment_share, first + y, x, one, two, three)
+            for c in range(3):
+                out[y, x, c] = found[c]
+
+
+@compiled()
+def levels_at(
+    matrices: FloatImage, segment_share: FloatImage, y: int, x: int, r: np.float32, s: np.float32, t: np.float32
+) -> Colour:
+    """The colour that all projectors would show alike to make the light (r, s, t) at a pixel, by Cramer's rule.
+
+    Infinite where the projectors' colours are not independent. ``matrices``, ``segment_share``: of ``DriveLevels``
+    """
+    B = matrices[:, :, y, x]
+    a, b, c = B[0, 0], B[0, 1], B[0, 2]
+    d, e, f = B[1, 0], B[1, 1], B[1, 2]
+    g, h, i = B[2, 0], B[2, 1], B[2, 2]
+    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if det == 0:
+        infinite = np.float32(np.inf)
+        return infinite, infinite, infinite
+    one = (r * (e * i - f * h) - b * (s * i - f * t) + c * (s * h - e * t)) / det
+    two = (a * (s * i - f * t) - r * (d * i - f * g) + c * (d * t - s * g)) / det
+    three = (a * (e * t - s * h) - b * (d * t - s * g) + r * (d * h - e * g)) / det
+    if segment_share.shape[0]:
+        # what is below none has no white in it
+        share = segment_share[y, x]
+        white = share * max(min(one, two, three), np.float32(0))
+        own = np.float32(1) - share
+        return (one - white) / own, (two - white) / own, (three - white) / own
+    return one, two, three
+
+
+@compiled()
+def light_at(
+    matrices: FloatImage, segment_share: FloatImage, y: int, x: int, one: np.float32, two: np.float32, three: np.float32
+) -> Colour:
+    """The light of such a colour at a pixel: the inverse of ``levels_at``."""
+    if segment_share.shape[0]:
+        share = segment_share[y, x]
+        white = share * max(min(one, two, three), np.float32(0))
+        own = np.float32(1) - share
+        one, two, three = own * one + white, own * two + white, own * three + white
+    B = matrices[:, :, y, x]
+    return (
+        B[0, 0] * one + B[0, 1] * two + B[0, 2] * three,
+        B[1, 0] * one + B[1, 1] * two + B[1, 2] * three,
+        B[2, 0] * one + B[2, 1] * two + B[2, 2] * three,
+    )

@@ -28,17 +28,22 @@ REACH: Final = 0.04
 ROUNDS: Final = 60
 SOFT_CELLS: Final = 0.7
 """Standard deviation of the last smoothing, in cells."""
+BESIDE: Final = 4
+"""Cells beside the object's that the last smoothing reaches."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothLimits:
     """The cells of one object, for any number of limits.
 
-    ``mask`` (rows, columns) of the object; ``side`` of a cell in pixels; ``cells`` (rows, columns of cells): those with
-    a pixel of the object; ``stiffness`` (cells, cells): springs and tension
+    ``box``: rows and columns of the picture around the object, whole cells; ``mask`` (rows, columns) of the object in
+    it; ``thin``: the side in pixels of what is left out; ``side`` of a cell in pixels; ``cells`` (rows, columns of
+    cells): those with a pixel of the object; ``stiffness`` (cells, cells): springs and tension
     """
 
+    box: tuple[slice, slice]
     mask: Mask
+    thin: int
     side: int
     cells: Mask
     stiffness: Any
@@ -48,21 +53,23 @@ class SmoothLimits:
         """For an object's ``mask`` (rows, columns)."""
         longer = max(mask.shape)
         side = max(LEAST_SIDE_PX, round(CELL * longer))
+        box = _around(mask, side)
+        mask = mask[box]
         cells = np.asarray(_blocks(mask, side).any(axis=2), np.bool_)
         length = REACH * longer / side
         tension = _differences(cells)
         stiffness = sp.identity(tension.shape[1]) + length**2 * (tension.T @ tension)
-        return cls(mask, side, cells, sp.csr_matrix(stiffness))
+        return cls(box, mask, round(THIN * longer) | 1, side, cells, sp.csr_matrix(stiffness))
 
     def above(self, need: FloatImage) -> FloatImage:
         """(rows, columns) float32: a smooth limit above ``need`` of that shape, where this is more than 0; 0 far off.
 
         Narrow obstacles and a twentieth of each cell's pixels may stand out of it.
         """
+        found, need = np.zeros(need.shape, np.float32), need[self.box]
         if not (self.mask & (need > 0)).any():
-            return np.zeros_like(need)
-        thin = round(THIN * max(self.mask.shape)) | 1
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (thin, thin))
+            return found
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (self.thin, self.thin))
         wide = cv2.morphologyEx(
             np.where(self.mask, need, 0).astype(np.float32), cv2.MORPH_OPEN, disc,
             borderType=cv2.BORDER_CONSTANT, borderValue=0,
@@ -71,7 +78,8 @@ class SmoothLimits:
         obstacle = _quantile(_blocks(wide, self.side)[self.cells], inside, QUANTILE)
         lying = np.zeros(self.cells.shape, np.float32)
         lying[self.cells] = lowest_above(self.stiffness, obstacle)
-        return self._on_pixels(lying)
+        found[self.box] = self._on_pixels(lying)
+        return found
 
     def _on_pixels(self, values: FloatImage) -> FloatImage:
         """Values of cells, interpolated over those that hold a pixel of the object."""
@@ -84,6 +92,16 @@ class SmoothLimits:
             value, share = (cv2.remap(one, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in soft)
             found[part] = np.where(self.mask[part], value / np.maximum(share, np.float32(1e-3)), 0)
         return found
+
+
+def _around(mask: Mask, side: int) -> tuple[slice, slice]:
+    """Rows and columns of whole cells around a mask, with as many more as the last smoothing reaches."""
+    spans = []
+    for across in (1, 0):
+        at = np.flatnonzero(mask.any(axis=across))
+        first, last = (0, -1) if at.size == 0 else (int(at[0]) // side - BESIDE, int(at[-1]) // side + BESIDE)
+        spans.append(slice(max(first, 0) * side, min((last + 1) * side, mask.shape[1 - across])))
+    return spans[0], spans[1]
 
 
 def lowest_above(stiffness: Any, obstacle: Float64) -> Float64:
