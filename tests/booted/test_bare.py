@@ -56,6 +56,13 @@ def test_a_service_that_is_broken_into_can_do_little_on_this_debian(bare: Kiosk,
     print(bare.machine.call("systemd-analyze", "security", "--no-pager", most, service).splitlines()[-1])
 
 
+def test_a_graphics_processor_could_solve_on_this_debian(bare: Kiosk) -> None:
+    """None is plugged in; the program that would use one is there, and looks for it."""
+    program = "from controller.solve.engines.graphics import graphics_sentence; print(graphics_sentence())"
+    said = bare.machine.call("/opt/velatura/bin/python", "-c", program, user="velatura")
+    assert said.strip() == "Solves run on the processor: no graphics processor was found."
+
+
 def test_a_dry_run_tells_what_is_done(bare: Kiosk) -> None:
     done = [line for line in bare.told.splitlines() if line.startswith(("write", "useradd", "usermod", "make"))]
     later = ("/etc/X11/xorg.conf.d/20-velatura-outputs.conf", "/var/lib/velatura/player.options")
