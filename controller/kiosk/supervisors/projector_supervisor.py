@@ -24,6 +24,8 @@ PATIENCE_S: Final = 15.0
 """A projector counts as lost when it has been silent for this long."""
 MOST_STRIKES: Final = 3
 """Failed attempts to light the lamp in a row, after which it stays off until the next opening."""
+LINE_WELL_S: Final = 60.0
+"""A line that answered for so long is well: a last attempt that had no answer is made again."""
 REOPEN_AFTER_FAULT_S: Final = 120.0
 """A projector that reported a fault is reopened after this time: many report a fault, but never its end."""
 LIGHT_MARGIN_S: Final = 30.0
@@ -77,6 +79,9 @@ class ProjectorSupervisor:
         """Since when its light is awaited: the attempt, then the first answer that it warms up."""
         self._warms = False
         self._failed_strikes = failed
+        self._unanswered = False
+        """Whether the last attempt had neither an answer nor an effect: the projector may never have received it."""
+        self._answers_since_s: float | None = None
         self._burning = False
         self._faulty_since_s: float | None = None
 
@@ -108,12 +113,12 @@ class ProjectorSupervisor:
             self._failed_strikes = min(self._failed_strikes, MOST_STRIKES - 1)
             self._keep_forgiven(MOST_STRIKES - 1)
         if wanted and not self._want_lit:
-            self._faulty_since_s = float("-inf")
+            self._faulty_since_s, self._unanswered = float("-inf"), False
         self._want_lit = wanted
 
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
-        self._failed_strikes, self._faulty_since_s = 0, float("-inf")
+        self._failed_strikes, self._faulty_since_s, self._unanswered = 0, float("-inf"), False
         self._keep_forgiven(0)
 
     def step(self) -> None:
@@ -142,6 +147,8 @@ class ProjectorSupervisor:
             self._silent(error)
             return
         self._silent_since_s = None
+        if self._answers_since_s is None:
+            self._answers_since_s = self._clock.now_s()
         # Read late: opening the line takes seconds, and the lamp may not be wanted any more.
         wanted = self._want_lit
         try:
@@ -152,6 +159,7 @@ class ProjectorSupervisor:
             else:
                 self._darken(guard, status)
         except (DeviceError, VelaturaError) as error:
+            self._answers_since_s = None
             self._see(self._view.condition, status, _decision(error))
         self._keep_failed(guard)
 
@@ -185,6 +193,7 @@ class ProjectorSupervisor:
 
     def _silent(self, error: DeviceError | VelaturaError) -> None:
         now_s = self._clock.now_s()
+        self._answers_since_s = None
         if self._silent_since_s is None:
             self._silent_since_s = now_s
         guard = self._guard
@@ -220,6 +229,9 @@ class ProjectorSupervisor:
     # -- lit
 
     def _light(self, guard: LampGuard, status: ProjectorStatus) -> None:
+        if status.power in (Power.ON, Power.WARMING, Power.COOLING):
+            # It received the command, whatever became of its answer.
+            self._unanswered = False
         if status.power is Power.FAULT or fatal_faults(status):
             if status.power in (Power.ON, Power.WARMING):
                 guard.switch_off(deadline=self._deadline(guard.switch_s))
@@ -271,7 +283,7 @@ class ProjectorSupervisor:
             if now_s - self._struck_at_s <= self._light_limit_s(guard):
                 return self._see(Condition.LIGHTING, status, self._awaited)
             self._strike_failed()
-        if self._failed_strikes >= MOST_STRIKES:
+        if self._failed_strikes >= MOST_STRIKES and not self._one_more():
             return self._see(Condition.BROKEN, status, _unlit(self.name))
         strikes = guard.use().strikes
         try:
@@ -283,14 +295,19 @@ class ProjectorSupervisor:
         except DeviceError:
             # The projector may have received the command: without its answer, too, this is an attempt.
             if guard.use().strikes > strikes:
-                self._struck_at_s, self._warms = now_s, False
+                self._struck_at_s, self._warms, self._unanswered = now_s, False, True
             raise
         except VelaturaError as error:
             # The lamp counter can't be saved, so the lamp was not switched on.
             return self._see(Condition.BROKEN, status, _unrecorded(error))
-        self._struck_at_s, self._warms = now_s, False
+        self._struck_at_s, self._warms, self._unanswered = now_s, False, False
         self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
         return self._see(Condition.LIGHTING, status, self._awaited)
+
+    def _one_more(self) -> bool:
+        """Whether the last attempt is made again: the projector seems not to have received it, and its line is well."""
+        well_s = 0.0 if self._answers_since_s is None else self._clock.now_s() - self._answers_since_s
+        return self._unanswered and self._failed_strikes == MOST_STRIKES and well_s >= LINE_WELL_S
 
     def _went_dark(self, status: ProjectorStatus) -> None:
         if self._burning:

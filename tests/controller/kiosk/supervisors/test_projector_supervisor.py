@@ -17,7 +17,7 @@ from controller.kiosk.supervisors.projector_supervisor import (
 from controller.rig.lamp_guard import LampGuard
 from controller.rig.lamp_ledger import LampFile, LampLedger, LampRecord
 from hal.deadline import Deadline
-from hal.errors import DeviceGone, DeviceTimeout
+from hal.errors import DeviceGone, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import FragileLamp
 from tests.controller.rig.lamp_model import RULES, Shelf, World
@@ -52,6 +52,25 @@ class LateLamp(FragileLamp):
     def switch_on(self, *, deadline: Deadline) -> None:
         super().switch_on(deadline=deadline)
         raise DeviceTimeout("projector-not-confirmed", what="It did not switch in time.", remedy="Check its cable.")
+
+
+class DeafLamp(FragileLamp):
+    """Never receives a command while it is ``deaf``; if ``garbled``, a third of its answers are none either."""
+
+    deaf, garbled = True, False
+    commands = asked = 0
+
+    def status(self, *, deadline: Deadline) -> ProjectorStatus:
+        self.asked += 1
+        if self.garbled and self.asked % 3 == 0:
+            raise ProtocolError("answer-wrong", what="That was no answer.", remedy="Check its cable.")
+        return super().status(deadline=deadline)
+
+    def switch_on(self, *, deadline: Deadline) -> None:
+        self.commands += 1
+        if self.deaf:
+            raise DeviceTimeout("projector-not-confirmed", what="It did not switch in time.", remedy="Check its cable.")
+        super().switch_on(deadline=deadline)
 
 
 class SlowToStart(FragileLamp):
@@ -202,6 +221,28 @@ def test_a_dead_lamp_whose_projector_answers_late_is_struck_as_often_as_any() ->
     assert kept.run(2 * 3600) is Condition.BROKEN
     assert kept.lamp.strikes == MOST_STRIKES
     assert kept.codes.count("lamp-given-up") == 1
+
+
+def test_a_lamp_that_heard_no_command_through_a_bad_line_lights_once_the_line_is_well() -> None:
+    kept = Kept(DeafLamp)
+    lamp = kept.lamp
+    assert isinstance(lamp, DeafLamp)
+    lamp.garbled = True
+    kept.supervisor.want_lit = True
+    kept.run(900.0)
+    assert kept.codes.count("lamp-given-up") == 1
+    assert lamp.strikes == 0
+    lamp.deaf = lamp.garbled = False
+    assert kept.run(180.0) is Condition.LIT
+    assert lamp.strikes == 1
+
+
+def test_a_lamp_that_never_hears_a_command_is_given_up_after_one_attempt_more() -> None:
+    kept = Kept(DeafLamp)
+    kept.supervisor.want_lit = True
+    assert kept.run(2 * 3600) is Condition.BROKEN
+    assert isinstance(kept.lamp, DeafLamp)
+    assert kept.lamp.commands == MOST_STRIKES + 1
 
 
 def test_a_lamp_whose_projector_answers_late_lights_by_one_strike() -> None:
