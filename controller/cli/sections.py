@@ -13,8 +13,8 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Set up a stage": ("demo", "plan", "init", "doctor", "aim", "identify", "camera", "keys", "settings", "account"),
     "Calibrate": ("calibrate", "recalibrate", "drift", "results", "report", "export"),
     "Make appearances": (
-        "appearance", "compute", "reach", "reach-picture", "feasibility", "photograph", "compare", "appearances",
-        "remove", "view", "bundle",
+        "appearance", "compute", "reach", "reach-picture", "computed-preview", "computed-picture", "feasibility",
+        "photograph", "compare", "appearances", "remove", "view", "bundle",
     ),
     "Show them": (
         "play", "live", "show", "rotate", "next", "black", "pause", "brightness", "start", "stop", "schedule",
