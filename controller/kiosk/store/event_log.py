@@ -320,6 +320,7 @@ class EventLog:
         if str(path) != ":memory:":
             path.parent.mkdir(parents=True, exist_ok=True)
         database = self._connect(path, check_same_thread=False, timeout=2.0)
+        database.text_factory = _text
         try:
             database.execute("PRAGMA journal_mode=WAL")
             # A finished task must not run again after a power cut.
@@ -364,6 +365,14 @@ class EventLog:
         except sqlite3.Error as error:
             self.problem, self._torn = str(error), self._torn or _is_corrupt(error)
         return rows
+
+
+def _text(stored: bytes) -> str | None:
+    """None for what is no text: such a row is torn, and SQLite's own error would hide all rows behind it."""
+    try:
+        return stored.decode()
+    except UnicodeDecodeError:
+        return None
 
 
 def _without_write_ahead_log(database: sqlite3.Connection) -> None:

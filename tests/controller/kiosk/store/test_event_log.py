@@ -142,6 +142,24 @@ def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk
     log.close()
 
 
+def test_a_log_with_a_row_that_is_no_text_keeps_the_others_in_another_file(tmp_path: Path) -> None:
+    path = tmp_path / EventLog.FILE
+    log = EventLog(path, durable=False)
+    for text in ("One.", "Two, the one that is damaged.", "Three."):
+        log.add(Decision("before", text))
+    log.close()
+    content = path.read_bytes()
+    at = content.index(b"the one that")
+    path.write_bytes(content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + 12]) + content[at + 12 :])
+    log = EventLog(path, durable=False)
+    log.add(Decision("after", "Four."))
+    log.close()
+    assert len(list(path.parent.glob("*.damaged-*"))) == 1
+    log = EventLog(path, durable=False)
+    assert [row.text for row in log.after(0)] == ["One.", "Three.", "Four."]
+    log.close()
+
+
 @pytest.mark.parametrize("length", [50, 5000])
 def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length: int) -> None:
     path = tmp_path / EventLog.FILE
