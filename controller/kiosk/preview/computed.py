@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.storage import write_atomically
-from controller.kiosk.preview.reach import FOLDER
+from controller.kiosk.preview.reach import kept_at
 from controller.kiosk.values import Computed
 from controller.solve.engines.graphics import MODULE
 from controller.stage.calibrations import finished_calibration
@@ -57,10 +57,8 @@ class ComputedPreviews:
         table = checked.stage.tables.solve
         run = finished_calibration(checked.stage.folder)
         if not self.possible(checked):
-            raise UsageError(NO_DEVICE, what="This computer has no graphics processor that can solve.",
-                             remedy="Use the quick preview, or compute the appearance.")  # fmt: skip
-        folder = checked.stage.folder / FOLDER / target.stem[:64]
-        about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": repr(table)}
+            raise no_device()
+        folder, about = kept_at(checked, run, target)
         with self._one_at_a_time:
             if (known := _kept(folder, about)) is not None:
                 return known
@@ -151,6 +149,11 @@ class ComputedPreviews:
             self._idle = threading.Timer(IDLE_S, self.end)
             self._idle.daemon = True
             self._idle.start()
+
+
+def no_device() -> UsageError:
+    return UsageError(NO_DEVICE, what="This computer has no graphics processor that can solve.",
+                      remedy="Use the quick preview, or compute the appearance.")  # fmt: skip
 
 
 def _ended() -> WorkError:

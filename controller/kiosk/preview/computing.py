@@ -26,6 +26,7 @@ from controller.artefacts.calibrated import Calibrated
 from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
+from controller.kiosk.preview.computed import no_device
 from controller.kiosk.preview.pictures import write_picture
 from controller.kiosk.store.targets import fitted, png_size
 from controller.report.pictures import to_screen
@@ -68,14 +69,9 @@ class Solver:
 
     def __init__(self, stage: Stage) -> None:
         table = SolveTable.model_validate(stage.solve)
-        self._notes: list[str] = []
-        engine = choose_engine(table.device, self._notes.append)
+        engine = choose_engine(table.device, lambda note: None)
         if isinstance(engine, Processor):
-            raise UsageError(
-                "no-graphics-processor",
-                what="This computer has no graphics processor that can solve.",
-                remedy="Use the quick preview, or compute the appearance.",
-            )
+            raise no_device()
         self._device = engine.name
         self._options = options_of(table)
         self._calibrated = Calibrated(Path(stage.run), stage.names, engine)

@@ -38,9 +38,8 @@ def reach(checked: Checked, target: Path) -> Reach:
 
     Raises UsageError("not-calibrated", "target-unreadable"), WorkError("no-light", "no-space").
     """
-    folder = checked.stage.folder / FOLDER / target.stem[:64]
     run = finished_calibration(checked.stage.folder)
-    about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": repr(checked.stage.tables.solve)}
+    folder, about = kept_at(checked, run, target)
     with _one_at_a_time:
         if (known := _kept(folder, about)) is not None:
             return known
@@ -48,6 +47,13 @@ def reach(checked: Checked, target: Path) -> Reach:
         found = _made(checked, run, target, folder)
         write_atomically(folder / FIGURES, json.dumps({"of": about, "shares": _shares(found)}).encode())
         return found
+
+
+def kept_at(checked: Checked, run: Path, target: Path) -> tuple[Path, dict[str, Any]]:
+    """The folder of a target's previews, and what they depend on: others are made where it differs."""
+    solve = repr(checked.stage.tables.solve)
+    about = {"run": run.name, "changed_ns": target.stat().st_mtime_ns, "solve": solve}
+    return checked.stage.folder / FOLDER / target.stem[:64], about
 
 
 def _shares(found: Reach) -> dict[str, float]:
