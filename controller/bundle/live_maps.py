@@ -34,7 +34,8 @@ class OutputMaps:
     """One output's maps.
 
     ``base`` (rows, columns, 3) uint16 over ``base_range``; ``centre`` (rows, columns, 2) uint16; ``shape``
-    (rows, columns, 3) uint8; ``unmix`` (3, 3); ``response`` (3, 256); ``dither`` (rows, columns) into the tile.
+    (rows, columns, 3) uint8; ``unmix`` (3, 3); ``response`` (3, 256); ``dither`` (rows, columns) into the tile;
+    ``segment``: share of white that a white segment makes, 0 without one, below 1.
     """
 
     name: str
@@ -45,6 +46,7 @@ class OutputMaps:
     unmix: Float
     response: Float
     dither: tuple[int, int]
+    segment: float = 0.0
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -54,11 +56,12 @@ class OutputMaps:
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """As a bundle holds them, by key."""
-        return {
+        arrays: dict[str, npt.NDArray[Any]] = {
             "base": self.base, "range": np.array(self.base_range, np.float32), "centre": self.centre,
             "shape": self.shape, "unmix": self.unmix, "response": self.response,
             "dither": np.array(self.dither, np.uint16),
         }  # fmt: skip
+        return arrays | ({"segment": np.array([self.segment], np.float32)} if self.segment else {})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +90,10 @@ class LiveMaps:
         live = bundle.index.live
         assert live is not None
         width, height = live.target_px
-        outputs = tuple(_output(bundle, o.name, (o.width_px, o.height_px)) for o in bundle.index.outputs)
+        outputs = tuple(
+            _output(bundle, o.name, (o.width_px, o.height_px), segmented=f"{o.name}.segment" in live.arrays)
+            for o in bundle.index.outputs
+        )
         found = cls(
             (width, height), gain, bundle.live_array("offset"), bundle.live_array("present"),
             float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
@@ -123,17 +129,20 @@ def _indirect(bundle: Bundle, size: tuple[int, int]) -> LiveIndirect:
         raise damaged(str(wrong)) from wrong
 
 
-def _output(bundle: Bundle, name: str, size_px: tuple[int, int]) -> OutputMaps:
+def _output(bundle: Bundle, name: str, size_px: tuple[int, int], *, segmented: bool) -> OutputMaps:
     def array(key: str, shape: tuple[int, ...], dtype: str) -> npt.NDArray[Any]:
         return _shaped(bundle.live_array(f"{name}.{key}"), shape, dtype, key)
 
     columns, rows = size_px
     low, high = map(float, array("range", (2,), "f4"))
     down, along = (int(value) % TILE for value in array("dither", (2,), "u2"))
+    segment = float(array("segment", (1,), "f4")[0]) if segmented else 0.0
+    if not 0 <= segment < 1:
+        raise damaged(f"the array {name}.segment of its live section is {segment:g}, not 0 or more and below 1")
     return OutputMaps(
         name, array("base", (rows, columns, 3), "u2"), (low, high), array("centre", (rows, columns, 2), "u2"),
         array("shape", (rows, columns, 3), "u1"), array("unmix", (3, 3), "f4"), array("response", (3, 256), "f4"),
-        (down, along),
+        (down, along), segment,
     )  # fmt: skip
 
 
@@ -199,14 +208,19 @@ def _frame(maps: LiveMaps, output: OutputMaps, scale: Float) -> Bytes:
     frame: Bytes = np.empty(output.base.shape, np.uint8)
     means = _means(maps, output, scale) * base_light(output)
     rows, columns = frame.shape[:2]
+    own = _own_light(np.clip(means @ output.unmix.T, 0, 1), output.segment)
     for channel in range(3):
-        u = output.unmix[channel]
-        part = u[0] * means[..., 0] + u[1] * means[..., 1] + u[2] * means[..., 2]
-        level = device_level(np.clip(part, 0, 1), output.response[channel])
+        level = device_level(own[..., channel], output.response[channel])
         below = np.floor(level)
         limit = thresholds(maps.noise, output, channel)[np.ix_(np.arange(rows) % TILE, np.arange(columns) % TILE)]
         frame[..., channel] = np.where(level - below > limit, below + 1, below)
     return frame
+
+
+def _own_light(shown: Float, segment: float) -> Float:
+    """What the channels make of light (..., 3) where a white segment makes a share of what they have in common."""
+    share = np.float32(segment)
+    return np.asarray((shown - share * shown.min(axis=-1, keepdims=True)) / (1 - share), np.float32)
 
 
 def thresholds(noise: Float, output: OutputMaps, channel: int) -> Float:

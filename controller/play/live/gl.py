@@ -137,6 +137,7 @@ class LiveRenderer:
         matrix = (gl.GLfloat * 9)(*values.unmix.ravel())
         gl.glUniformMatrix3fv(program.at("unmix"), 1, gl.GL_TRUE, matrix)
         gl.glUniform2f(program.at("range"), *values.base_range)
+        gl.glUniform1f(program.at("segment"), values.segment)
         gl.glUniform2i(program.at("phase"), values.dither[1], values.dither[0])
         _draw_to(into, *values.size_px)
 

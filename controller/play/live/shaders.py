@@ -61,6 +61,7 @@ uniform usampler2D centre;
 uniform usampler2D shape;
 uniform mat3 unmix;
 uniform vec2 range;
+uniform float segment;
 uniform ivec2 phase;
 
 float response(int channel, int level) { return texelFetch(tables, ivec2(level, 2 + channel), 0).r; }
@@ -104,9 +105,10 @@ float device(int channel, float wanted, ivec2 at) {
 void main() {
     ivec2 at = ivec2(gl_FragCoord.xy);
     vec3 light = range.x + vec3(texelFetch(base, at, 0).rgb) / 65535.0 * (range.y - range.x);
-    vec3 wanted = clamp(unmix * (mean(at) * light), 0.0, 1.0);
-    colour = vec4(device(0, wanted.r, at), device(1, wanted.g, at), device(2, wanted.b, at), 1.0);
+    vec3 shown = clamp(unmix * (mean(at) * light), 0.0, 1.0);
+    vec3 own = (shown - segment * min(shown.r, min(shown.g, shown.b))) / (1.0 - segment);
+    colour = vec4(device(0, own.r, at), device(1, own.g, at), device(2, own.b, at), 1.0);
 }
 """
 """Steps 2 and 3: P_s, P_b x P_s, and its device values. ``phase`` is (columns, rows); ``tables`` has light and sigma
-in its first two rows, then the response."""
+in its first two rows, then the response; ``segment`` is 0 where the projector has no white segment."""

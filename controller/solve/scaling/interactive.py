@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.bundle.live_indirect import LiveIndirect, between
 from controller.bundle.live_maps import (
     FULL,
     LiveMaps,
@@ -35,7 +34,6 @@ from controller.solve.appearance import Base
 from controller.solve.bounded.solver import check_target
 from controller.solve.scaling.kernels import (
     MARGIN,
-    ReflectedLight,
     scale_picture,
     scale_plainly,
     scale_twos,
@@ -44,6 +42,7 @@ from controller.solve.scaling.kernels import (
     small_picture,
     sums_of,
 )
+from controller.solve.scaling.reflected import NOTHING, ReflectedLight, Surfaces
 from controller.solve.scaling.stage_maps import reduction, scaling_maps
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
@@ -58,7 +57,7 @@ class _Output:
     """One projector, ready.
 
     ``at`` (pixels,) int32: first block of the window, -1 for a pixel that stays dark; ``shares`` (pixels x 16) uint8
-    ``gain`` (3 pixels + 1,) float32; ``unmix`` (12,) float32, by columns of four
+    ``gain`` (3 pixels + 1,) float32; ``unmix`` (12,) float32, by columns of four; ``segment``: as of ``OutputMaps``
     ``levels`` (3 x (STEPS + 1),) uint16: 256 times the device value; ``noise`` (64 x 64 x 3,) uint8
     """
 
@@ -68,6 +67,7 @@ class _Output:
     shares: ByteImage
     gain: FloatImage
     unmix: FloatImage
+    segment: np.float32
     levels: npt.NDArray[np.uint16]
     noise: ByteImage
 
@@ -89,11 +89,12 @@ class Interactive:
         blocks = (self._size[0] + 2 * MARGIN) * self._side
         self._scale = np.zeros(4 * blocks + 16, np.float32)
         # radiance to scale; one float more, because four are read where three are meant
-        self._gain = _padded(maps.gain.astype(np.float32) * brightness_factor(maps, 1.0))
+        gain = maps.gain.astype(np.float32)
+        self._gain = _padded(gain * brightness_factor(maps, 1.0))
         self._offset = _padded(maps.offset.astype(np.float32))
         self._paint = np.zeros(0, np.float32) if maps.paint is None else maps.paint.astype(np.float32).ravel()
         self._used = _used(maps)
-        self._reflected = _reflected(maps)
+        self._surfaces = None if maps.indirect is None else Surfaces(maps.indirect, gain)
         self._outputs = tuple(self._prepared(output) for output in maps.outputs)
         self._table = light_table()
 
@@ -134,22 +135,21 @@ class Interactive:
         )
         light = np.float32(brightness) * self._table
         pixels = np.ascontiguousarray(picture, np.uint8)
-        indirect, reflected = self.maps.indirect, self._reflected
-        if indirect is not None:
-            reflected = _with(reflected, indirect, light[indirect.samples(pixels)])
+        surfaces = self._surfaces
+        reflected = NOTHING if surfaces is None else surfaces.reflect(light[surfaces.samples(pixels)])
         maps = self._gain, self._offset, self._used
         scale_picture(pixels, light, self._block, *maps, self._side, self._scale, reflected, self._paint)
         self._show(into)
 
     def _of(self, light: FloatImage) -> ReflectedLight:
         """What surfaces throw back where a radiance (height, width, 3) of the targets' size is seen."""
-        indirect = self.maps.indirect
-        return self._reflected if indirect is None else _with(self._reflected, indirect, indirect.samples(light))
+        surfaces = self._surfaces
+        return NOTHING if surfaces is None else surfaces.reflect(surfaces.samples(light))
 
     def _show(self, into: Sequence[ByteImage]) -> None:
         for output, frame in zip(self._outputs, into, strict=True):
-            show(self._scale, self._side, output.at, output.shares, output.gain, output.unmix, output.levels,
-                 output.noise, output.columns, frame.reshape(-1))  # fmt: skip
+            show(self._scale, self._side, output.at, output.shares, output.gain, output.unmix,
+                 output.segment, output.levels, output.noise, output.columns, frame.reshape(-1))  # fmt: skip
 
     def _prepared(self, output: OutputMaps) -> _Output:
         width, height = self.maps.target_px
@@ -170,7 +170,8 @@ class Interactive:
         noise = np.stack([thresholds(self.maps.noise, output, c) for c in range(3)], -1)
         return _Output(
             output.size_px[1], output.size_px[0], at, shares.ravel(), _padded(gain), unmix.ravel(),
-            _levels(output.response), np.asarray(255 - np.floor(256 * noise), np.uint8).ravel(),
+            np.float32(output.segment), _levels(output.response),
+            np.asarray(255 - np.floor(256 * noise), np.uint8).ravel(),
         )  # fmt: skip
 
     def _present(self) -> FloatImage:
@@ -213,23 +214,6 @@ def _used(maps: LiveMaps) -> npt.NDArray[np.int32]:
     found = lit.any(axis=1)
     first, last = lit.argmax(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1)
     return np.stack([np.where(found, first, 0), np.where(found, last, 0)], 1).astype(np.int32)
-
-
-def _reflected(maps: LiveMaps) -> ReflectedLight:
-    """Without what falls, which differs from picture to picture."""
-    empty = np.zeros(0, np.float32)
-    indirect, gain = maps.indirect, maps.gain.astype(np.float32)
-    if indirect is None:
-        return ReflectedLight(empty, np.zeros((0, 0), np.float32), np.zeros(0, np.int32), empty)
-    surface = np.divide(indirect.surface.astype(np.float32), gain, out=np.zeros_like(gain), where=gain > 0)
-    rows = between(maps.target_px[1], indirect.grid[0], indirect.side)
-    return ReflectedLight(surface.ravel(), np.zeros((indirect.grid[0], 3 * maps.target_px[0]), np.float32), *rows)
-
-
-def _with(reflected: ReflectedLight, indirect: LiveIndirect, light: FloatImage) -> ReflectedLight:
-    """With what falls where samples have that radiance."""
-    across = indirect.across(indirect.falling(light))
-    return reflected._replace(falling=across.reshape(len(across), -1))
 
 
 def _padded(values: FloatImage) -> FloatImage:

@@ -6,7 +6,7 @@ around it, so that no window ends outside.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,8 @@ from numba import prange
 from controller.bundle.live_maps import MOST_CORRELATION, MOST_RADIUS_PX, REACH, TILE
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
-from controller.transport.simd.scaling import SIDE, STEPS, Index, scale_of_four, scale_of_one, window_steps
+from controller.solve.scaling.reflected import ReflectedLight, reflected_row
+from controller.transport.simd.scaling import SIDE, STEPS, Index, own_steps, scale_of_four, scale_of_one, window_steps
 
 MARGIN: Final = SIDE
 LEVELS: Final = STEPS + 1
@@ -23,34 +24,6 @@ LEVELS: Final = STEPS + 1
 _REACH, _RADIUS, _CORRELATION = np.float32(REACH), np.float32(MOST_RADIUS_PX), np.float32(MOST_CORRELATION)
 
 Used = npt.NDArray[np.int32]
-
-
-class ReflectedLight(NamedTuple):
-    """Light by way of other surfaces, as the loops take it off the wanted light; of no size where there is none.
-
-    ``surface`` (3 x target pixels,): what a pixel makes of falling light; ``falling`` (grid rows, 3 x columns): that
-    light in the rows of blocks' middles; ``up``, ``part_up``: the row of blocks before each row of the target, and the
-    part of the way to the next
-    """
-
-    surface: FloatImage
-    falling: FloatImage
-    up: npt.NDArray[np.int32]
-    part_up: FloatImage
-
-
-@compiled()
-def reflected_row(reflected: ReflectedLight, row: int, first: Index, last: Index, out: FloatImage) -> None:
-    """Light by way of other surfaces in a row of the target, at columns ``first`` to ``last``; ``out`` is a row."""
-    i, part, values = np.int64(reflected.up[row]), reflected.part_up[row], reflected.falling.shape[1]
-    # slices that begin with the first element: an index that might be negative can't be vectorised
-    start, end = 3 * first, 3 * last
-    above = reflected.falling[i, start:end]
-    below = reflected.falling[min(i + 1, reflected.falling.shape[0] - 1), start:end]
-    surface = reflected.surface[row * values + start : row * values + end]
-    taken = out[start:end]
-    for k in range(taken.size):
-        taken[k] = surface[k] * (above[k] + part * (below[k] - above[k]))
 
 
 @compiled(parallel=True)
@@ -230,12 +203,16 @@ def show(
     shares: ByteImage,
     gain: FloatImage,
     unmix: FloatImage,
+    segment: np.float32,
     levels: npt.NDArray[np.uint16],
     noise: ByteImage,
     columns: int,
     out: ByteImage,
 ) -> None:
-    """Each pixel's mean of the scale, times its base, unmixed, through the response, dithered. All arrays flat."""
+    """Each pixel's mean of the scale, times its base, unmixed, through the response, dithered. All arrays flat.
+
+    ``segment``: as of ``OutputMaps``
+    """
     for y in prange(at.size // columns):
         tile = np.int64(y & (TILE - 1)) * (3 * TILE)
         for x in range(columns):
@@ -243,7 +220,9 @@ def show(
             i, k = np.uint64(y * columns + x), np.uint64(tile + 3 * (x & (TILE - 1)))
             first = np.int64(at[i])
             r = g = b = np.int64(0)
-            if first >= 0:
+            if first >= 0 and segment > 0:
+                r, g, b = own_steps(scale, first, side, shares, np.int64(i), gain, unmix, segment)
+            elif first >= 0:
                 r, g, b = window_steps(scale, first, side, shares, np.int64(i), gain, unmix)
             j, bits = np.uint64(3) * i, np.uint32(8)
             green, blue = np.uint64(g) + np.uint64(LEVELS), np.uint64(b) + np.uint64(2 * LEVELS)

@@ -20,7 +20,6 @@ from controller.bundle.live_maps import FULL, TILE, LiveMaps, OutputMaps, packed
 from controller.calibrate.values import Radiometry
 from controller.capture.encoding import checked_response
 from controller.core.arrays import FloatImage
-from controller.core.errors import WorkError
 from controller.solve.appearance import Base
 from controller.solve.scaling.dither import blue_noise
 from controller.solve.scaling.indirect_maps import indirect_maps, paint_map
@@ -54,14 +53,8 @@ def scaling_maps(
     One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``;
     means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6). ``indirect``: light
     by way of other surfaces, which is left out of what the projectors make, and colours that depend on the paint.
-    Raises UsageError("response-not-rising"), WorkError("live-white-segment").
+    Raises UsageError("response-not-rising").
     """
-    if any(radiometry.segment for radiometry in radiometries):
-        raise WorkError(
-            "live-white-segment",
-            what="A projector adds white light of its own. Live targets can't be calculated for it.",
-            remedy="Switch off its brilliant-colour and white-boost modes and calibrate again, or solve appearances.",
-        )
     factor = reduction(transport.camera_shape, largest_px)
     lit = base.inverse > 0
     unit = float(np.median(1 / base.inverse[lit])) if lit.any() else 1.0
@@ -108,7 +101,7 @@ def _output_maps(
                 np.asarray(np.rint(FULL * scaled), np.uint16), (low, high),
                 places[span].reshape(*size, 2), shapes[span].reshape(*size, 3),
                 np.linalg.inv(transport.mixing[n].astype(np.float64)).astype(np.float32),
-                checked_response(radiometry.response), (17 * n % TILE, 29 * n % TILE),
+                checked_response(radiometry.response), (17 * n % TILE, 29 * n % TILE), radiometry.segment,
             )
         )  # fmt: skip
     return tuple(outputs)

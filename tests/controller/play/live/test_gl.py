@@ -81,6 +81,12 @@ def random_paint(seed: int) -> Arrays:
     return {"paint": np.random.default_rng(seed).normal(0, 0.2, (height, width, 3, 3)).astype(np.float16)}
 
 
+def segments(*shares: float) -> Arrays:
+    """White segments of the outputs."""
+    named = zip(OUTPUTS, shares, strict=True)
+    return {f"{name}.segment": np.array([share], np.float32) for (name, _, _), share in named}
+
+
 def write(path: Path, arrays: Arrays) -> Path:
     frames = {name: np.zeros((rows, columns, 3), np.uint8) for name, columns, rows in OUTPUTS}
     write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS,
@@ -95,8 +101,14 @@ def maps_of(path: Path) -> LiveMaps:
 
 @pytest.mark.parametrize(
     ("seed", "more"),
-    [(1, {}), (2, random_indirect(2)), (3, random_paint(3)), (4, random_indirect(4) | random_paint(4))],
-    ids=["direct", "indirect", "paint", "both"],
+    [
+        (1, {}),
+        (2, random_indirect(2)),
+        (3, random_paint(3)),
+        (4, random_indirect(4) | random_paint(4)),
+        (5, segments(0.2, 0.55)),
+    ],
+    ids=["direct", "indirect", "paint", "both", "white segments"],
 )
 def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(
     tmp_path: Path, seed: int, more: Arrays
@@ -122,7 +134,8 @@ def test_frames_by_shaders_are_those_of_the_reference_to_one_device_value(
 
 
 def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path: Path) -> None:
-    arrays = random_live(3)
+    shares = {"P1": 0.0, "P2": 0.3}
+    arrays = random_live(3) | segments(*shares.values())
     maps = maps_of(write(tmp_path / "live.vel", arrays))
     target = np.random.default_rng(3).integers(0, 256, (*TARGET[::-1], 3), dtype=np.uint8)
     frames = compensate(maps, target, 0.9)
@@ -147,7 +160,9 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
             mean = (weight[..., None] * scale).sum(axis=(0, 1)) / below if below > 0 else np.zeros(3)
             low, high = arrays[f"{name}.range"]
             base = low + arrays[f"{name}.base"][row, column] / 65535 * (high - low)
-            light = np.clip(arrays[f"{name}.unmix"] @ (mean * base), 0, 1)
+            shown_light = np.clip(arrays[f"{name}.unmix"] @ (mean * base), 0, 1)
+            own = (shown_light - shares[name] * shown_light.min()) / (1 - shares[name])
+            light = np.minimum(own, 1)  # a colour can be more saturated than the projector shows
             for channel in range(3):
                 table = arrays[f"{name}.response"][channel]
                 shown = int(frames[number][row, column, channel])
@@ -163,6 +178,9 @@ def test_the_reference_is_the_weighted_mean_written_down_pixel_by_pixel(tmp_path
         ("P2.response", np.zeros((3, 255), np.float32)),
         ("unit", np.array([np.nan], np.float32)),
         ("P1.unmix", np.full((3, 3), np.inf, np.float32)),
+        ("P1.segment", np.zeros(2, np.float32)),
+        ("P1.segment", np.ones(1, np.float32)),
+        ("P2.segment", np.full(1, -0.1, np.float32)),
         ("paint", np.zeros((*TARGET, 3, 3), np.float16)),
         ("paint", np.full((*TARGET[::-1], 3, 3), np.nan, np.float16)),
         ("indirect.factors", np.zeros((11, 12), np.float32)),

@@ -236,6 +236,58 @@ def test_a_live_picture_on_paint_that_changes_colours_has_the_wanted_ones() -> N
     assert unknown > 3 * known
 
 
+def segmented(stage: Stage, share: float) -> Stage:
+    """Another white segment in each projector, and a base that knows them."""
+    calibration, _, _ = stage
+    projectors = tuple(
+        dataclasses.replace(part, radiometry=dataclasses.replace(part.radiometry, segment=share * (n + 1)))
+        for n, part in enumerate(calibration.projectors)
+    )
+    calibration = dataclasses.replace(calibration, projectors=projectors)
+    transport = build_transport(calibration)
+    base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-2)
+    return calibration, transport, base
+
+
+@pytest.mark.parametrize("largest_px", [2048, 100], ids=["camera's size", "half of it"])
+def test_the_processor_knows_white_segments_as_the_reference_does(stage: Stage, largest_px: int) -> None:
+    stage = segmented(stage, 0.12)
+    maps = maps_of(stage, largest_px)
+    target, brightness = wanted(stage, largest_px)
+    target[..., 0] //= 2
+    scaler = Interactive(maps)
+    frames = scaler.blank()
+    scaler.show_picture(target, brightness, frames)
+    outputs = tuple(dataclasses.replace(output, segment=0.0) for output in maps.outputs)
+    plain = compensate(dataclasses.replace(maps, outputs=outputs), target, brightness)
+    for n, reference in enumerate(compensate(maps, target, brightness)):
+        lit = maps.outputs[n].shape[..., 0] > 0
+        assert np.abs(reference.astype(int) - plain[n])[lit].mean() > 1, "the segment counts here"
+        assert np.abs(frames[n].astype(int) - reference)[lit].mean() <= 0.75
+
+
+def test_a_live_picture_by_projectors_with_white_segments_has_the_wanted_colours(stage: Stage) -> None:
+    stage = segmented(stage, 0.12)
+    calibration, transport, _ = stage
+    target, brightness = wanted(stage)
+    target[..., 0], target[..., 2] = 200, 120
+    light = light_table()[target] * np.float32(brightness)
+    mask = transport.object_mask & (0.5 * transport.reach() > light).all(axis=2)
+    maps = maps_of(stage)
+    unaware = tuple(dataclasses.replace(output, segment=0.0) for output in maps.outputs)
+    known, unknown = (
+        float(
+            np.median(
+                np.abs((seen(stage, compensate(each, target, brightness)) + calibration.black)[mask] / light[mask] - 1)
+            )
+        )
+        for each in (maps, dataclasses.replace(maps, outputs=unaware))
+    )
+    assert mask.sum() > 1000
+    assert known < 0.03
+    assert unknown > 3 * known
+
+
 def test_a_picture_of_another_size_is_refused_with_both_sizes(stage: Stage) -> None:
     scaler = Interactive(maps_of(stage))
     with pytest.raises(UsageError) as refused:

@@ -91,6 +91,13 @@ def window_light(scale: Array, at: int, side: int, shares: Array, i: int, gain: 
     return np.asarray((total * gain[3 * i : 3 * i + 3]) @ columns)
 
 
+def own_light(light: Double, segment: float) -> Double:
+    """(3,): what three channels make so that, with a white segment's share of their least, they show ``light``."""
+    shown = np.clip(light, 0, 1)
+    common = shown.min()  # the least channel is shown as it is
+    return np.asarray([(value - segment * common) / (1 - segment) for value in shown])
+
+
 def table_steps(light: Double) -> Double:
     """Steps of the device table before they are rounded."""
     return np.asarray(np.sqrt(np.clip(light, 0, 1)) * STEPS)

@@ -104,9 +104,18 @@ def pour_strips(strips: FloatImage, at: int, sums: FloatImage, to: int, side: in
 
 @compiled()
 def window_steps(
-    scale: FloatImage, at: int, side: int, shares: ByteImage, i: int, gain: FloatImage, unmix: FloatImage
+    scale: FloatImage,
+    at: int,
+    side: int,
+    shares: ByteImage,
+    i: int,
+    gain: FloatImage,
+    unmix: FloatImage,
+    segment: np.float32,
 ) -> Any:
-    return scaling.window_steps(scale, at, side, shares, i, gain, unmix)
+    if segment == 0:
+        return scaling.window_steps(scale, at, side, shares, i, gain, unmix)
+    return scaling.own_steps(scale, at, side, shares, i, gain, unmix, segment)
 
 
 @compiled()
@@ -244,9 +253,11 @@ def test_strips_are_filled_and_poured(seed: int, before: int, behind: int, wider
 
 
 @quick
-@given(seed=seeds, wider=spare, pixels=st.integers(1, 5), bright=st.floats(0, 3))
+@given(
+    seed=seeds, wider=spare, pixels=st.integers(1, 5), bright=st.floats(0, 3), segment=st.just(0.0) | st.floats(0, 0.6)
+)
 def test_a_window_of_the_scale_gives_steps_of_the_device_table(
-    seed: int, wider: int, pixels: int, bright: float
+    seed: int, wider: int, pixels: int, bright: float, segment: float
 ) -> None:
     random = np.random.default_rng(seed)
     side, i = scaling.SIDE + wider, int(random.integers(0, pixels))
@@ -256,9 +267,9 @@ def test_a_window_of_the_scale_gives_steps_of_the_device_table(
     gain = np.append(np.abs(floats(random, 3 * pixels)), np.float32(0)) * np.float32(bright / 1000)
     unmix = np.zeros((3, 4), np.float32)
     unmix[:, :3] = np.eye(3) + random.uniform(-0.2, 0.2, (3, 3))
-    steps = np.array(window_steps(scale, first, side, shares, i, gain, unmix.ravel()))
-    light = reference.window_light(scale, first, side, shares, i, gain, unmix.ravel())
-    slack = 1e-6 * (1 + np.abs(light))
+    steps = np.array(window_steps(scale, first, side, shares, i, gain, unmix.ravel(), np.float32(segment)))
+    light = reference.own_light(reference.window_light(scale, first, side, shares, i, gain, unmix.ravel()), segment)
+    slack = 1e-6 * (1 + np.abs(light)) * (1 + segment) / (1 - segment)
     assert (steps >= reference.table_steps(light - slack) - 0.51).all()
     assert (steps <= reference.table_steps(light + slack) + 0.51).all()
 
