@@ -1,11 +1,12 @@
 """How good the simulation is: bugs planted in a copy of the kiosk's code, and how many of them it finds.
 
-    python -m tests.campaigns.planted [--seeds=NAME] [SECONDS] [WORD ...]
+    python -m tests.campaigns.planted [--seeds=NAME] [--log] [SECONDS] [WORD ...]
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
 the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
-WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet. A search that
-fails does not stop the others; the exit code is 1 then.
+WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet; ``--log``: lives
+in which things happen to the event log alone (``log_lives``). A search that fails does not stop the others; the exit
+code is 1 then.
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ PARTS = ("controller", "hal", "plugins", "firmware_configs")
 LIVES = """
 import sys, time
 from controller.simulate.life import Life
+from tests.campaigns.log_lives import lived
 number, days = 0, 0.0
 while time.process_time() < float(sys.argv[1]):
-    outcome = Life(f"{sys.argv[2]}-{number}", 7.0).live()
+    seed = f"{sys.argv[2]}-{number}"
+    outcome = lived(seed) if sys.argv[3] == "log" else Life(seed, 7.0).live()
     number, days = number + 1, days + outcome.at_s / 86400
     if outcome.broken:
         print(f"{outcome.how} (seed {outcome.seed}, after {days:.1f} days)")
@@ -59,14 +62,15 @@ def planted(patch: Path | None, folder: Path) -> Path:
     return folder
 
 
-def search(patch: Path | None, seconds: float, seeds: str = "planted") -> Found:
-    """Live until a promise is broken, or the time is over."""
+def search(patch: Path | None, seconds: float, seeds: str = "planted", kind: str = "usual") -> Found:
+    """Live until a promise is broken, or the time is over; ``kind`` of lives: "usual" or "log"."""
     with tempfile.TemporaryDirectory() as name:
         copy = planted(patch, Path(name))
         before_s = os.times().children_user + os.times().children_system
-        environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+        path = os.pathsep.join([str(copy), str(ROOT)])  # the copy's code first; of ROOT only the tests
+        environment = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
         done = subprocess.run(
-            [sys.executable, "-c", LIVES, str(seconds), seeds],
+            [sys.executable, "-c", LIVES, str(seconds), seeds, kind],
             cwd=copy, env=environment, capture_output=True, text=True, check=False,
         )  # fmt: skip
         took_s = os.times().children_user + os.times().children_system - before_s
@@ -76,18 +80,19 @@ def search(patch: Path | None, seconds: float, seeds: str = "planted") -> Found:
 
 
 def main() -> int:
-    named = [text for text in sys.argv[1:] if text.startswith("--seeds=")]
+    named = [text for text in sys.argv[1:] if text.startswith("--")]
     seconds, *words = [text for text in sys.argv[1:] if text not in named] or ["120"]
-    seeds = named[-1].partition("=")[2] if named else "planted"
+    seeds = next((text.partition("=")[2] for text in named if text.startswith("--seeds=")), "planted")
+    kind = "log" if "--log" in named else "usual"
     began_s, found, all_s = time.monotonic(), 0, 0.0
     if not words:
-        control = search(None, float(seconds), seeds)
+        control = search(None, float(seconds), seeds, kind)
         print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
     bugs = patches(words or [""])
     failed = 0
     for patch in bugs:
         try:
-            one = search(patch, float(seconds), seeds)
+            one = search(patch, float(seconds), seeds, kind)
         except (RuntimeError, subprocess.CalledProcessError) as error:
             failed += 1
             print(f"         {patch.stem:42} FAILED: {str(error).strip().splitlines()[-1]}", flush=True)

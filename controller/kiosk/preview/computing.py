@@ -69,7 +69,8 @@ class Solver:
 
     def __init__(self, stage: Stage) -> None:
         table = SolveTable.model_validate(stage.solve)
-        engine = choose_engine(table.device, lambda note: None)
+        self._refusals: list[str] = []
+        engine = choose_engine(table.device, self._refusals.append)
         if isinstance(engine, Processor):
             raise no_device()
         self._device = engine.name
@@ -91,7 +92,8 @@ class Solver:
         return {
             **self._judged(made, seen, Path(task.picture)),
             "seconds": time.perf_counter() - began_s,
-            "device": self._device,
+            # what a device refuses, because it is lost or too small, is done by the processor
+            "device": Processor.name if self._refusals else self._device,
         }
 
     def _begin(self) -> None:
