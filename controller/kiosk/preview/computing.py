@@ -69,11 +69,10 @@ class Solver:
 
     def __init__(self, stage: Stage) -> None:
         table = SolveTable.model_validate(stage.solve)
-        self._refusals: list[str] = []
-        engine = choose_engine(table.device, self._refusals.append)
+        engine = choose_engine(table.device, lambda note: None)
         if isinstance(engine, Processor):
             raise no_device()
-        self._device = engine.name
+        self._engine = engine
         self._options = options_of(table)
         self._calibrated = Calibrated(Path(stage.run), stage.names, engine)
         self._begun = False
@@ -92,8 +91,7 @@ class Solver:
         return {
             **self._judged(made, seen, Path(task.picture)),
             "seconds": time.perf_counter() - began_s,
-            # what a device refuses, because it is lost or too small, is done by the processor
-            "device": Processor.name if self._refusals else self._device,
+            "device": self._engine.worked,
         }
 
     def _begin(self) -> None:

@@ -19,10 +19,12 @@ from controller.transport.planes import frame_planes, plane_frames
 class Engine(Protocol):
     """The heavy loops of solving and scaling. All engines solve the same problem, to the same KKT residual.
 
-    ``name``: what does the work, for people
+    ``name``: what does the work, for people; ``worked``: the name of what did the last of it, which is the processor
+    where a device refuses
     """
 
     name: str
+    worked: str
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """What ``solver.solve_bounded`` finds. Raises WorkError("solve-cancelled")."""
@@ -41,6 +43,7 @@ class Processor:
     """The engine of compiled loops on the processor's cores."""
 
     name = "processor"
+    worked = name
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """As ``Engine.solve``."""

@@ -26,7 +26,7 @@ class GpuEngine:
     """
 
     def __init__(self, device: Device, note: Callable[[str], None]) -> None:
-        self.name = device.name
+        self.name = self.worked = device.name
         self._device, self._note = device, note
         self._instead = Processor()
         self._stage: _Stage | None = None
@@ -37,9 +37,11 @@ class GpuEngine:
         try:
             stage = self._on_device(given.transport)
             if stage is not None:
+                self.worked = self.name
                 return stage.solve(given, control)
         except DeviceRefused as refused:
             self._say(refused)
+        self.worked = self._instead.name
         return self._instead.solve(given, control)
 
     def scaled(
@@ -49,9 +51,11 @@ class GpuEngine:
         try:
             stage = self._on_device(transport)
             if stage is not None:
+                self.worked = self.name
                 return stage.scaled(light, (inverse, mixed, coverage))
         except DeviceRefused as refused:
             self._say(refused)
+        self.worked = self._instead.name
         return self._instead.scaled(transport, light, inverse, mixed, coverage)
 
     def _on_device(self, transport: LightTransport) -> _Stage | None:

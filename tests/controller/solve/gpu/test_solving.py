@@ -245,6 +245,7 @@ def test_a_device_lost_in_the_middle_leaves_the_solve_to_the_processor(
     engine = GpuEngine(own, notes.append)
     found = solved(stage, engine, progress=pull_out)
     assert lost
+    assert engine.worked == "processor"
     np.testing.assert_array_equal(frame_planes(found), frame_planes(solved(stage, None)))
     assert notes[-1].startswith(f"The processor solves instead of {own.name}: the graphics processor could not ")
     told = len(notes)
