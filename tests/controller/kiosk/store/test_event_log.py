@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from controller.kiosk.store.event_log import MOST_DONE, MOST_EVENTS, MOST_FAILURES, Decision, EventLog
+from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
+from controller.kiosk.store.log_file import MOST_DONE, MOST_EVENTS
 
 
 def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path: Path) -> None:
