@@ -13,6 +13,7 @@ from controller.simulate.happen.places import setting
 from controller.simulate.happen.script import STOPPED, Item, Setting, from_json, to_json
 from controller.simulate.judge.promises import PROMISES
 from controller.simulate.life import Life, Outcome
+from tests.campaigns.log_lives import lived
 
 FOUND = Path(__file__).parent / "found"
 ROOT = Path(__file__).parents[3]
@@ -69,6 +70,13 @@ def test_a_short_life_keeps_every_promise() -> None:
     assert outcome.how == "", outcome.last
     assert outcome.events > 10
     assert outcome.minutes["open"] + outcome.minutes["closed"] > 900
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_troubles_of_the_log_alone_break_no_promise(number: int) -> None:
+    outcome = lived(f"short-{number}")
+    assert outcome.how == "", outcome.last
+    assert outcome.events > 10
 
 
 def test_what_waits_for_a_moment_happens_when_the_log_says_that() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,22 @@ import pytest
 
 from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
 from controller.kiosk.store.log_file import MOST_DONE, MOST_EVENTS
+
+
+def without_space(
+    is_full: Sequence[bool], only: Path | None = None, code: int = sqlite3.SQLITE_FULL
+) -> Callable[..., sqlite3.Connection]:
+    """As ``sqlite3.connect``, but files can't be opened while the disk ``is_full``; ``only``: this one can't."""
+
+    def connect(database: Any, **options: Any) -> sqlite3.Connection:
+        if is_full and (str(database) != ":memory:" if only is None else database == only):
+            error = sqlite3.OperationalError("database or disk is full")
+            error.sqlite_errorcode = code
+            raise error
+        found: sqlite3.Connection = sqlite3.connect(database, **options)
+        return found
+
+    return connect
 
 
 def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path: Path) -> None:
@@ -40,18 +56,11 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
     log.keep("chosen", "glass")
     log.close()
 
-    def full(database: Any, **options: Any) -> sqlite3.Connection:
-        if is_full and database == path:
-            error = sqlite3.OperationalError("disk I/O error")
-            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
-            raise error
-        found: sqlite3.Connection = sqlite3.connect(database, **options)
-        return found
-
-    log = EventLog(path, durable=False, connect=full)
+    # what SQLite says on a file system without space
+    log = EventLog(path, durable=False, connect=without_space(is_full, path, sqlite3.SQLITE_IOERR_SHMSIZE))
     log.add(Decision("second", "Two."))
     log.mark_done("drift-check 2026-01-01", "drift-none")
-    assert log.problem == "disk I/O error"
+    assert log.problem == "database or disk is full"
     assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
     is_full.clear()
     log.mark_done("drift-check 2026-01-02", "drift-none")
@@ -77,14 +86,6 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     # The schema's page is not damaged where it is ``whole``.
     path.write_bytes(content[: whole - 2000] + bytes(byte ^ 0xA5 for byte in content[whole - 2000 :]))
 
-    def full(database: Any, **options: Any) -> sqlite3.Connection:
-        if is_full and database == path:
-            error = sqlite3.OperationalError("database or disk is full")
-            error.sqlite_errorcode = sqlite3.SQLITE_FULL
-            raise error
-        found: sqlite3.Connection = sqlite3.connect(database, **options)
-        return found
-
     def replace(old: Path, new: Path) -> Path:
         if is_full:
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -93,7 +94,7 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     rename = Path.replace
     monkeypatch.setattr(Path, "replace", replace)
     now_s = [0.0]
-    log = EventLog(path, durable=False, connect=full, monotonic=lambda: now_s[0])
+    log = EventLog(path, durable=False, connect=without_space(is_full, path), monotonic=lambda: now_s[0])
     log.add(Decision("full", "Two."))
     is_full.clear()
     for _ in range(4):
@@ -118,16 +119,8 @@ def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk
     content[middle : middle + 4096] = bytes(byte ^ 0xA5 for byte in content[middle : middle + 4096])
     path.write_bytes(content)
 
-    def full(database: Any, **options: Any) -> sqlite3.Connection:
-        if is_full and str(database) != ":memory:":
-            error = sqlite3.OperationalError("database or disk is full")
-            error.sqlite_errorcode = sqlite3.SQLITE_FULL
-            raise error
-        found: sqlite3.Connection = sqlite3.connect(database, **options)
-        return found
-
     now_s = [0.0]
-    log = EventLog(path, durable=False, connect=full, monotonic=lambda: now_s[0])
+    log = EventLog(path, durable=False, connect=without_space(is_full), monotonic=lambda: now_s[0])
     newest = [row for row in log.after(0) if row.code == "before"]
     assert newest
     log.add(Decision("full", "Two."))
@@ -231,15 +224,7 @@ def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_pat
         shutil.copyfile(f"{killed.path}{end}", f"{left}{end}")
     killed.close()
 
-    def full(database: Any, **options: Any) -> sqlite3.Connection:
-        if str(database) == ":memory:":
-            memory: sqlite3.Connection = sqlite3.connect(database, **options)
-            return memory
-        error = sqlite3.OperationalError("database or disk is full")
-        error.sqlite_errorcode = sqlite3.SQLITE_FULL
-        raise error
-
-    log = EventLog(left, connect=full)
+    log = EventLog(left, connect=without_space([True]))
     assert [row.code for row in log.after(0)] == ["last"]
     assert (log.value("override"), log.number) == ("[true, false]", 1)
     log.close()
