@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+import controller.core.errors
+import hal.errors
+
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 TOPS = ("controller", "hal", "plugins", "firmware_configs")
@@ -116,6 +119,20 @@ def imports() -> dict[str, set[str]]:
 
 def test_no_file_imports_itself_by_way_of_others() -> None:
     TopologicalSorter(imports()).prepare()  # raises CycleError, which names the files
+
+
+def test_no_exception_is_made_once_for_all() -> None:
+    """It would keep a traceback of each time it is raised, with all that the frames hold."""
+    own = {name for module in (controller.core.errors, hal.errors) for name, kind in vars(module).items()
+           if isinstance(kind, type) and issubclass(kind, BaseException)}  # fmt: skip
+    kept = []
+    for path in (path for top in TOPS for path in (ROOT / top).rglob("*.py")):
+        for node in ast.parse(path.read_text("utf-8")).body:
+            made = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+            name = ast.unparse(made.func).rpartition(".")[2] if isinstance(made, ast.Call) else ""
+            if name in own or name.endswith(("Error", "Exception")):
+                kept.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert kept == []
 
 
 def test_every_kernel_of_the_tables_is_a_function_of_its_module() -> None:

@@ -163,7 +163,7 @@ class Reconciler:
 
     def _require_open(self) -> None:
         if not self.overrides.open(self._plan):
-            raise _NOTHING_PLAYS
+            raise _nothing_plays()
 
     def _shown(self) -> str:
         self._require_open()
@@ -171,7 +171,7 @@ class Reconciler:
         if self._live.now.held or shown is None or not shown.appearance:
             wanted = self._content.of(self._plan, frozenset())
             if not (self._live.now.held or wanted.appearance):
-                raise _NOTHING_PLAYS
+                raise _nothing_plays()
             return self._live.now.held or wanted.appearance
         return shown.appearance
 
@@ -286,9 +286,12 @@ def _same_picture(one: Showing, other: Showing) -> bool:
     return (one.bundle, one.appearance, one.brightness) == (other.bundle, other.appearance, other.brightness)
 
 
-_NOTHING_PLAYS: Final = WorkError(
-    "nothing-plays", what="The stage is closed, or nothing is installed.", remedy="Open the stage first."
-)
+def _nothing_plays() -> WorkError:
+    return WorkError(
+        "nothing-plays", what="The stage is closed, or nothing is installed.", remedy="Open the stage first."
+    )
+
+
 _FAULTY: Final = Decision(
     "work-impossible", "The job was cancelled because the stage has a fault.",
     "Correct the fault, then start the job again.", "error",

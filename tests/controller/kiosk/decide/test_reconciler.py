@@ -50,6 +50,16 @@ def test_stops_on_request_and_cools_and_starts_again_only_when_asked(kiosk: Kios
     assert not kiosk.sins
 
 
+def test_a_request_that_is_refused_keeps_nothing_of_the_ones_before(kiosk: Kiosk) -> None:
+    kiosk.reconciler.shut()
+    frames = []
+    for _ in range(3):
+        with pytest.raises(WorkError, match="closed") as refused:
+            kiosk.reconciler.next()
+        frames.append(len(refused.traceback))
+    assert frames == [frames[0]] * 3
+
+
 def test_a_request_survives_a_restart_of_the_service(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
     kiosk.reconciler.choose("marble")
