@@ -17,6 +17,7 @@ import numpy.typing as npt
 from controller.bundle.format import damaged
 from controller.bundle.live_indirect import LiveIndirect, read_indirect
 from controller.bundle.reader import Bundle
+from controller.core.channels import own_light
 
 MOST_RADIUS_PX: Final = 12
 REACH: Final = np.float32(3)
@@ -208,19 +209,13 @@ def _frame(maps: LiveMaps, output: OutputMaps, scale: Float) -> Bytes:
     frame: Bytes = np.empty(output.base.shape, np.uint8)
     means = _means(maps, output, scale) * base_light(output)
     rows, columns = frame.shape[:2]
-    own = _own_light(np.clip(means @ output.unmix.T, 0, 1), output.segment)
+    own = own_light(np.clip(means @ output.unmix.T, 0, 1), output.segment)
     for channel in range(3):
         level = device_level(own[..., channel], output.response[channel])
         below = np.floor(level)
         limit = thresholds(maps.noise, output, channel)[np.ix_(np.arange(rows) % TILE, np.arange(columns) % TILE)]
         frame[..., channel] = np.where(level - below > limit, below + 1, below)
     return frame
-
-
-def _own_light(shown: Float, segment: float) -> Float:
-    """What the channels make of light (..., 3) where a white segment makes a share of what they have in common."""
-    share = np.float32(segment)
-    return np.asarray((shown - share * shown.min(axis=-1, keepdims=True)) / (1 - share), np.float32)
 
 
 def thresholds(noise: Float, output: OutputMaps, channel: int) -> Float:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import own_light
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +90,7 @@ class Radiometry:
 
     def channels(self, shown: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """The inverse: the channels' own light for what is to be shown; above 1 where a colour is too saturated."""
-        if not self.segment:
-            return shown
-        common = shown.min(axis=-1, keepdims=True)
-        return np.asarray((shown - shown.dtype.type(self.segment) * common) / shown.dtype.type(1 - self.segment))
+        return own_light(shown, self.segment)
 
 
 @dataclass(frozen=True, slots=True)

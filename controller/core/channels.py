@@ -35,6 +35,17 @@ def total(picture: Picture) -> Picture:
     return _over(np.add, picture)
 
 
+def own_light(shown: Picture, segment: float) -> Picture:
+    """The colours' part of ``shown`` light, where a white segment adds to what they have in common.
+
+    ``segment``: its share of white, 0 without one, below 1. Above 1 where a colour is too saturated.
+    """
+    if not segment:
+        return shown
+    common = smallest(shown)[..., None]
+    return np.asarray((shown - shown.dtype.type(segment) * common) / shown.dtype.type(1 - segment))
+
+
 def products(one: Picture, other: Picture) -> npt.NDArray[np.float64]:
     """(channels,): sum over all pixels of the products of two pictures' values, as ``sum(one * other)``."""
     pairs = ((one[..., channel], other[..., channel]) for channel in range(one.shape[-1]))

@@ -11,6 +11,7 @@ code is 1 then.
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -80,19 +81,22 @@ def search(patch: Path | None, seconds: float, seeds: str = "planted", kind: str
 
 
 def main() -> int:
-    named = [text for text in sys.argv[1:] if text.startswith("--")]
-    seconds, *words = [text for text in sys.argv[1:] if text not in named] or ["120"]
-    seeds = next((text.partition("=")[2] for text in named if text.startswith("--seeds=")), "planted")
-    kind = "log" if "--log" in named else "usual"
+    options = argparse.ArgumentParser()
+    options.add_argument("--seeds", default="planted")
+    options.add_argument("--log", dest="kind", action="store_const", const="log", default="usual")
+    options.add_argument("seconds", nargs="?", type=float, default=120.0)
+    options.add_argument("words", nargs="*")
+    chosen = options.parse_args()
+    seconds, words, seeds, kind = chosen.seconds, chosen.words, chosen.seeds, chosen.kind
     began_s, found, all_s = time.monotonic(), 0, 0.0
     if not words:
-        control = search(None, float(seconds), seeds, kind)
+        control = search(None, seconds, seeds, kind)
         print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
     bugs = patches(words or [""])
     failed = 0
     for patch in bugs:
         try:
-            one = search(patch, float(seconds), seeds, kind)
+            one = search(patch, seconds, seeds, kind)
         except (RuntimeError, subprocess.CalledProcessError) as error:
             failed += 1
             print(f"         {patch.stem:42} FAILED: {str(error).strip().splitlines()[-1]}", flush=True)

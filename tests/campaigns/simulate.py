@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 
+from controller.simulate.life import Outcome
 from controller.simulate.run import YEAR_DAYS, lives
 from controller.simulate.scheduler import DAY_S
 from controller.simulate.shrink import shortened
 
 
-def main() -> int:
-    years = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
-    seed = int(sys.argv[2]) if len(sys.argv) > 2 else int(time.time())
-    began_s, days, failed = time.process_time(), 0.0, 0
-    print(f"seed {seed}")
-    for outcome in lives(seed, years):
+def judged(outcomes: Iterable[Outcome]) -> tuple[float, int]:
+    """The days that were lived, and how many lives broke a promise; their shortest scripts are printed."""
+    days, failed = 0.0, 0
+    for outcome in outcomes:
         days += outcome.at_s / DAY_S
         if outcome.broken:
             failed += 1
             print(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / DAY_S:.3f})", flush=True)
             short = shortened(outcome)
             print("\n".join([*(item.line for item in short.items), *short.last]), flush=True)
+    return days, failed
+
+
+def main() -> int:
+    years = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
+    seed = int(sys.argv[2]) if len(sys.argv) > 2 else int(time.time())
+    began_s = time.process_time()
+    print(f"seed {seed}")
+    days, failed = judged(lives(seed, years))
     hours = (time.process_time() - began_s) / 3600
     print(f"{days / YEAR_DAYS:.2f} years, {failed} broken promises, {days / YEAR_DAYS / hours:.1f} years a core-hour")
     return 1 if failed else 0

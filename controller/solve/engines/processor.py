@@ -24,7 +24,9 @@ class Engine(Protocol):
     """
 
     name: str
-    worked: str
+
+    @property
+    def worked(self) -> str: ...
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """What ``solver.solve_bounded`` finds. Raises WorkError("solve-cancelled")."""

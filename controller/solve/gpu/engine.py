@@ -26,22 +26,25 @@ class GpuEngine:
     """
 
     def __init__(self, device: Device, note: Callable[[str], None]) -> None:
-        self.name = self.worked = device.name
+        self.name = device.name
         self._device, self._note = device, note
         self._instead = Processor()
         self._stage: _Stage | None = None
         self._refused: LightTransport | None = None
+
+    @property
+    def worked(self) -> str:
+        """As ``Engine.worked``."""
+        return self.name if self._refused is None else self._instead.name
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """As ``Engine.solve``."""
         try:
             stage = self._on_device(given.transport)
             if stage is not None:
-                self.worked = self.name
                 return stage.solve(given, control)
         except DeviceRefused as refused:
             self._say(refused)
-        self.worked = self._instead.name
         return self._instead.solve(given, control)
 
     def scaled(
@@ -51,11 +54,9 @@ class GpuEngine:
         try:
             stage = self._on_device(transport)
             if stage is not None:
-                self.worked = self.name
                 return stage.scaled(light, (inverse, mixed, coverage))
         except DeviceRefused as refused:
             self._say(refused)
-        self.worked = self._instead.name
         return self._instead.scaled(transport, light, inverse, mixed, coverage)
 
     def _on_device(self, transport: LightTransport) -> _Stage | None:

@@ -6,18 +6,18 @@ are half of what floats take.
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import prange
 
 from controller.bundle.live_indirect import ROUNDS, LiveIndirect, between
+from controller.bundle.live_maps import FULL
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
 from controller.transport.simd.scaling import Index
 
-FULL: Final = 65535
 PART: Final = 96
 """Numbers a block of samples is worked on at once: they and their sums stay in the nearest cache."""
 
@@ -44,26 +44,22 @@ NOTHING: Final = ReflectedLight(
 class Surfaces:
     """A stage's maps of indirect light, ready. Not for two threads at once: working memory is kept.
 
-    ``gain`` (height, width, 3) float32: as of ``LiveMaps``
+    ``gain`` (height, width, 3) float32: as of ``LiveMaps``; ``samples``: of ``indirect``
     """
 
     def __init__(self, indirect: LiveIndirect, gain: FloatImage) -> None:
         height, width, _ = gain.shape
         surface = np.divide(indirect.surface.astype(np.float32), gain, out=np.zeros_like(gain), where=gain > 0)
         most = max(float(surface.max()), 1e-30)
-        self._surface = np.rint(surface * np.float32(FULL / most)).astype(np.uint16).ravel()
-        self._factors = indirect.factors * np.float32(most / FULL)
-        self._unit = np.float32(FULL / most)
+        self._unit = FULL / np.float32(most)
+        self._surface = np.rint(surface * self._unit).astype(np.uint16).ravel()
+        self._factors = indirect.factors / self._unit
         self._samples = indirect.sampled.reshape(3, len(indirect.places), -1)
-        self._places = indirect.places[..., 0].astype(np.int64) * width + indirect.places[..., 1]
+        self.samples = indirect.samples
         self._grid = indirect.grid
         self._up = between(height, indirect.grid[0], indirect.side)
         self._across = between(width, indirect.grid[1], indirect.side)
         self._rows = np.empty((indirect.grid[0], 3 * width), np.float32)
-
-    def samples(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(samples, blocks, 3): the pixels of a target (height, width, 3) that stand for blocks."""
-        return np.asarray(image.reshape(-1, 3).take(self._places, axis=0))
 
     def reflect(self, light: FloatImage) -> ReflectedLight:
         """What all pixels throw back where samples (samples, blocks, 3) of a target have that radiance."""

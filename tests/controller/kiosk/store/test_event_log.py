@@ -14,16 +14,18 @@ import pytest
 from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
 from controller.kiosk.store.log_file import MOST_DONE, MOST_EVENTS
 
+FULL = "database or disk is full", sqlite3.SQLITE_FULL
+
 
 def without_space(
-    is_full: Sequence[bool], only: Path | None = None, code: int = sqlite3.SQLITE_FULL
+    is_full: Sequence[bool], only: Path | None = None, says: tuple[str, int] = FULL
 ) -> Callable[..., sqlite3.Connection]:
     """As ``sqlite3.connect``, but files can't be opened while the disk ``is_full``; ``only``: this one can't."""
 
     def connect(database: Any, **options: Any) -> sqlite3.Connection:
         if is_full and (str(database) != ":memory:" if only is None else database == only):
-            error = sqlite3.OperationalError("database or disk is full")
-            error.sqlite_errorcode = code
+            error = sqlite3.OperationalError(says[0])
+            error.sqlite_errorcode = says[1]
             raise error
         found: sqlite3.Connection = sqlite3.connect(database, **options)
         return found
@@ -56,11 +58,11 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
     log.keep("chosen", "glass")
     log.close()
 
-    # what SQLite says on a file system without space
-    log = EventLog(path, durable=False, connect=without_space(is_full, path, sqlite3.SQLITE_IOERR_SHMSIZE))
+    says = "disk I/O error", sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
+    log = EventLog(path, durable=False, connect=without_space(is_full, path, says))
     log.add(Decision("second", "Two."))
     log.mark_done("drift-check 2026-01-01", "drift-none")
-    assert log.problem == "database or disk is full"
+    assert log.problem == "disk I/O error"
     assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
     is_full.clear()
     log.mark_done("drift-check 2026-01-02", "drift-none")
