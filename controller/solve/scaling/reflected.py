@@ -6,7 +6,7 @@ are half of what floats take.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +44,7 @@ NOTHING: Final = ReflectedLight(
 class Surfaces:
     """A stage's maps of indirect light, ready. Not for two threads at once: working memory is kept.
 
-    ``gain`` (height, width, 3) float32: as of ``LiveMaps``; ``samples``: of ``indirect``
+    ``gain`` (height, width, 3) float32: as of ``LiveMaps``
     """
 
     def __init__(self, indirect: LiveIndirect, gain: FloatImage) -> None:
@@ -55,11 +55,15 @@ class Surfaces:
         self._surface = np.rint(surface * self._unit).astype(np.uint16).ravel()
         self._factors = indirect.factors / self._unit
         self._samples = indirect.sampled.reshape(3, len(indirect.places), -1)
-        self.samples = indirect.samples
+        self._places = indirect.places[..., 0].astype(np.int64) * width + indirect.places[..., 1]
         self._grid = indirect.grid
         self._up = between(height, indirect.grid[0], indirect.side)
         self._across = between(width, indirect.grid[1], indirect.side)
         self._rows = np.empty((indirect.grid[0], 3 * width), np.float32)
+
+    def samples(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """As ``LiveIndirect.samples``, whose places are found once here and not for each picture."""
+        return np.asarray(image.reshape(-1, 3).take(self._places, axis=0))
 
     def reflect(self, light: FloatImage) -> ReflectedLight:
         """What all pixels throw back where samples (samples, blocks, 3) of a target have that radiance."""
