@@ -123,7 +123,10 @@ def _open_output(options: argparse.Namespace, sizes: tuple[OutputSize, ...]) -> 
 
 
 def _end_on_signals(player: Player) -> threading.Event:
-    """SIGTERM, SIGINT and a broken thread end the loop; the event is set only in the last case."""
+    """SIGTERM, SIGINT and a broken thread end the loop; the event is set only in the last case. SIGUSR1 ends it, too,
+    and leaves the picture to the next player.
+    """
+    signal.signal(signal.SIGUSR1, lambda *_: player.end(leaving=True))
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: player.end())
     broken = threading.Event()

@@ -67,30 +67,40 @@ class Player:
         self._appearance: str | None = None
         self._brightness = 1.0
         self._ending = False
+        self._leaving = False
 
     def run(self, serve: Callable[[float], None], *, first: Callable[[], None] = lambda: None) -> None:
-        """Show black, do what is to be done ``first``, serve until ``end`` is called, and leave black."""
-        self.stop(None)
-        self._present_if_due(wait=True)
+        """Show black, do what is to be done ``first``, serve until ``end`` is called, and leave black.
+
+        After a player that left its picture, that picture stays until ``first`` has brought one.
+        """
+        if not self._output.continued:
+            self.stop(None)
+            self._present_if_due(wait=True)
         self._notifier.ready()
         first()
         while not self._ending:
+            if self._output.continued and self._coming is None:
+                self.stop(None)
             serve(self._patience_s())
             self._output.pump()
             self._take_live()
             self._present_if_due()
             self._notifier.alive()
         self._notifier.stopping()
-        self.stop(None)
-        self._present_if_due(wait=True)
+        if self._leaving:
+            self._output.leave()
+        else:
+            self.stop(None)
+            self._present_if_due(wait=True)
         if self._decoded is not None:
             self._decoded.close()
 
     # --- what may be asked for ----------------------------------------------------------------------------------
 
-    def end(self) -> None:
-        """Show black and end soon; a signal handler may call it."""
-        self._ending = True
+    def end(self, *, leaving: bool = False) -> None:
+        """End soon, with black, or ``leaving`` the picture to the next player; a signal handler may call it."""
+        self._ending, self._leaving = True, leaving
 
     def stop(self, on_result: ResultCallback | None, *, fade_s: float = 0.0) -> None:
         """Show black."""
@@ -313,4 +323,6 @@ class Player:
         assert self._playlist is not None
         self._decoded.want(self._playlist.upcoming)
         name, fade_s = self._playlist.appearance, self._playlist.fade_s
+        if self._output.continued:
+            fade_s = 0.0  # It would begin with black.
         self._coming = PendingPresentation("appearance", name, None, tick, on_result, fade_s, paced=True)

@@ -5,9 +5,6 @@ from __future__ import annotations
 from tests.booted.kiosk import SERVICES, Kiosk
 from tests.campaigns.power_cuts import kept, lost
 
-BLACK_S = 2.0
-"""While the player is another version."""
-
 
 def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk) -> None:
     machine = playing.machine
@@ -21,9 +18,7 @@ def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kio
             machine.wait_for(playing.shows)
             machine.wait_for(lambda: playing.state == "playing")
         shown = [what for _, what in seen[:-1]]
-        assert shown == [shown[0], "black", shown[0]], "it was black once, and never showed anything else"
-        black_s = seen[2][0] - seen[1][0]
-        print(f"black for {black_s:.2f} s")
-        assert black_s <= BLACK_S
+        assert shown == [shown[0]], "it was never black, and never showed anything else"
+        assert shown != ["black"]
         assert lost(playing, before) == []
         assert {machine.restarts(name) for name in SERVICES[1:]} == {0}

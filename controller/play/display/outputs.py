@@ -31,6 +31,13 @@ class Output(Protocol):
         The set that ``prepare`` got is not needed any more after this.
         """
 
+    @property
+    def continued(self) -> bool:
+        """Whether the picture of the player before is still visible: it has left it, and nothing was flipped since."""
+
+    def leave(self) -> None:
+        """Leave what is visible to the next player: it stays visible after ``close``."""
+
     def missing(self) -> tuple[str, ...]:
         """Names of outputs that are not there now, or not as they were at the start."""
 
@@ -74,6 +81,13 @@ class MemoryOutput:
         self._file.write(self._next, self._pool)
         self._next = None
         return self._file.presented_at
+
+    @property
+    def continued(self) -> bool:
+        return False
+
+    def leave(self) -> None:
+        """The file stays as it is."""
 
     def missing(self) -> tuple[str, ...]:
         return ()

@@ -52,8 +52,9 @@ class WindowOutput:
             for connector in found.values():
                 self._server.make_plain(connector)
         self._places = self._placed(found)
+        self._continued = self._server.kept.there()
         try:
-            self._window = _open_window(self._extent())
+            self._window = self._open_window()
         except (pyglet.display.xlib.NoSuchDisplayException, pyglet.window.NoSuchConfigException) as error:
             raise WorkError(
                 "display-gone",
@@ -69,6 +70,22 @@ class WindowOutput:
         self._live: LiveRenderer | None = None
         self._damaged = False
         self._window.push_handlers(on_expose=self._on_expose, on_draw=self._on_expose, on_close=_stay)
+
+    def _open_window(self) -> Any:
+        config = gl.Config(  # type: ignore[abstract]
+            double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
+        )
+        window = pyglet.window.Window(
+            *self._extent(), caption="Velatura", style="borderless", vsync=True, visible=False, config=config
+        )
+        if self._continued:
+            self._server.kept.let_through(window._window, window._view)
+        window.set_location(0, 0)
+        window.set_visible(True)
+        # A window manager may have moved it while it was mapped.
+        window.set_location(0, 0)
+        window.set_mouse_visible(False)
+        return window
 
     def _find(self) -> tuple[dict[str, Connector], tuple[Connector, ...]]:
         connectors = self._server.connectors()
@@ -150,7 +167,18 @@ class WindowOutput:
     def flip(self) -> float:
         self._window.flip()
         gl.glFinish()
-        return time.monotonic()
+        at_s = time.monotonic()
+        if self._continued:
+            self._continued = False
+            self._server.kept.drop()
+        return at_s
+
+    @property
+    def continued(self) -> bool:
+        return self._continued
+
+    def leave(self) -> None:
+        self._server.kept.keep(self._window._view)
 
     def missing(self) -> tuple[str, ...]:
         return self._missing
@@ -159,7 +187,7 @@ class WindowOutput:
         if self._server.changed():
             self._follow()
         self._window.dispatch_events()
-        if self._damaged:
+        if self._damaged and not self._continued:
             self._damaged = False
             self._window.switch_to()
             self._draw()
@@ -193,18 +221,3 @@ class WindowOutput:
 def _stay() -> bool:
     """A kiosk's window can't be closed from its frame."""
     return True
-
-
-def _open_window(extent: tuple[int, int]) -> Any:
-    config = gl.Config(  # type: ignore[abstract]
-        double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
-    )
-    window = pyglet.window.Window(
-        *extent, caption="Velatura", style="borderless", vsync=True, visible=False, config=config
-    )
-    window.set_location(0, 0)
-    window.set_visible(True)
-    # A window manager may have moved it while it was mapped.
-    window.set_location(0, 0)
-    window.set_mouse_visible(False)
-    return window

@@ -66,6 +66,11 @@ class Slow:
         self.flips_s.append(self.clocks.now_s)
         return self.clocks.now_s
 
+    continued = False
+
+    def leave(self) -> None:
+        """Nobody follows."""
+
     def missing(self) -> tuple[str, ...]:
         return ()
 

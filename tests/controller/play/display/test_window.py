@@ -6,10 +6,13 @@ Needs Xvfb (package xvfb) and software OpenGL (libgl1-mesa-dri); a machine witho
 from __future__ import annotations
 
 import os
+import signal
 import struct
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +54,9 @@ def framebuffer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Framebuffe
     reading, writing = os.pipe()
     command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", f"{WIDTH}x{HEIGHT}x24", "-fbdir", str(folder)]
     with (folder / "log").open("wb") as log:
-        server = subprocess.Popen([*command, "-nolisten", "tcp"], pass_fds=[writing], stderr=log)
+        server = subprocess.Popen(
+            [*command, "-nolisten", "tcp", "-nocursor", "-noreset"], pass_fds=[writing], stderr=log
+        )
     try:
         os.close(writing)
         number = b""
@@ -135,6 +140,81 @@ def test_the_screen_is_black_when_the_player_has_ended_and_sequences_run(
     # The X server notices that a program has ended, and then removes its window: some time after the program's end.
     wait_for(lambda: not framebuffer.picture().any())
     assert "Traceback" not in player.log.read_text()
+
+
+def test_a_player_that_is_started_again_goes_on_without_black(
+    framebuffer: Framebuffer, start: Start, bundle: Path, outputs: Outputs
+) -> None:
+    first = start(frames=None, bundle=bundle, allow_unsigned=True, resume=True)
+    expected = spanned(noise(outputs, 2), outputs)
+    with Wire(first.socket) as wire:
+        wire.ask("play", appearance="2", fade_s=0.5)
+    seen = []
+    with meanwhile(lambda: seen.append(np.array_equal(framebuffer.picture(), expected))):
+        leave(first)
+        second = start(frames=None, bundle=bundle, allow_unsigned=True, resume=True)
+        with Wire(second.socket) as wire:
+            wait_for(lambda: wire.ask("status")["showing"] == "appearance")
+    assert len(seen) > 10
+    assert all(seen)
+    with Wire(second.socket) as wire:
+        wire.ask("play", appearance="3")
+        np.testing.assert_array_equal(framebuffer.picture(), spanned(noise(outputs, 3), outputs))
+    assert second.terminate() == 0
+    wait_for(lambda: not framebuffer.picture().any())
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_pattern_is_not_shown_any_more_after_a_restart(
+    framebuffer: Framebuffer, start: Start, bundle: Path, outputs: Outputs, kept: bool
+) -> None:
+    first = start(frames=None, bundle=bundle, allow_unsigned=True, resume=kept)
+    with Wire(first.socket) as wire:
+        inbox = Frames(Path(wire.ask("hello")["inbox"]))
+        assert wire.ask("show", sequence=inbox.write(noise(outputs, 7)))["ok"]
+    leave(first)
+    assert framebuffer.picture().any()
+    start(frames=None, bundle=bundle, allow_unsigned=True, resume=kept)
+    wait_for(lambda: not framebuffer.picture().any())
+
+
+def test_a_picture_that_can_not_be_read_any_more_gives_way_to_black(
+    framebuffer: Framebuffer, start: Start, bundle: Path
+) -> None:
+    first = start(frames=None, bundle=bundle, allow_unsigned=True, resume=True)
+    with Wire(first.socket) as wire:
+        wire.ask("play", appearance="0")
+    leave(first)
+    data = bytearray(bundle.read_bytes())
+    data[4096 + 20] ^= 1  # in the first stripe of "0"
+    bundle.write_bytes(data)
+    start(frames=None, bundle=bundle, allow_unsigned=True, resume=True)
+    wait_for(lambda: not framebuffer.picture().any())
+
+
+def leave(player: PlayerProcess) -> None:
+    """End it as `systemctl restart` does."""
+    os.kill(player.pid, signal.SIGUSR1)
+    wait_for(lambda: not player.alive)
+
+
+@contextmanager
+def meanwhile(look: Callable[[], object]) -> Iterator[None]:
+    """Look again and again in a thread; at least once after the last statement."""
+    ended = threading.Event()
+
+    def looking() -> None:
+        while not ended.is_set():
+            look()
+        look()
+
+    thread = threading.Thread(target=looking)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_without_a_display_it_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:

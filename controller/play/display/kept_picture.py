@@ -1,0 +1,81 @@
+"""A picture that stays on the X server between two players: while the program becomes another version.
+
+The root window's background shows wherever no other window is. The player that ends puts its picture there, so that
+the server itself shows it, and the next player takes it away behind its own first picture. A property says that it is
+there.
+"""
+
+from __future__ import annotations
+
+from ctypes import POINTER, byref, c_int, c_ubyte, c_uint, c_ulong, cast
+from typing import Any, Final
+
+from pyglet.libs.x11 import xlib
+
+_NAME: Final = b"_VELATURA_PICTURE"
+_CARDINAL: Final = 6
+_NO_PIXMAP: Final = 0
+_BLACK: Final = 0
+_BITS: Final = 32
+
+
+class KeptPicture:
+    """``display``: a connection of Xlib; ``root``: its root window."""
+
+    def __init__(self, display: Any, root: int) -> None:
+        self._display, self._root = display, root
+        self._name = xlib.XInternAtom(display, _NAME, 0)
+
+    def there(self) -> bool:
+        """Whether the player before has left its picture."""
+        kind, width, count, left = c_ulong(), c_int(), c_ulong(), c_ulong()
+        data = POINTER(c_ubyte)()
+        xlib.XGetWindowProperty(self._display, self._root, self._name, 0, 1, 0, _CARDINAL, byref(kind), byref(width),
+                                byref(count), byref(left), byref(data))  # fmt: skip
+        if data:
+            xlib.XFree(data)
+        return bool(count.value)
+
+    def let_through(self, *windows: int) -> None:
+        """Keep the server from painting these windows black when they appear."""
+        for window in windows:
+            xlib.XSetWindowBackgroundPixmap(self._display, window, _NO_PIXMAP)
+        xlib.XSync(self._display, 0)
+
+    def keep(self, window: int) -> None:
+        """Show what this window shows, from the screen's corner on, also when the window is gone; black beside it.
+
+        Does nothing where a pixel of the window has other bits than one of the screen, which an X server can't copy.
+        """
+        width, height, depth = self._shape(self._root)
+        window_width, window_height, window_depth = self._shape(window)
+        if window_depth != depth:
+            return
+        # As large as the root window: a smaller background is repeated.
+        pixmap = xlib.XCreatePixmap(self._display, self._root, width, height, depth)
+        context = xlib.XCreateGC(self._display, pixmap, 0, None)
+        xlib.XSetForeground(self._display, context, _BLACK)
+        xlib.XFillRectangle(self._display, pixmap, context, 0, 0, width, height)
+        xlib.XCopyArea(self._display, window, pixmap, context, 0, 0, window_width, window_height, 0, 0)
+        xlib.XSetWindowBackgroundPixmap(self._display, self._root, pixmap)
+        value = cast(byref(c_ulong(1)), POINTER(c_ubyte))
+        xlib.XChangeProperty(self._display, self._root, self._name, _CARDINAL, _BITS, 0, value, 1)
+        # The server keeps what a window has as its background.
+        xlib.XFreeGC(self._display, context)
+        xlib.XFreePixmap(self._display, pixmap)
+        xlib.XSync(self._display, 0)
+
+    def drop(self) -> None:
+        """Black again, wherever no window is."""
+        xlib.XSetWindowBackground(self._display, self._root, _BLACK)
+        xlib.XClearWindow(self._display, self._root)
+        xlib.XDeleteProperty(self._display, self._root, self._name)
+        xlib.XSync(self._display, 0)
+
+    def _shape(self, window: int) -> tuple[int, int, int]:
+        """Width and height in pixels, and the bits of a pixel."""
+        root, left, top = c_ulong(), c_int(), c_int()
+        width, height, border, depth = c_uint(), c_uint(), c_uint(), c_uint()
+        xlib.XGetGeometry(self._display, window, byref(root), byref(left), byref(top), byref(width), byref(height),
+                          byref(border), byref(depth))  # fmt: skip
+        return width.value, height.value, depth.value
