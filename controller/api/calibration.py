@@ -159,7 +159,7 @@ def _calibrated(
         return plain, fitted.mosaic
     encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
-    waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid)
+    waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid, encoded_with)
     white = np.nan_to_num(seen.white)
     for _ in range(PASSES):
         linearity = shown_contrast(radiometry, encoded_with)

@@ -5,12 +5,15 @@ no sinusoids in light. What reaches a camera pixel is c + a w(x - shift): c, lig
 direct light, are unknown in each small part of the picture, and w, the wave, is the same in all of it. c and a change
 the wave's first harmonic and its mean, as blur and light between near surfaces do. An error of the response has higher
 harmonics, too: by these, w is found at the values of device light that the sinusoids show, 0 at black and 1 at white.
+
+Device values are whole numbers, and what one pixel lacks its neighbours get (``encode_frame``). In a sinusoid this
+leaves whole lines brighter or darker than asked for, by up to 0.001 of white. The frames are known, so that is, too.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,9 +23,10 @@ import numpy.typing as npt
 from controller.calibrate.correspondence.captures import Captures, coloured, lit_pixels
 from controller.calibrate.photometry.tile_fit import rising
 from controller.calibrate.values import PhaseMap, Radiometry
+from controller.capture.pattern_frames import device_frame
 from controller.capture.patterns import PERIOD_PX, PatternPlan
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 
 COARSE: Final = ("phase-x", "phase-y")
 HALF: Final = PERIOD_PX // 2
@@ -31,22 +35,23 @@ ASKED: Final[Float64] = 0.5 - 0.5 * np.cos(ANGLES)
 """Light that a sinusoid asks of a whole pixel, from black to white."""
 PART_PX: Final = 8
 """Projector pixels a side of a part of the picture: the period of what harmonics do to three steps."""
-PIXELS: Final = 48
-"""Camera pixels of a part that are used; a part with fewer is left out."""
-MOST_PARTS: Final = 1000
+PIXELS: Final = 96
+"""Camera pixels of a part that are used, some twice where it has fewer."""
+FEWEST_PIXELS: Final = 48
+"""Of a part; one with fewer is left out."""
+MOST_PARTS: Final = 2000
 FEWEST_PARTS: Final = 60
 FRAME_PX: Final = 6
 """Projector pixels at the frame's border that are left out: beyond it is no wave."""
-TURNS: Final = 2
 OUTLIER: Final = 5.0
 DARK_NOISE: Final = 0.03
 """Variance of a pixel's light is that of white, times its share of white and this."""
 CONTRAST_LEFT: Final = 0.2, 1.5
 """Of white; a part with another direct light is none of one surface."""
 FLICKER: Final = 0.01
-BEND: Final = 0.003
-"""Standard deviation of the second differences of the wave's error, from one level to the next."""
-SIGMA: Final = 0.0007
+BEND: Final = 0.001
+"""Standard deviation of the second differences of what is added to a response from tiles, from a level to the next."""
+SIGMA: Final = 0.00045
 """Standard deviation of a level besides noise, of white: the blur is not quite a Gaussian, and light between near
 surfaces is modulated a little."""
 TILES_SIGMA: Final = 0.0005
@@ -63,16 +68,27 @@ class Wave:
     ``ratio`` (parts, pixels, steps, 3): light over white; ``weight`` (parts, pixels, 3): white, of the brightest
     ``levels`` (parts, pixels, steps, 13): how much of each of ``ASKED`` a camera pixel gets
     ``moved`` (parts, pixels, steps): change of the asked light with the place, per projector pixel
+    ``values`` (13, 256, 3): share of each device value in the projector's pixels that were asked for a level
     """
 
     ratio: Float64
     weight: Float64
     levels: Float64
     moved: Float64
+    values: Float64
+
+    def light(self, response: Float64) -> Float64:
+        """(13, 3) mean light of the pixels that were asked for each level, by a response (3, 256)."""
+        return np.asarray(np.einsum("lvc,cv->lc", self.values, response), np.float64)
 
 
 def coarse_waves(
-    captures: Captures, plan: PatternPlan, white: FloatImage, phase_map: PhaseMap, valid: Mask
+    captures: Captures,
+    plan: PatternPlan,
+    white: FloatImage,
+    phase_map: PhaseMap,
+    valid: Mask,
+    shown_with: Float64,
 ) -> tuple[Wave, ...]:
     """What the photographs show of the coarse sinusoids, for ``held_to``; none where that is too little.
 
@@ -82,6 +98,7 @@ def coarse_waves(
     white : (rows, columns, 3) less the black image, NaN where not known
     phase_map, valid : where the camera pixels look, and which are known. From a plan whose opposites are computed
         nothing can be said: they contradict no response
+    shown_with : (3, 256) the response by which the sinusoids were encoded
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
@@ -94,6 +111,7 @@ def coarse_waves(
         return ()
     bright = np.percentile(white[lit][::7], 99, axis=0)
     table = _table()
+    asked = table @ ASKED[:, None]
     waves = []
     for axis, prefix in enumerate(COARSE):
         steps = plan.sinusoids(prefix)
@@ -109,11 +127,25 @@ def coarse_waves(
         levels = np.stack([_levels(table, place[..., axis] - shift, variance) for shift in shifts], axis=2)
         near = 1 / OVERSAMPLED
         ahead, behind = (
-            np.stack([_levels(table, place[..., axis] - shift + step, variance) @ ASKED for shift in shifts], axis=2)
+            np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
             for step in (near, -near)
         )
-        waves.append(Wave(ratio, weight, levels, (ahead - behind) / (2 * near)))
+        values = _values([device_frame(step, plan.size_px, shown_with) for step in steps], shifts, axis)
+        waves.append(Wave(ratio, weight, levels, (ahead - behind) / (2 * near), values))
     return tuple(waves)
+
+
+def _values(frames: Sequence[ByteImage], shifts: Sequence[int], axis: int) -> Float64:
+    """``Wave.values`` of the steps' frames (rows, columns, 3), of sinusoids along ``axis`` at ``shifts``."""
+    found = np.zeros((HALF + 1, 256, 3))
+    for shown, shift in zip(frames, shifts, strict=True):
+        lines = shown if axis == 1 else shown.swapaxes(0, 1)
+        within = (np.arange(len(lines)) - shift) % PERIOD_PX
+        level = HALF - np.minimum(within, PERIOD_PX - within)
+        for channel in range(3):
+            at = level[:, None] * 256 + lines[..., channel]
+            found[..., channel] += np.bincount(at.ravel(), minlength=found[..., 0].size).reshape(-1, 256)
+    return np.asarray(found / found.sum(axis=1, keepdims=True), np.float64)
 
 
 def _colours(captures: Captures, name: str, black: FloatImage, at: npt.NDArray[np.int64]) -> Float64:
@@ -136,13 +168,11 @@ def held_to(
     """
     if not waves:
         return radiometry
-    device = [np.interp(ASKED, curve, np.arange(256.0)) for curve in shown_with]
-    known = np.stack([np.interp(at, np.arange(256.0), r) for at, r in zip(device, radiometry.response, strict=True)])
-    found, sigma = _measured(waves, radiometry, known)
+    found, sigma = _measured(waves, radiometry)
     lit = lit_pixels(white)
     indirect = float(np.median(share[lit])) if lit.any() else 0.0
     of_tiles = TILES_SIGMA**2 + (TILES_SIGMA_OF_SHARE * indirect) ** 2
-    change = of_tiles / (of_tiles + SIGMA**2 + sigma**2) * (found - known)
+    change = of_tiles / (of_tiles + SIGMA**2 + sigma**2) * found
     change[:, [0, -1]] = 0
     curves = [
         rising(own + _between(off, np.arccos(np.clip(1 - 2 * used, -1, 1))))
@@ -158,27 +188,23 @@ def _between(change: Float64, angle: Float64) -> Float64:
     return np.asarray(CubicSpline(ANGLES, change, bc_type="clamped")(angle), np.float64)
 
 
-def _measured(waves: tuple[Wave, ...], radiometry: Radiometry, known: Float64) -> tuple[Float64, Float64]:
-    """(3, 13) light of each projector channel at ``ASKED``, and its standard deviation by noise."""
-    shown = radiometry.emitted(known.T).T
-    inner, first = HALF - 1, shown[:, 1:-1]
+def _measured(waves: tuple[Wave, ...], radiometry: Radiometry) -> tuple[Float64, Float64]:
+    """(3, 13) what is to be added to each channel's light at ``ASKED``, and its standard deviation by noise."""
+    inner = HALF - 1
     bend = np.diff(np.eye(HALF + 1), 2, axis=0)[:, 1:-1] / BEND
-    sigma = np.zeros_like(shown)
-    for _ in range(TURNS):
-        seen = radiometry.mixing @ shown
-        whole = np.kron(np.eye(3), bend.T @ bend)
-        # smooth is the error of what the sinusoids asked for
-        wanted = whole @ np.tile(ASKED[1:-1], 3)
-        for wave in waves:
-            for channel, (matrix, value) in enumerate(_normals(wave, seen)):
-                to_camera = np.kron(radiometry.mixing[channel], np.eye(inner))
-                whole += to_camera.T @ matrix @ to_camera
-                wanted += to_camera.T @ (value + matrix @ seen[channel, 1:-1])
-        covariance = np.linalg.inv(whole)
-        first = (covariance @ wanted).reshape(3, inner)
-        sigma[:, 1:-1] = np.sqrt(np.diag(covariance)).reshape(3, inner)
-        shown = np.concatenate([np.zeros((3, 1)), first, np.ones((3, 1))], axis=1)
-    return radiometry.channels(shown.T).T, sigma
+    whole, wanted = np.kron(np.eye(3), bend.T @ bend), np.zeros(3 * inner)
+    for wave in waves:
+        seen = radiometry.mixing @ radiometry.emitted(wave.light(radiometry.response)).T
+        for channel, (matrix, value) in enumerate(_normals(wave, seen)):
+            to_camera = np.kron(radiometry.mixing[channel], np.eye(inner))
+            whole += to_camera.T @ matrix @ to_camera
+            wanted += to_camera.T @ value
+    covariance = np.linalg.inv(whole)
+    added, sigma = np.zeros((3, HALF + 1)), np.zeros((3, HALF + 1))
+    added[:, 1:-1] = (covariance @ wanted).reshape(3, inner)
+    sigma[:, 1:-1] = np.sqrt(np.diag(covariance)).reshape(3, inner)
+    shown = np.mean([radiometry.emitted(wave.light(radiometry.response)) for wave in waves], axis=0)
+    return (radiometry.channels(shown + added.T) - radiometry.channels(shown)).T, sigma
 
 
 def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
@@ -249,7 +275,7 @@ def _parts(place_px: FloatImage, used: Mask, size_px: tuple[int, int]) -> npt.ND
     part = row * (size_px[0] // PART_PX + 1) + column
     order = np.argsort(part, kind="stable")
     _, first, count = np.unique(part[order], return_index=True, return_counts=True)
-    full = np.flatnonzero(count >= PIXELS)
+    full = np.flatnonzero(count >= FEWEST_PIXELS)
     if full.size > MOST_PARTS:
         full = full[np.arange(MOST_PARTS) * full.size // MOST_PARTS]
     taken = (np.arange(PIXELS) * count[full, None]) // PIXELS
@@ -284,7 +310,7 @@ def _table() -> Float64:
 
 
 def _levels(table: Float64, place_px: Float64, variance: Float64) -> Float64:
-    """(..., 13) of ``_table`` at places and variances (...)."""
+    """(..., n) of ``table`` (variances, places, n), as ``_table``, at places and variances (...)."""
     at = np.rint(place_px * OVERSAMPLED).astype(np.int64) % table.shape[1]
     log = np.log(np.clip(variance, VARIANCES_PX2[0], VARIANCES_PX2[-1]))
     number = np.interp(log, np.log(VARIANCES_PX2), np.arange(VARIANCES_PX2.size))

@@ -23,7 +23,7 @@ from controller.calibrate.photometry.separation import (
     shown_contrast,
     sinusoid_contrast,
 )
-from controller.calibrate.photometry.waveform import coarse_waves, held_to
+from controller.calibrate.photometry.waveform import Wave, coarse_waves, held_to
 from controller.core.arrays import FloatImage
 from controller.core.troubles import TroubleCode
 from controller.rig.rig import RigProjector
@@ -67,7 +67,9 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     white = seen.white
     code = tile_code(captures, plan, light.black, light.white, known_px=known_px, noise=noise)
     known = pixels.phase_map
-    waves = () if known is None else coarse_waves(captures, plan, light.white, known, pixels.seen)
+    waves: tuple[Wave, ...] = ()
+    if known is not None:
+        waves = coarse_waves(captures, plan, light.white, known, pixels.seen, light.response)
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
