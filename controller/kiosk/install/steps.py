@@ -66,7 +66,7 @@ def install(
     _outputs(system, again=outputs_again, say=say)
     if restart or any(changed):
         # In this order the player stops only once the controller has, and starts at once, before the controller. In the
-        # other order the projectors are black for as long as the controller takes to stop.
+        # other order there is no player for as long as the controller takes to stop.
         system.run("systemctl", "restart", *reversed(SERVICES[1:]))
     system.run("systemctl", "start", TARGET)
     if not system.dry:
