@@ -12,7 +12,8 @@ from typing import Any, Final
 
 from pyglet.libs.x11 import xlib
 
-_NAME: Final = b"_VELATURA_PICTURE"
+NAME: Final = b"_VELATURA_PICTURE"
+"""Of the root window's property: 1 while the picture is there."""
 _CARDINAL: Final = 6
 _NO_PIXMAP: Final = 0
 _BLACK: Final = 0
@@ -20,21 +21,14 @@ _BITS: Final = 32
 
 
 class KeptPicture:
-    """``display``: a connection of Xlib; ``root``: its root window."""
+    """``display``: a connection of Xlib; ``root``: its root window.
 
-    def __init__(self, display: Any, root: int) -> None:
-        self._display, self._root = display, root
-        self._name = xlib.XInternAtom(display, _NAME, 0)
+    ``there``: whether the player before has left its picture, and it was not dropped since; at first as given
+    """
 
-    def there(self) -> bool:
-        """Whether the player before has left its picture."""
-        kind, width, count, left = c_ulong(), c_int(), c_ulong(), c_ulong()
-        data = POINTER(c_ubyte)()
-        xlib.XGetWindowProperty(self._display, self._root, self._name, 0, 1, 0, _CARDINAL, byref(kind), byref(width),
-                                byref(count), byref(left), byref(data))  # fmt: skip
-        if data:
-            xlib.XFree(data)
-        return bool(count.value)
+    def __init__(self, display: Any, root: int, *, there: bool) -> None:
+        self._display, self._root, self.there = display, root, there
+        self._name = xlib.XInternAtom(display, NAME, 0)
 
     def let_through(self, *windows: int) -> None:
         """Keep the server from painting these windows black when they appear."""
@@ -67,6 +61,7 @@ class KeptPicture:
 
     def drop(self) -> None:
         """Black again, wherever no window is."""
+        self.there = False
         xlib.XSetWindowBackground(self._display, self._root, _BLACK)
         xlib.XClearWindow(self._display, self._root)
         xlib.XDeleteProperty(self._display, self._root, self._name)

@@ -52,7 +52,6 @@ class WindowOutput:
             for connector in found.values():
                 self._server.make_plain(connector)
         self._places = self._placed(found)
-        self._continued = self._server.kept.there()
         try:
             self._window = self._open_window()
         except (pyglet.display.xlib.NoSuchDisplayException, pyglet.window.NoSuchConfigException) as error:
@@ -78,7 +77,7 @@ class WindowOutput:
         window = pyglet.window.Window(
             *self._extent(), caption="Velatura", style="borderless", vsync=True, visible=False, config=config
         )
-        if self._continued:
+        if self.continued:
             self._server.kept.let_through(window._window, window._view)
         window.set_location(0, 0)
         window.set_visible(True)
@@ -168,14 +167,13 @@ class WindowOutput:
         self._window.flip()
         gl.glFinish()
         at_s = time.monotonic()
-        if self._continued:
-            self._continued = False
+        if self.continued:
             self._server.kept.drop()
         return at_s
 
     @property
     def continued(self) -> bool:
-        return self._continued
+        return self._server.kept.there
 
     def leave(self) -> None:
         self._server.kept.keep(self._window._view)
@@ -187,7 +185,7 @@ class WindowOutput:
         if self._server.changed():
             self._follow()
         self._window.dispatch_events()
-        if self._damaged and not self._continued:
+        if self._damaged and not self.continued:
             self._damaged = False
             self._window.switch_to()
             self._draw()

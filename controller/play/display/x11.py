@@ -18,6 +18,7 @@ from pyglet.libs.x11 import xlib, xrandr
 
 from controller.core.errors import WorkError
 from controller.play.display.edid import serial_names
+from controller.play.display.kept_picture import NAME as KEPT
 from controller.play.display.kept_picture import KeptPicture
 
 _CARDINAL, _ATOM = 6, 4
@@ -95,7 +96,7 @@ class XServer:
         self._address = ctypes.cast(self._display, c_void_p)
         self._root = xlib.XDefaultRootWindow(self._display)
         _select_input(self._address, self._root, _NOTIFY_EVERYTHING)
-        self.kept = KeptPicture(self._display, self._root)
+        self.kept = KeptPicture(self._display, self._root, there=bool(self._window_number(self._root, KEPT)))
 
     def close(self) -> None:
         """Hang up."""
