@@ -35,6 +35,7 @@ from controller.stage.bench import BenchProcess
 from controller.stage.calibrations import KEY_FILE, output_sizes
 from controller.stage.check import check_stage
 from tests.controller.play.wire import Wire
+from tests.waiting import meanwhile
 
 STARTS = 5
 HANGS = 3
@@ -137,21 +138,9 @@ def _busy(stage: Path, pid: int) -> float:
 @contextlib.contextmanager
 def _changing(stage: Path) -> Iterator[None]:
     """Inside, the hour at which the stage closes changes, which leaves what is played as it is."""
-    ended = threading.Event()
-
-    def change() -> None:
-        for closes in itertools.cycle(("23:58", "23:59")):
-            if ended.wait(0.25):
-                return
-            _close_at(stage, closes)
-
-    thread = threading.Thread(target=change)
-    thread.start()
-    try:
+    closing = itertools.cycle(("23:58", "23:59"))
+    with meanwhile(lambda: _close_at(stage, next(closing)), every_s=0.25):
         yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _close_at(stage: Path, closes: str) -> None:

@@ -323,6 +323,4 @@ class Player:
         assert self._playlist is not None
         self._decoded.want(self._playlist.upcoming)
         name, fade_s = self._playlist.appearance, self._playlist.fade_s
-        if self._output.continued:
-            fade_s = 0.0  # It would begin with black.
         self._coming = PendingPresentation("appearance", name, None, tick, on_result, fade_s, paced=True)

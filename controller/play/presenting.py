@@ -76,7 +76,8 @@ class Presenter:
 
     def _prepare(self, coming: PendingPresentation, frames: FrameSet) -> None:
         """Prepare the set itself, or the next step on its way in."""
-        steps = self.grid.ticks(coming.fade_s)
+        # Of a picture that another player has left nothing is known: a fade would begin with black.
+        steps = 0 if self._output.continued else self.grid.ticks(coming.fade_s)
         if coming.begun_tick is None and steps > 1:
             self._output.load_fade(self.shown, frames)
             coming.begin(steps)

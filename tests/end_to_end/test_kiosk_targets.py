@@ -44,6 +44,7 @@ from tests.controller.panel.served import served
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied, wait_for
 from tests.end_to_end.test_targets import CAMERA_PX, grey_png
+from tests.waiting import meanwhile
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1500)]
 LONG_MS = 800_000
@@ -92,20 +93,13 @@ def ended(kiosk: StageKiosk, job: Job) -> Job:
 @contextmanager
 def moved(kiosk: StageKiosk) -> Iterator[None]:
     """A thread moves its service, as that of ``velatura serve`` does."""
-    over = threading.Event()
 
     def move() -> None:
-        while not over.wait(0.05):
-            kiosk.service.reconciler.step()
-            kiosk.service.changed()
+        kiosk.service.reconciler.step()
+        kiosk.service.changed()
 
-    thread = threading.Thread(target=move)
-    thread.start()
-    try:
+    with meanwhile(move, every_s=0.05):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")

@@ -13,7 +13,7 @@ leaves whole lines brighter or darker than asked for, by up to 0.001 of white. T
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -130,18 +130,17 @@ def coarse_waves(
             np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
             for step in (near, -near)
         )
-        values = _values([device_frame(step, plan.size_px, shown_with) for step in steps], shifts, axis)
+        values = _values((device_frame(step, plan.size_px, shown_with) for step in steps), shifts, axis)
         waves.append(Wave(ratio, weight, levels, (ahead - behind) / (2 * near), values))
     return tuple(waves)
 
 
-def _values(frames: Sequence[ByteImage], shifts: Sequence[int], axis: int) -> Float64:
+def _values(frames: Iterable[ByteImage], shifts: Sequence[int], axis: int) -> Float64:
     """``Wave.values`` of the steps' frames (rows, columns, 3), of sinusoids along ``axis`` at ``shifts``."""
     found = np.zeros((HALF + 1, 256, 3))
     for shown, shift in zip(frames, shifts, strict=True):
         lines = shown if axis == 1 else shown.swapaxes(0, 1)
-        within = (np.arange(len(lines)) - shift) % PERIOD_PX
-        level = HALF - np.minimum(within, PERIOD_PX - within)
+        level = _level(np.arange(len(lines)) - shift)
         for channel in range(3):
             at = level[:, None] * 256 + lines[..., channel]
             found[..., channel] += np.bincount(at.ravel(), minlength=found[..., 0].size).reshape(-1, 256)
@@ -193,9 +192,9 @@ def _measured(waves: tuple[Wave, ...], radiometry: Radiometry) -> tuple[Float64,
     inner = HALF - 1
     bend = np.diff(np.eye(HALF + 1), 2, axis=0)[:, 1:-1] / BEND
     whole, wanted = np.kron(np.eye(3), bend.T @ bend), np.zeros(3 * inner)
-    for wave in waves:
-        seen = radiometry.mixing @ radiometry.emitted(wave.light(radiometry.response)).T
-        for channel, (matrix, value) in enumerate(_normals(wave, seen)):
+    shown = [radiometry.emitted(wave.light(radiometry.response)) for wave in waves]
+    for wave, light in zip(waves, shown, strict=True):
+        for channel, (matrix, value) in enumerate(_normals(wave, radiometry.mixing @ light.T)):
             to_camera = np.kron(radiometry.mixing[channel], np.eye(inner))
             whole += to_camera.T @ matrix @ to_camera
             wanted += to_camera.T @ value
@@ -203,8 +202,8 @@ def _measured(waves: tuple[Wave, ...], radiometry: Radiometry) -> tuple[Float64,
     added, sigma = np.zeros((3, HALF + 1)), np.zeros((3, HALF + 1))
     added[:, 1:-1] = (covariance @ wanted).reshape(3, inner)
     sigma[:, 1:-1] = np.sqrt(np.diag(covariance)).reshape(3, inner)
-    shown = np.mean([radiometry.emitted(wave.light(radiometry.response)) for wave in waves], axis=0)
-    return (radiometry.channels(shown + added.T) - radiometry.channels(shown)).T, sigma
+    mean = np.mean(shown, axis=0)
+    return (radiometry.channels(mean + added.T) - radiometry.channels(mean)).T, sigma
 
 
 def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
@@ -303,10 +302,14 @@ def _table() -> Float64:
         kernel = np.exp(-((place[:, None] - pixel) ** 2) / (2 * variance))
         kernel[np.abs(place[:, None] - pixel) > reach] = 0
         kernel /= kernel.sum(axis=1, keepdims=True)
-        within = pixel % PERIOD_PX
-        level = HALF - np.minimum(within, PERIOD_PX - within)
-        found[number] = kernel @ np.eye(HALF + 1)[level]
+        found[number] = kernel @ np.eye(HALF + 1)[_level(pixel)]
     return found
+
+
+def _level(pixel: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Which of ``ASKED`` a sinusoid asks of a projector's pixel, counted from its brightest."""
+    within = pixel % PERIOD_PX
+    return np.asarray(HALF - np.minimum(within, PERIOD_PX - within), np.int64)
 
 
 def _levels(table: Float64, place_px: Float64, variance: Float64) -> Float64:

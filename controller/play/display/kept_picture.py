@@ -7,28 +7,28 @@ there.
 
 from __future__ import annotations
 
-from ctypes import POINTER, byref, c_int, c_ubyte, c_uint, c_ulong, cast
+from ctypes import byref, c_int, c_uint, c_ulong
 from typing import Any, Final
 
 from pyglet.libs.x11 import xlib
 
-NAME: Final = b"_VELATURA_PICTURE"
+from controller.play.display.properties import number_of, set_number
+
+_NAME: Final = b"_VELATURA_PICTURE"
 """Of the root window's property: 1 while the picture is there."""
-_CARDINAL: Final = 6
 _NO_PIXMAP: Final = 0
 _BLACK: Final = 0
-_BITS: Final = 32
 
 
 class KeptPicture:
     """``display``: a connection of Xlib; ``root``: its root window.
 
-    ``there``: whether the player before has left its picture, and it was not dropped since; at first as given
+    ``there``: whether the player before has left its picture, and it was not dropped since
     """
 
-    def __init__(self, display: Any, root: int, *, there: bool) -> None:
-        self._display, self._root, self.there = display, root, there
-        self._name = xlib.XInternAtom(display, NAME, 0)
+    def __init__(self, display: Any, root: int) -> None:
+        self._display, self._root = display, root
+        self.there = bool(number_of(display, root, _NAME))
 
     def let_through(self, *windows: int) -> None:
         """Keep the server from painting these windows black when they appear."""
@@ -52,8 +52,7 @@ class KeptPicture:
         xlib.XFillRectangle(self._display, pixmap, context, 0, 0, width, height)
         xlib.XCopyArea(self._display, window, pixmap, context, 0, 0, window_width, window_height, 0, 0)
         xlib.XSetWindowBackgroundPixmap(self._display, self._root, pixmap)
-        value = cast(byref(c_ulong(1)), POINTER(c_ubyte))
-        xlib.XChangeProperty(self._display, self._root, self._name, _CARDINAL, _BITS, 0, value, 1)
+        set_number(self._display, self._root, _NAME, 1)
         # The server keeps what a window has as its background.
         xlib.XFreeGC(self._display, context)
         xlib.XFreePixmap(self._display, pixmap)
@@ -64,7 +63,7 @@ class KeptPicture:
         self.there = False
         xlib.XSetWindowBackground(self._display, self._root, _BLACK)
         xlib.XClearWindow(self._display, self._root)
-        xlib.XDeleteProperty(self._display, self._root, self._name)
+        xlib.XDeleteProperty(self._display, self._root, xlib.XInternAtom(self._display, _NAME, 0))
         xlib.XSync(self._display, 0)
 
     def _shape(self, window: int) -> tuple[int, int, int]:

@@ -20,6 +20,7 @@ from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.core.errors import WorkError  # noqa: E402
 from controller.play.control.notify import log  # noqa: E402
 from controller.play.display.drawing import Canvas  # noqa: E402
+from controller.play.display.kept_picture import KeptPicture  # noqa: E402
 from controller.play.display.output_mapping import check_rates, find_connectors, fits, unfit  # noqa: E402
 from controller.play.display.x11 import Connector, XServer  # noqa: E402
 from controller.play.frames import FrameSet, OutputSize  # noqa: E402
@@ -53,7 +54,7 @@ class WindowOutput:
                 self._server.make_plain(connector)
         self._places = self._placed(found)
         try:
-            self._window = self._open_window()
+            self._window = _open_window(self._extent(), self._server.kept)
         except (pyglet.display.xlib.NoSuchDisplayException, pyglet.window.NoSuchConfigException) as error:
             raise WorkError(
                 "display-gone",
@@ -69,22 +70,6 @@ class WindowOutput:
         self._live: LiveRenderer | None = None
         self._damaged = False
         self._window.push_handlers(on_expose=self._on_expose, on_draw=self._on_expose, on_close=_stay)
-
-    def _open_window(self) -> Any:
-        config = gl.Config(  # type: ignore[abstract]
-            double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
-        )
-        window = pyglet.window.Window(
-            *self._extent(), caption="Velatura", style="borderless", vsync=True, visible=False, config=config
-        )
-        if self.continued:
-            self._server.kept.let_through(window._window, window._view)
-        window.set_location(0, 0)
-        window.set_visible(True)
-        # A window manager may have moved it while it was mapped.
-        window.set_location(0, 0)
-        window.set_mouse_visible(False)
-        return window
 
     def _find(self) -> tuple[dict[str, Connector], tuple[Connector, ...]]:
         connectors = self._server.connectors()
@@ -219,3 +204,20 @@ class WindowOutput:
 def _stay() -> bool:
     """A kiosk's window can't be closed from its frame."""
     return True
+
+
+def _open_window(extent: tuple[int, int], kept: KeptPicture) -> Any:
+    config = gl.Config(  # type: ignore[abstract]
+        double_buffer=True, red_size=8, green_size=8, blue_size=8, major_version=3, minor_version=3, depth_size=0
+    )
+    window = pyglet.window.Window(
+        *extent, caption="Velatura", style="borderless", vsync=True, visible=False, config=config
+    )
+    if kept.there:
+        kept.let_through(window._window, window._view)
+    window.set_location(0, 0)
+    window.set_visible(True)
+    # A window manager may have moved it while it was mapped.
+    window.set_location(0, 0)
+    window.set_mouse_visible(False)
+    return window

@@ -18,10 +18,10 @@ from pyglet.libs.x11 import xlib, xrandr
 
 from controller.core.errors import WorkError
 from controller.play.display.edid import serial_names
-from controller.play.display.kept_picture import NAME as KEPT
 from controller.play.display.kept_picture import KeptPicture
+from controller.play.display.properties import number_of, set_number
 
-_CARDINAL, _ATOM = 6, 4
+_ATOM: Final = 4
 _NOTIFY_EVERYTHING: Final = 0b1111
 """RandR: screen, CRTC, output and property changes."""
 _GAMMA_TOLERANCE: Final = 0x0100
@@ -96,7 +96,7 @@ class XServer:
         self._address = ctypes.cast(self._display, c_void_p)
         self._root = xlib.XDefaultRootWindow(self._display)
         _select_input(self._address, self._root, _NOTIFY_EVERYTHING)
-        self.kept = KeptPicture(self._display, self._root, there=bool(self._window_number(self._root, KEPT)))
+        self.kept = KeptPicture(self._display, self._root)
 
     def close(self) -> None:
         """Hang up."""
@@ -124,30 +124,15 @@ class XServer:
         try:
             owner = xlib.XGetSelectionOwner(self._display, selection)
             if owner:
-                process = self._window_number(owner, _PROCESS)
+                process = number_of(self._display, owner, _PROCESS)
                 return f" (process {process})" if process else ""
             window = xlib.XCreateSimpleWindow(self._display, self._root, -1, -1, 1, 1, 0, 0, 0)
-            atom, number = xlib.XInternAtom(self._display, _PROCESS, 0), c_ulong(os.getpid())
-            value = ctypes.cast(byref(number), POINTER(c_ubyte))
-            xlib.XChangeProperty(self._display, window, atom, _CARDINAL, 32, 0, value, 1)
+            set_number(self._display, window, _PROCESS, os.getpid())
             xlib.XSetSelectionOwner(self._display, selection, window, 0)
             return None
         finally:
             xlib.XUngrabServer(self._display)
             xlib.XSync(self._display, 0)
-
-    def _window_number(self, window: int, name: bytes) -> int:
-        """A window's property that is one number; 0 where it has none."""
-        kind, width, count, left = c_ulong(), c_int(), c_ulong(), c_ulong()
-        data = POINTER(c_ubyte)()
-        atom = xlib.XInternAtom(self._display, name, 0)
-        xlib.XGetWindowProperty(self._display, window, atom, 0, 1, 0, _CARDINAL, byref(kind), byref(width),
-                                byref(count), byref(left), byref(data))  # fmt: skip
-        if not data:
-            return 0
-        number = c_ulong.from_address(ctypes.addressof(data.contents)).value if count.value else 0
-        xlib.XFree(data)
-        return number
 
     def changed(self) -> bool:
         """Whether outputs came, went or changed since the last call."""
@@ -249,9 +234,7 @@ class XServer:
 
     def bypass_compositor(self, window: int) -> None:
         """Tell a compositing window manager to leave this window alone (EWMH, _NET_WM_BYPASS_COMPOSITOR)."""
-        atom = xlib.XInternAtom(self._display, b"_NET_WM_BYPASS_COMPOSITOR", 0)
-        value = ctypes.cast(byref(c_ulong(1)), POINTER(c_ubyte))
-        xlib.XChangeProperty(self._display, window, atom, _CARDINAL, 32, 0, value, 1)
+        set_number(self._display, window, b"_NET_WM_BYPASS_COMPOSITOR", 1)
         xlib.XSync(self._display, 0)
 
 

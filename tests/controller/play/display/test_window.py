@@ -9,10 +9,8 @@ import os
 import signal
 import struct
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +22,7 @@ from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerProcess, PlayerSettings
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
-from tests.waiting import wait_for
+from tests.waiting import meanwhile, wait_for
 
 Outputs = list[tuple[str, int, int]]
 Start = Callable[..., PlayerProcess]
@@ -157,6 +155,7 @@ def test_a_player_that_is_started_again_goes_on_without_black(
             wait_for(lambda: wire.ask("status")["showing"] == "appearance")
     assert len(seen) > 10
     assert all(seen)
+    np.testing.assert_array_equal(framebuffer.picture(), expected)
     with Wire(second.socket) as wire:
         wire.ask("play", appearance="3")
         np.testing.assert_array_equal(framebuffer.picture(), spanned(noise(outputs, 3), outputs))
@@ -196,25 +195,6 @@ def leave(player: PlayerProcess) -> None:
     """End it as `systemctl restart` does."""
     os.kill(player.pid, signal.SIGUSR1)
     wait_for(lambda: not player.alive)
-
-
-@contextmanager
-def meanwhile(look: Callable[[], object]) -> Iterator[None]:
-    """Look again and again in a thread; at least once after the last statement."""
-    ended = threading.Event()
-
-    def looking() -> None:
-        while not ended.is_set():
-            look()
-        look()
-
-    thread = threading.Thread(target=looking)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def test_without_a_display_it_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
