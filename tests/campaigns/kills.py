@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from tests.campaigns.mini_stage import APPEARANCE, prepare_mini, serve, taken
+from tests.processes import children
 
 REPOSITORY: Final = Path(__file__).parents[2]
 LONGEST_S: Final = 0.3
@@ -175,16 +176,6 @@ class Process:
 
     def __exit__(self, *_: object) -> None:
         self.kill()
-
-
-def children(pid: int) -> list[int]:
-    """Processes that a process has started, and those that these have."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            if int((folder / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
-                found += [*children(int(folder.name)), int(folder.name)]
-    return found
 
 
 class Life:

@@ -33,8 +33,8 @@ from plugins.emulated.projectors.mains import Mains
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.usb.bus import environment
 from plugins.emulated.usb.process import KINDS, UsbBusProcess
-from tests.campaigns.kills import children
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
+from tests.processes import children, command_of
 
 POLL_S: Final = 0.02
 STEADY_S: Final = 3.0
@@ -210,9 +210,9 @@ class WiredKiosk:
         return self.service.reconciler.machine.reason
 
     def signal_player(self, number: signal.Signals) -> None:
-        for pid in children(os.getpid()):
-            with contextlib.suppress(OSError):
-                if b"controller.play" in Path(f"/proc/{pid}/cmdline").read_bytes():
+        for pid in children():
+            if "controller.play" in command_of(pid):
+                with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, number)
 
     def _rest(self) -> None:

@@ -20,6 +20,7 @@ from numba import types
 
 from hal.runtime import kernels
 from hal.runtime.kernels import TABLES, Compilation, are_compiled, decode, encode, main, record
+from tests.processes import children
 
 MODULE = "controller.capture.encoding"
 """A small one, with several kernels, of which some call others and some use all cores."""
@@ -102,19 +103,13 @@ def test_a_compilation_whose_process_was_killed_names_what_is_missing_and_ends_w
     monkeypatch.setenv("VELATURA_CACHE", str(tmp_path))
     raised: list[threading.ExceptHookArgs] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
-    before = _children()
+    before = children()
     with Compilation(processes=1) as compilation:
-        for process in _children() - before:
+        for process in set(children()).difference(before):
             os.kill(process, signal.SIGKILL)
         assert compilation.wait(60)
         assert compilation.failed
     assert raised == []
-
-
-def _children() -> set[int]:
-    """Of this process, started by any of its threads."""
-    listed = Path("/proc/self/task").glob("*/children")
-    return {int(number) for children in listed for number in children.read_text().split()}
 
 
 def test_a_module_that_does_not_exist_fails_and_says_so_in_its_exit_code(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from plugins.emulated.optics.truth import DouserTruth
 from plugins.emulated.projectors.dousers import EmulatedDouser, EmulatedNode, dmx_nodes, read_levels
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from tests.ports import kept_port
+from tests.processes import children, command_of
 from tests.waiting import wait_for
 
 SOON = 20.0
@@ -147,9 +148,7 @@ def test_the_stream_of_a_controller_that_is_killed_is_ended_at_once(receiver: tu
 
 def sender_of(douser: SacnDouser) -> int:
     """The process that sends: a child of this one."""
-    children = Path(f"/proc/{os.getpid()}/task").glob("*/children")
-    pids = [int(pid) for file in children for pid in file.read_text().split()]
-    return next(pid for pid in pids if b"plugins.dousers.sender" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return next(pid for pid in children() if "plugins.dousers.sender" in command_of(pid))
 
 
 @pytest.mark.parametrize("lost", ["close", "hold"])

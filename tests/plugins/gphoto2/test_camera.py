@@ -21,6 +21,7 @@ from hal.values import ExposureSettings
 from plugins.gphoto2 import settings as words
 from plugins.gphoto2.camera import DRIVER, Gphoto2Camera, open_camera
 from tests.campaigns.camera_peers import FLAVOURS, Flavour, driver_captures
+from tests.processes import children, command_of
 from tests.waiting import wait_for
 
 
@@ -68,13 +69,7 @@ def test_a_camera_that_could_not_be_opened_leaves_no_process_behind() -> None:
     with pytest.raises(DeviceError) as caught:
         open_camera({"serial": "of another camera"}, OpenContext(Path()), in_seconds(20))
     assert caught.value.code == "camera-other"
-    assert not [child for child in children() if "plugins.gphoto2.worker" in child]
-
-
-def children() -> list[str]:
-    """The command lines of this process' children."""
-    mine = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ") for child in mine]
+    assert not [child for child in children() if "plugins.gphoto2.worker" in command_of(child)]
 
 
 def test_a_library_that_crashes_ends_its_process_and_the_call_is_done_again(camera: Gphoto2Camera) -> None:
