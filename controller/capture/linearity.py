@@ -30,6 +30,11 @@ PILED = 1.15
 HOT_SIGMAS = 12.0
 SMALLEST_CORRECTION = 0.015
 """Spread of the corrections of an exposure series from which the camera's exposure times are corrected."""
+UNSTEADY, AS_RATIOS = 0.01, 4
+"""Standard deviation by which a lamp is expected to change a ratio of two exposures, and how many measured ratios that
+counts as much as."""
+CHANCE = 0.01
+"""Probability up to which an unsteady lamp alone explains the ratios, and nothing is corrected."""
 NAMED_SPREAD = 0.003
 """Standard deviation of the pixels' response, relative, from which it is named; even sensors have 0.001 at most."""
 NAMED_HOT = 5e-5
@@ -131,10 +136,12 @@ def _site(one: RawExposure, levels: SensorLevels, row: int, column: int) -> npt.
 
 
 def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Float64:
-    """(n, 2) reported and true exposures in seconds, for those that are reported noticeably wrong.
+    """(n, 2) reported and true exposures in seconds, where the camera reports noticeably wrong ones; empty elsewhere.
 
     Cameras round: one that reports 1/30 s opens for 1/32 s. Each series gives the ratios of its exposures; together
     they are solved for the corrections that are smallest on the whole, since no photograph shows absolute time.
+    A lamp that is not steady changes ratios, too; by how much, the ratios tell that were measured more than once. What
+    it alone could explain is not corrected.
 
     Parameters
     ----------
@@ -151,11 +158,22 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
             row[reported.index(a)] -= 1
             rows.append(row)
             wanted.append(np.log(y / x) - np.log(b / a))
-    correction = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
-    # Smaller differences can come from the lamp, so the reported exposures are kept.
-    if np.ptp(correction) < SMALLEST_CORRECTION:
+    correction, _, rank, _ = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)
+    if np.ptp(correction) < SMALLEST_CORRECTION or _by_chance(np.array(rows) @ correction, np.array(wanted), rank):
         return np.empty((0, 2))
     return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
+
+
+def _by_chance(explained: Float64, measured: Float64, parameters: int) -> bool:
+    """Whether a lamp that is not steady could alone have made the ratios ``measured`` (n,), logarithms.
+
+    ``explained`` (n,): what wrong exposure times make of them, with so many ``parameters``.
+    """
+    from scipy.special import chdtri
+
+    left = float(np.sum((measured - explained) ** 2))
+    variance = (AS_RATIOS * UNSTEADY**2 + left) / (AS_RATIOS + len(measured) - parameters)
+    return bool(np.sum(explained**2) < chdtri(parameters, CHANCE) * variance)
 
 
 def camera_faults(exposures: Float64, hot: int, samples: int, spread: float = 0.0) -> Mapping[TroubleCode, str]:

@@ -92,6 +92,39 @@ def test_only_exposures_that_are_told_noticeably_wrong_are_corrected() -> None:
     assert np.prod(corrected[:, 1] / corrected[:, 0]) == pytest.approx(1.0)
 
 
+Series = list[tuple[list[float], list[float]]]
+
+
+def drawn_series(rng: np.random.Generator, flicker: float, wrong: float) -> tuple[Series, dict[float, float]]:
+    """Three projectors' exposures and ratios, and how long each exposure really is; relative standard deviations."""
+    true: dict[float, float] = {}
+    series: Series = []
+    for _ in range(3):
+        first = int(rng.integers(3))
+        exposures = [2.0 ** ((first + 5 * step) / 3) / 16 for step in range(3)]
+        for one in exposures:
+            true.setdefault(one, one * float(np.exp(wrong * rng.standard_normal())))
+        seen = [true[one] * (1 + flicker * rng.standard_normal()) for one in exposures]
+        series.append((exposures, [one / seen[0] for one in seen]))
+    return series, true
+
+
+def test_a_lamp_that_flickers_is_hardly_ever_taken_for_wrong_exposure_times() -> None:
+    rng = np.random.default_rng(7)
+    assert sum(len(true_exposures(drawn_series(rng, 0.007, 0.0)[0])) > 0 for _ in range(2000)) < 80
+
+
+def test_wrong_exposure_times_are_found_beside_a_lamp_that_flickers() -> None:
+    rng = np.random.default_rng(7)
+    drawn = [drawn_series(rng, 0.007, 0.03) for _ in range(200)]
+    corrected = [(true_exposures(series), true) for series, true in drawn]
+    found = [(one, true) for one, true in corrected if len(one)]
+    assert len(found) > 180
+    left = [np.log(one[:, 1] / [true[reported] for reported in one[:, 0]]) for one, true in found]
+    before = [np.log([true[reported] / reported for reported in one[:, 0]]) for one, true in found]
+    assert np.mean([one.std() for one in left]) < 0.5 * np.mean([one.std() for one in before])
+
+
 def test_a_limit_seen_once_too_low_does_not_count() -> None:
     high, low, none = np.full((2, 2), 4000.0), np.full((2, 2), 1700.0), np.full((2, 2), np.inf)
     np.testing.assert_array_equal(common_limit([low, high, none]), high)
