@@ -8,6 +8,8 @@ harmonics, too: by these, w is found at the values of device light that the sinu
 
 Device values are whole numbers, and what one pixel lacks its neighbours get (``encode_frame``). In a sinusoid this
 leaves whole lines brighter or darker than asked for, by up to 0.001 of white. The frames are known, so that is, too.
+How much of it a camera pixel sees depends on its blur, which is measured only nearly: each colour has some of its own,
+and a place that is not quite right blurs, too.
 """
 
 from __future__ import annotations
@@ -49,6 +51,8 @@ DARK_NOISE: Final = 0.03
 CONTRAST_LEFT: Final = 0.2, 1.5
 """Of white; a part with another direct light is none of one surface."""
 FLICKER: Final = 0.01
+BLUR_PX2: Final = 0.1
+"""Standard deviation of what a colour's blur has more than was measured, in projector pixels squared."""
 BEND: Final = 0.001
 """Standard deviation of the second differences of what is added to a response from tiles, from a level to the next."""
 SIGMA: Final = 0.00045
@@ -67,13 +71,15 @@ class Wave:
 
     ``ratio`` (parts, pixels, steps, 3): light over white; ``weight`` (parts, pixels, 3): white, of the brightest
     ``levels`` (parts, pixels, steps, 13): how much of each of ``ASKED`` a camera pixel gets
+    ``blurred`` (parts, pixels, steps, 13): change of ``levels`` with the blur, per projector pixel squared
     ``moved`` (parts, pixels, steps): change of the asked light with the place, per projector pixel
     ``values`` (13, 256, 3): share of each device value in the projector's pixels that were asked for a level
     """
 
     ratio: Float64
     weight: Float64
-    levels: Float64
+    levels: npt.NDArray[np.float32]
+    blurred: npt.NDArray[np.float32]
     moved: Float64
     values: Float64
 
@@ -111,6 +117,7 @@ def coarse_waves(
         return ()
     bright = np.percentile(white[lit][::7], 99, axis=0)
     table = _table()
+    change = _changes(table)
     asked = table @ ASKED[:, None]
     waves = []
     for axis, prefix in enumerate(COARSE):
@@ -124,14 +131,17 @@ def coarse_waves(
         place = phase_map.projector_px.reshape(-1, 2)[at].astype(np.float64)
         variance = _variance(phase_map.spread_px2, place, axis)
         shifts = [round(step.phase_rad / (2 * np.pi) * PERIOD_PX) for step in steps]
-        levels = np.stack([_levels(table, place[..., axis] - shift, variance) for shift in shifts], axis=2)
+        levels, blurred = (
+            np.stack([_levels(one, place[..., axis] - shift, variance).astype(np.float32) for shift in shifts], axis=2)
+            for one in (table, change)
+        )
         near = 1 / OVERSAMPLED
         ahead, behind = (
             np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
             for step in (near, -near)
         )
         values = _values((device_frame(step, plan.size_px, shown_with) for step in steps), shifts, axis)
-        waves.append(Wave(ratio, weight, levels, (ahead - behind) / (2 * near), values))
+        waves.append(Wave(ratio, weight, levels, blurred, (ahead - behind) / (2 * near), values))
     return tuple(waves)
 
 
@@ -210,14 +220,15 @@ def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
     """Of each camera channel: normal matrix (11, 11) and right side of what is to be added to the levels ``seen``.
 
     In each part, light that is not modulated, direct light, and a shift of the wave are free, and over all parts
-    the lamp's strength in each photograph.
+    the lamp's strength in each photograph, and the blur.
     """
     parts, pixels, steps, _ = wave.levels.shape
     inner = wave.levels[..., 1:-1].reshape(parts, pixels * steps, -1)
     photograph = np.tile(np.eye(steps), (pixels, 1))
+    known = np.array([FLICKER] * steps + [BLUR_PX2])
     moved = wave.moved.reshape(parts, -1)
     for channel in range(3):
-        model = (wave.levels @ seen[channel]).reshape(parts, -1)
+        model, blurred = ((one @ seen[channel]).reshape(parts, -1) for one in (wave.levels, wave.blurred))
         light = wave.ratio[..., channel].reshape(parts, -1)
         own = np.stack([np.ones_like(model), model, moved], axis=2)
         weight = np.repeat(wave.weight[..., channel], steps, axis=1) / (DARK_NOISE + np.clip(model, 0, 1))
@@ -227,7 +238,8 @@ def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
         solve, residual = _fitted(own, weight, light)
         fitted, direct = light - residual, solve(light[..., None])[:, 1, 0]
         good = (direct > CONTRAST_LEFT[0]) & (direct < CONTRAST_LEFT[1])
-        columns = np.concatenate([inner * direct[:, None, None], fitted[..., None] * photograph], axis=2)
+        of_blur = (blurred * direct[:, None])[..., None]
+        columns = np.concatenate([inner * direct[:, None, None], fitted[..., None] * photograph, of_blur], axis=2)
         columns -= own @ solve(columns)
         count = np.maximum(np.count_nonzero(weight, axis=1) - own.shape[2], 1)
         variance = np.maximum(np.sum(weight * residual**2, axis=1) / count, 1e-12)
@@ -235,7 +247,7 @@ def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
         weighted = (columns * weight[..., None]).reshape(parts * pixels * steps, -1)
         matrix = weighted.T @ columns.reshape(weighted.shape)
         value = weighted.T @ residual.ravel()
-        yield _without_flicker(matrix, value, steps)
+        yield _without(known, matrix, value)
 
 
 class _Solver:
@@ -255,11 +267,11 @@ def _fitted(own: Float64, weight: Float64, light: Float64) -> tuple[_Solver, Flo
     return solve, np.asarray(light - (own @ solve(light[..., None]))[..., 0], np.float64)
 
 
-def _without_flicker(matrix: Float64, value: Float64, steps: int) -> tuple[Float64, Float64]:
-    """Normal equations without their last ``steps`` unknowns, the lamp's strengths."""
-    left = len(value) - steps
-    gains = matrix[left:, left:] + np.eye(steps) / FLICKER**2
-    away = np.linalg.solve(gains, np.column_stack([matrix[left:, :left], value[left:]]))
+def _without(sigma: Float64, matrix: Float64, value: Float64) -> tuple[Float64, Float64]:
+    """Normal equations without their last unknowns, which are 0 with standard deviations ``sigma``."""
+    left = len(value) - len(sigma)
+    others = matrix[left:, left:] + np.diag(1 / sigma**2)
+    away = np.linalg.solve(others, np.column_stack([matrix[left:, :left], value[left:]]))
     across = matrix[:left, left:]
     return matrix[:left, :left] - across @ away[:, :-1], value[:left] - across @ away[:, -1]
 
@@ -304,6 +316,11 @@ def _table() -> Float64:
         kernel /= kernel.sum(axis=1, keepdims=True)
         found[number] = kernel @ np.eye(HALF + 1)[_level(pixel)]
     return found
+
+
+def _changes(table: Float64) -> Float64:
+    """Change of ``table`` (variances, places, 13) with the variance."""
+    return np.asarray(np.gradient(table, VARIANCES_PX2, axis=0), np.float64)
 
 
 def _level(pixel: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

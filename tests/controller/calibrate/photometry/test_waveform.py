@@ -52,14 +52,16 @@ def seen(of: Scene) -> Mapping[str, FloatImage]:
     return MappingProxyType({p.name: stage.photograph(device_frame(p, SIZE_PX, USED)) for p in wanted})
 
 
-def waves(of: Scene, captures: Mapping[str, FloatImage]) -> tuple[Wave, ...]:
+def waves(of: Scene, captures: Mapping[str, FloatImage], at: PhaseMap | None = None) -> tuple[Wave, ...]:
     white = captures["white"] - captures["black"]
-    return coarse_waves(captures, PLAN, white, place(of), np.ones(white.shape[:2], np.bool_), USED)
+    return coarse_waves(captures, PLAN, white, at or place(of), np.ones(white.shape[:2], np.bool_), USED)
 
 
-def held(of: Scene, captures: Mapping[str, FloatImage], known: Radiometry, share: float = MUCH) -> Radiometry:
+def held(
+    of: Scene, captures: Mapping[str, FloatImage], known: Radiometry, share: float = MUCH, at: PhaseMap | None = None
+) -> Radiometry:
     white = captures["white"] - captures["black"]
-    return held_to(waves(of, captures), known, USED, np.full(white.shape, share, np.float32), white)
+    return held_to(waves(of, captures, at), known, USED, np.full(white.shape, share, np.float32), white)
 
 
 def wrong(of: Scene) -> Radiometry:
@@ -94,6 +96,16 @@ def test_a_true_response_stays_as_it_is() -> None:
     of = scene(indirect=0.3)
     true = replace(wrong(of), response=of.response())
     assert error(held(of, seen(of), true), of) < 0.001
+
+
+@pytest.mark.parametrize("off_px2", [-0.05, 0.05])
+def test_a_blur_that_is_measured_only_nearly_changes_the_response_little(off_px2: float) -> None:
+    of = scene(indirect=0.3)
+    true = replace(wrong(of), response=of.response())
+    at = place(of)
+    nearly = replace(at, spread_px2=at.spread_px2 + np.array([off_px2, 0, off_px2], np.float32))
+    found = held(of, seen(of), true, at=nearly).response - held(of, seen(of), true).response
+    assert float(np.abs(found).max()) < 0.0003
 
 
 @settings(max_examples=6, deadline=None)
