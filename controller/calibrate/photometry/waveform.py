@@ -164,7 +164,12 @@ def _colours(captures: Captures, name: str, black: FloatImage, at: npt.NDArray[n
 
 
 def held_to(
-    waves: tuple[Wave, ...], radiometry: Radiometry, shown_with: Float64, share: FloatImage, white: FloatImage
+    waves: tuple[Wave, ...],
+    radiometry: Radiometry,
+    shown_with: Float64,
+    share: FloatImage,
+    white: FloatImage,
+    near: Float64 | None = None,
 ) -> Radiometry:
     """The radiometry, its responses held to the waves as far as they are surer than colour tiles.
 
@@ -174,10 +179,11 @@ def held_to(
     radiometry : from colour tiles
     shown_with : (3, 256) the response by which the sinusoids were encoded
     share : (rows, columns, 3) of the projector's white (rows, columns, 3) that is indirect light
+    near : (3, 256) what was found before: how much each pixel counts depends on what is left of it. None: the tiles'
     """
     if not waves:
         return radiometry
-    found, sigma = _measured(waves, radiometry)
+    found, sigma = _measured(waves, radiometry, radiometry.response if near is None else near)
     lit = lit_pixels(white)
     indirect = float(np.median(share[lit])) if lit.any() else 0.0
     of_tiles = TILES_SIGMA**2 + (TILES_SIGMA_OF_SHARE * indirect) ** 2
@@ -197,23 +203,29 @@ def _between(change: Float64, angle: Float64) -> Float64:
     return np.asarray(CubicSpline(ANGLES, change, bc_type="clamped")(angle), np.float64)
 
 
-def _measured(waves: tuple[Wave, ...], radiometry: Radiometry) -> tuple[Float64, Float64]:
-    """(3, 13) what is to be added to each channel's light at ``ASKED``, and its standard deviation by noise."""
+def _measured(waves: tuple[Wave, ...], radiometry: Radiometry, near: Float64) -> tuple[Float64, Float64]:
+    """(3, 13) what is to be added to each channel's light at ``ASKED``, and its standard deviation by noise.
+
+    ``near``: (3, 256) a response near to the one that is sought
+    """
     inner = HALF - 1
     bend = np.diff(np.eye(HALF + 1), 2, axis=0)[:, 1:-1] / BEND
-    whole, wanted = np.kron(np.eye(3), bend.T @ bend), np.zeros(3 * inner)
-    shown = [radiometry.emitted(wave.light(radiometry.response)) for wave in waves]
+    whole = np.kron(np.eye(3), bend.T @ bend)
+    shown, nearer = (
+        [radiometry.emitted(wave.light(response)).T for wave in waves] for response in (radiometry.response, near)
+    )
+    mean = np.mean(shown, axis=0)
+    added, sigma = np.mean(nearer, axis=0) - mean, np.zeros((3, HALF + 1))
+    wanted = -whole @ added[:, 1:-1].ravel()
     for wave, light in zip(waves, shown, strict=True):
-        for channel, (matrix, value) in enumerate(_normals(wave, radiometry.mixing @ light.T)):
+        for channel, (matrix, value) in enumerate(_normals(wave, radiometry.mixing @ (light + added))):
             to_camera = np.kron(radiometry.mixing[channel], np.eye(inner))
             whole += to_camera.T @ matrix @ to_camera
             wanted += to_camera.T @ value
     covariance = np.linalg.inv(whole)
-    added, sigma = np.zeros((3, HALF + 1)), np.zeros((3, HALF + 1))
-    added[:, 1:-1] = (covariance @ wanted).reshape(3, inner)
+    added[:, 1:-1] += (covariance @ wanted).reshape(3, inner)
     sigma[:, 1:-1] = np.sqrt(np.diag(covariance)).reshape(3, inner)
-    mean = np.mean(shown, axis=0)
-    return (radiometry.channels(mean + added.T) - radiometry.channels(mean)).T, sigma
+    return (radiometry.channels((mean + added).T) - radiometry.channels(mean.T)).T, sigma
 
 
 def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:

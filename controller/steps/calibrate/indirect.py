@@ -24,7 +24,7 @@ from controller.calibrate.photometry.separation import (
     sinusoid_contrast,
 )
 from controller.calibrate.photometry.waveform import Wave, coarse_waves, held_to
-from controller.core.arrays import FloatImage
+from controller.core.arrays import Float64, FloatImage
 from controller.core.troubles import TroubleCode
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
@@ -70,6 +70,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     waves: tuple[Wave, ...] = ()
     if known is not None:
         waves = coarse_waves(captures, plan, light.white, known, pixels.seen, light.response)
+    near: Float64 | None = None
     for number in range(PASSES):
         context.advance(number / PASSES)
         linearity = shown_contrast(radiometry, light.response)
@@ -83,7 +84,8 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
             noise=noise,
             code=code,
         )
-        radiometry = held_to(waves, radiometry, light.response, share, white)
+        radiometry = held_to(waves, radiometry, light.response, share, white, near)
+        near = radiometry.response
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     flicker = lamp_flicker(seen.strengths)

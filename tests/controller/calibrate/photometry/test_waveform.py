@@ -58,10 +58,15 @@ def waves(of: Scene, captures: Mapping[str, FloatImage], at: PhaseMap | None = N
 
 
 def held(
-    of: Scene, captures: Mapping[str, FloatImage], known: Radiometry, share: float = MUCH, at: PhaseMap | None = None
+    of: Scene,
+    captures: Mapping[str, FloatImage],
+    known: Radiometry,
+    share: float = MUCH,
+    at: PhaseMap | None = None,
+    near: Float64 | None = None,
 ) -> Radiometry:
     white = captures["white"] - captures["black"]
-    return held_to(waves(of, captures, at), known, USED, np.full(white.shape, share, np.float32), white)
+    return held_to(waves(of, captures, at), known, USED, np.full(white.shape, share, np.float32), white, near)
 
 
 def wrong(of: Scene) -> Radiometry:
@@ -96,6 +101,13 @@ def test_a_true_response_stays_as_it_is() -> None:
     of = scene(indirect=0.3)
     true = replace(wrong(of), response=of.response())
     assert error(held(of, seen(of), true), of) < 0.001
+
+
+def test_what_was_found_before_brings_the_response_nearer() -> None:
+    of = scene(indirect=0.3)
+    first = held(of, seen(of), wrong(of))
+    second = held(of, seen(of), wrong(of), near=first.response)
+    assert error(second, of) < 0.8 * error(first, of)
 
 
 @pytest.mark.parametrize("off_px2", [-0.05, 0.05])
