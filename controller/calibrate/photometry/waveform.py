@@ -237,7 +237,7 @@ def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
     parts, pixels, steps, _ = wave.levels.shape
     inner = wave.levels[..., 1:-1].reshape(parts, pixels * steps, -1)
     photograph = np.tile(np.eye(steps), (pixels, 1))
-    known = np.array([FLICKER] * steps + [BLUR_PX2])
+    expected = np.array([FLICKER] * steps + [BLUR_PX2])
     moved = wave.moved.reshape(parts, -1)
     for channel in range(3):
         model, blurred = ((one @ seen[channel]).reshape(parts, -1) for one in (wave.levels, wave.blurred))
@@ -259,7 +259,7 @@ def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
         weighted = (columns * weight[..., None]).reshape(parts * pixels * steps, -1)
         matrix = weighted.T @ columns.reshape(weighted.shape)
         value = weighted.T @ residual.ravel()
-        yield _without(known, matrix, value)
+        yield _without(expected, matrix, value)
 
 
 class _Solver:
