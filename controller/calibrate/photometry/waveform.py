@@ -135,13 +135,13 @@ def coarse_waves(
             np.stack([_levels(one, place[..., axis] - shift, variance).astype(np.float32) for shift in shifts], axis=2)
             for one in (table, change)
         )
-        near = 1 / OVERSAMPLED
+        beside = 1 / OVERSAMPLED
         ahead, behind = (
             np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
-            for step in (near, -near)
+            for step in (beside, -beside)
         )
         values = _values((device_frame(step, plan.size_px, shown_with) for step in steps), shifts, axis)
-        waves.append(Wave(ratio, weight, levels, blurred, (ahead - behind) / (2 * near), values))
+        waves.append(Wave(ratio, weight, levels, blurred, (ahead - behind) / (2 * beside), values))
     return tuple(waves)
 
 
