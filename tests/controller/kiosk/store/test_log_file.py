@@ -15,18 +15,31 @@ from controller.kiosk.store.event_log import Decision, EventLog
 from tests.controller.kiosk.store.full_disk import without_space
 
 
+def damage(path: Path, begin: int, end: int | None = None) -> None:
+    """Change every byte of a file from ``begin`` to ``end`` (None: its end)."""
+    content = bytearray(path.read_bytes())
+    content[begin:end] = bytes(byte ^ 0xA5 for byte in content[begin:end])
+    path.write_bytes(content)
+
+
+def written(path: Path, *codes: str, **kept: str) -> None:
+    """A log of one event of each code, in this order, and with these values kept."""
+    log = EventLog(path, durable=False)
+    for code in codes:
+        log.add(Decision(code, "One. " * 50))
+    for name, value in kept.items():
+        log.keep(name, value)
+    log.close()
+
+
 @pytest.mark.parametrize("whole", [4096, 8 * 4096])
 def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     tmp_path: Path, whole: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, is_full = tmp_path / EventLog.FILE, [True]
-    log = EventLog(path, durable=False)
-    for _ in range(100):
-        log.add(Decision("before", "One. " * 50))
-    log.close()
-    content = path.read_bytes()
+    written(path, *["before"] * 100)
     # The schema's page is not damaged where it is ``whole``.
-    path.write_bytes(content[: whole - 2000] + bytes(byte ^ 0xA5 for byte in content[whole - 2000 :]))
+    damage(path, whole - 2000)
 
     def replace(old: Path, new: Path) -> Path:
         if is_full:
@@ -52,14 +65,9 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
 
 def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk_has_space(tmp_path: Path) -> None:
     path, is_full = tmp_path / EventLog.FILE, [True]
-    log = EventLog(path, durable=False)
-    for _ in range(400):
-        log.add(Decision("before", "One. " * 50))
-    log.close()
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2 // 4096 * 4096
-    content[middle : middle + 4096] = bytes(byte ^ 0xA5 for byte in content[middle : middle + 4096])
-    path.write_bytes(content)
+    written(path, *["before"] * 400)
+    middle = 4096 * (path.stat().st_size // 8192)
+    damage(path, middle, middle + 4096)
 
     now_s = [0.0]
     log = EventLog(path, durable=False, connect=without_space(is_full), monotonic=lambda: now_s[0])
@@ -84,9 +92,8 @@ def test_a_log_with_a_row_that_is_no_text_keeps_the_others_in_another_file(tmp_p
     for text in ("One.", "Two, the one that is damaged.", "Three."):
         log.add(Decision("before", text))
     log.close()
-    content = path.read_bytes()
-    at = content.index(b"the one that")
-    path.write_bytes(content[:at] + bytes(byte ^ 0xA5 for byte in content[at : at + 12]) + content[at + 12 :])
+    at = path.read_bytes().index(b"the one that")
+    damage(path, at, at + 12)
     log = EventLog(path, durable=False)
     log.add(Decision("after", "Four."))
     log.close()
@@ -99,10 +106,7 @@ def test_a_log_with_a_row_that_is_no_text_keeps_the_others_in_another_file(tmp_p
 @pytest.mark.parametrize("length", [50, 5000])
 def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length: int) -> None:
     path = tmp_path / EventLog.FILE
-    log = EventLog(path, durable=False)
-    for _ in range(100):
-        log.add(Decision("before", "One. " * 50))
-    log.close()
+    written(path, *["before"] * 100)
     path.write_bytes(path.read_bytes()[:length])
     log = EventLog(path, durable=False)
     log.add(Decision("after", "Two."))
@@ -116,14 +120,9 @@ def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length:
 
 def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) -> None:
     path = tmp_path / EventLog.FILE
-    log = EventLog(path, durable=False)
-    for _ in range(100):
-        log.add(Decision("before", "One. " * 50))
-    log.keep("override", "open")
-    log.close()
-    content = path.read_bytes()
+    written(path, *["before"] * 100, override="open")
     # All pages of events are damaged; the schema and the small tables before them are sound.
-    path.write_bytes(content[: 8 * 4096] + bytes(byte ^ 0xA5 for byte in content[8 * 4096 :]))
+    damage(path, 8 * 4096)
     log = EventLog(path, durable=False)
     for _ in range(3):
         log.add(Decision("after", "Two."))
@@ -139,11 +138,7 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
 
 def test_a_log_that_is_damaged_in_its_middle_keeps_what_came_after(tmp_path: Path) -> None:
     path = tmp_path / EventLog.FILE
-    log = EventLog(path, durable=False)
-    for number in range(300):
-        log.add(Decision(f"before-{number}", "One. " * 50))
-    log.keep("override", "open")
-    log.close()
+    written(path, *(f"before-{number}" for number in range(300)), override="open")
     content, middle = path.read_bytes(), 4096 * (path.stat().st_size // 8192)
     path.write_bytes(content[:middle] + b"\xa5" * 4096 + content[middle + 4096 :])
     log = EventLog(path, durable=False)
