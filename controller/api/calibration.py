@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +19,10 @@ from controller.calibrate.correspondence import decode as correspondence_decode
 from controller.calibrate.correspondence.colour_alignment import colour_shifts, colours_apart
 from controller.calibrate.correspondence.colour_places import ColourPlaces
 from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
-from controller.calibrate.photometry.colour_tiles import KnownIndirect
+from controller.calibrate.photometry.direct_light import tell_direct_light
 from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import indirect_share, shown_contrast, sinusoid_contrast
-from controller.calibrate.photometry.waveform import coarse_waves, held_to
+from controller.calibrate.photometry.separation import sinusoid_contrast
+from controller.calibrate.photometry.waveform import coarse_waves
 from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
 from controller.capture.patterns import plan_patterns
 from controller.capture.profile import CameraProfile, load_profile
@@ -32,9 +31,6 @@ from controller.core.errors import CalibrationError, UsageError
 from controller.transport import LightTransport
 from controller.transport.indirect import IndirectLight
 from controller.transport.indirect_stripes import dark_light
-
-PASSES: Final = 2
-"""Of telling light apart: the share follows from the response, the response from the share."""
 
 
 def decode(captures: CaptureSet) -> Correspondence:
@@ -157,18 +153,13 @@ def _calibrated(
     )  # fmt: skip
     if not indirect:
         return plain, fitted.mosaic
-    encoded_with = radiometry.response
     seen = sinusoid_contrast(captures.pictures, plan, white)
-    waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid, encoded_with)
+    waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid, radiometry.response)
     white = np.nan_to_num(seen.white)
-    for _ in range(PASSES):
-        linearity = shown_contrast(radiometry, encoded_with)
-        share = indirect_share(
-            seen, white, correspondence.projector_px, linearity=linearity, spread=fitted.spread
-        )  # fmt: skip
-        known = KnownIndirect(share * white, radiometry)
-        radiometry = measure_radiometry(captures.pictures, plan, indirect=known)[0]
-        radiometry = held_to(waves, radiometry, encoded_with, share, white)
+    share, radiometry, _ = tell_direct_light(
+        captures.pictures, plan, seen, waves, start=radiometry, shown_with=radiometry.response, white=white,
+        projector_px=correspondence.projector_px, spread=fitted.spread,
+    )  # fmt: skip
     thrown = share * white
     stripes = dark_light(captures.pictures, plan, fitted.phase_map.projector_px)
     part = replace(plain, radiometry=radiometry, white=white - thrown, indirect=thrown, stripes=stripes)

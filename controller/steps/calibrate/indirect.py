@@ -14,17 +14,13 @@ from controller.artefacts.pattern_plans import PlanUsed
 from controller.artefacts.photographs import Developed, noise_of
 from controller.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
 from controller.calibrate.correspondence.opposites import completed
-from controller.calibrate.photometry.colour_tiles import KnownIndirect, tile_code
+from controller.calibrate.photometry.colour_tiles import tile_code
+from controller.calibrate.photometry.direct_light import tell_direct_light
 from controller.calibrate.photometry.lamp_light import lamp_flicker, unsteady
-from controller.calibrate.photometry.radiometry import measure_radiometry, painted
-from controller.calibrate.photometry.separation import (
-    indirect_figures,
-    indirect_share,
-    shown_contrast,
-    sinusoid_contrast,
-)
-from controller.calibrate.photometry.waveform import Wave, coarse_waves, held_to
-from controller.core.arrays import Float64, FloatImage
+from controller.calibrate.photometry.radiometry import painted
+from controller.calibrate.photometry.separation import indirect_figures, sinusoid_contrast
+from controller.calibrate.photometry.waveform import Wave, coarse_waves
+from controller.core.arrays import FloatImage
 from controller.core.troubles import TroubleCode
 from controller.rig.rig import RigProjector
 from controller.run.runner import Context, Step
@@ -33,8 +29,6 @@ from controller.steps import costs
 from controller.steps.troubles import tell
 from controller.transport.indirect_stripes import dark_light
 
-PASSES: Final = 2
-"""The share follows from the response by which sinusoids were shown, the response from the share."""
 GAIN_LIMITS: Final = 0.5, 2.0
 """Noise changes no white image by more, where it says anything."""
 TOLD_AT: Final = 64
@@ -62,7 +56,6 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     captures = completed(Developed(taken, {"black": light.black, "white": light.white + light.black}), plan)
     noise = noise_of(taken[plan.sinusoids("phase-x")[0].name])
     known_px = used.known_px(folder, name)
-    radiometry = light.radiometry
     seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
     white = seen.white
     code = tile_code(captures, plan, light.black, light.white, known_px=known_px, noise=noise)
@@ -70,22 +63,10 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     waves: tuple[Wave, ...] = ()
     if known is not None:
         waves = coarse_waves(captures, plan, light.white, known, pixels.seen, light.response)
-    near: Float64 | None = None
-    for number in range(PASSES):
-        context.advance(number / PASSES)
-        linearity = shown_contrast(radiometry, light.response)
-        share = indirect_share(
-            seen, white, pixels.projector_px, linearity=linearity, spread=pixels.surface_spread
-        )  # fmt: skip
-        radiometry, report = measure_radiometry(
-            captures,
-            plan,
-            indirect=KnownIndirect(share * white, radiometry),
-            noise=noise,
-            code=code,
-        )
-        radiometry = held_to(waves, radiometry, light.response, share, white, near)
-        near = radiometry.response
+    share, radiometry, report = tell_direct_light(
+        captures, plan, seen, waves, start=light.radiometry, shown_with=light.response, white=white,
+        projector_px=pixels.projector_px, spread=pixels.surface_spread, noise=noise, code=code, advance=context.advance,
+    )  # fmt: skip
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     flicker = lamp_flicker(seen.strengths)
