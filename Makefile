@@ -31,7 +31,7 @@ CORES := $(shell nproc 2>/dev/null || echo 2)
 # again: pytest-xdist would run its file again and again, without an end.
 WORKERS ?= $(shell expr $(CORES) + 2)
 # Folders of tests that need no other program. `slow` marks those that take seconds.
-FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle calibrate capture config core kiosk/decide plan report solve transport) \
+FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle config core kiosk/decide optics stage/report) \
 	tests/plugins/ptp tests/test_architecture.py
 DOCS_PYTHON ?= .venv/bin/python
 
@@ -100,7 +100,7 @@ docs:
 
 bench:
 	@.ci/setup test
-	.venv/bin/python -m benchmarks $(NAME) --size $(SIZE)
+	.venv/bin/python -m lab.timings $(NAME) --size $(SIZE)
 
 nightly:
 	@.ci/setup test

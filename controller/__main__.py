@@ -23,7 +23,6 @@ except ModuleNotFoundError as missing:  # an installation with only the player
     sys.exit(run_without_commands(sys.argv[1:], missing.name))
 
 from controller.cli import console, derived
-from controller.cli.benchmark_command import benchmark
 from controller.cli.commands import accounts as account_commands
 from controller.cli.commands import bundle as bundle_commands
 from controller.cli.commands import camera as camera_commands
@@ -37,14 +36,15 @@ from controller.cli.commands.keys import keys
 from controller.cli.commands.live import live
 from controller.cli.commands.photograph import photograph
 from controller.cli.commands.plan import plan
+from controller.cli.commands.record import record
 from controller.cli.commands.report import report
-from controller.cli.commands.study import study
 from controller.cli.error_reports import DONE, FAILED, report_error
-from controller.cli.record_command import record
 from controller.cli.running import Json, StageFolder, group, projector_names, work
-from controller.cli.simulate_command import simulate
 from controller.core.errors import UsageError
 from hal.runtime.caches import prepare_libraries
+from lab.compare.command import benchmark
+from lab.simulate.command import simulate
+from lab.study.command import study
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -87,7 +87,7 @@ def demo(
 
         stage = prepare(out.resolve(), size=size, object_file=object, seed=seed, room=room or DEFAULT_ROOM)
         if prepare_only:
-            from controller.stage.check import check_stage
+            from controller.stage.sessions.check import check_stage
 
             check_stage(stage)
             return {"stage": str(stage)}
@@ -111,7 +111,7 @@ def emulate(
     as_json: Json = False,
 ) -> int:
     """Run the emulated devices of a stage, or those of a tape, and print their addresses, until Ctrl-C."""
-    from controller.stage.bench import bench_of, terminated_when_input_ends
+    from controller.stage.sessions.bench import bench_of, terminated_when_input_ends
 
     if tape is not None:
         if until_input_ends:
@@ -154,9 +154,9 @@ def calibrate(
     """Photograph patterns and calibrate the stage. Continues an unfinished calibration."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.calibrate import calibrate
-        from controller.services.recalibrate import recalibrate
-        from controller.stage.session import OwnSession
+        from controller.stage.services.calibrate import calibrate
+        from controller.stage.services.recalibrate import recalibrate
+        from controller.stage.sessions.session import OwnSession
 
         session = OwnSession(stage)
         if quick or projector is not None:
@@ -199,9 +199,9 @@ def appearance(
     """Solve appearances with the latest calibration, refine them by photographs, and publish a signed bundle."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.calibrate import make_appearances
-        from controller.services.refine import refinement_of
-        from controller.stage.session import OwnSession
+        from controller.stage.services.calibrate import make_appearances
+        from controller.stage.services.refine import refinement_of
+        from controller.stage.sessions.session import OwnSession
 
         return make_appearances(
             session=OwnSession(stage), names=tuple(names or ()), scenes=tuple(blender or ()),
@@ -229,8 +229,8 @@ def play(
     """Switch the projectors on and show appearances of the installed bundle."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.play import play
-        from controller.stage.session import OwnSession
+        from controller.stage.services.play import play
+        from controller.stage.sessions.session import OwnSession
 
         return play(
             session=OwnSession(stage), names=tuple(names or ()), sequence=sequence, seconds=seconds or None,

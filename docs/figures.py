@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.storage import write_atomically
-from controller.study.catalogue import EXPERIMENTS
-from controller.study.output.figures import figure, span
-from controller.study.output.keeping import StoredStudy, read_study
-from controller.study.output.pages import DATA, INDEX, index_page, page
+from lab.study.catalogue import EXPERIMENTS
+from lab.study.output.figures import figure, span
+from lab.study.output.keeping import StoredStudy, read_study
+from lab.study.output.pages import DATA, INDEX, index_page, page
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 STUDY: Final = "docs/study"
@@ -109,7 +109,7 @@ FIGURES: Final[Mapping[str, Figure]] = {
 def documents(root: Path) -> Iterator[Path]:
     """Every document that people read, but for the pages that are made as a whole and those made by the build."""
     made = {f"{experiment.name}.md" for experiment in EXPERIMENTS} | {INDEX}
-    for path in [*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "benchmarks").glob("*.md")]:
+    for path in [*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "lab" / "timings").glob("*.md")]:
         beside = path.relative_to(root).as_posix()
         if not (beside.startswith("docs/generated/") or (beside.startswith(f"{STUDY}/") and path.name in made)):
             yield path

@@ -12,8 +12,8 @@ from babel.messages.extract import extract_from_dir
 from babel.messages.mofile import write_mo
 from babel.messages.pofile import read_po, write_po
 
-from controller.calibrate.verify import error_causes
 from controller.kiosk.operations.table import OPERATIONS
+from controller.optics.calibrate.verify import error_causes
 from controller.panel.pages.forms import LEADS_TO
 from controller.panel.words.language import LANGUAGES
 

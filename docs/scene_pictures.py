@@ -13,14 +13,14 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.geometry import read_geometry
-from controller.blender.job import BUILTIN, RenderSettings, as_seen, write_job
-from controller.blender.run import find_blender, render
 from controller.core.arrays import ByteImage, Mask
 from controller.kiosk.preview.scenes import SHIPPED
-from controller.solve.targets.files import read_picture
-from controller.solve.targets.values import linear_to_srgb
+from controller.optics.solve.targets.files import read_picture
+from controller.optics.solve.targets.values import linear_to_srgb
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
+from controller.stage.blender.run import find_blender, render
 
 NAMES: Final = ("left", "right", "above")
 """The projectors of a demo."""

@@ -39,14 +39,14 @@ LONGEST_FIRST: Final = (
     "tests/controller/panel/test_in_browser.py",
     "tests/plugins/emulated/cameras/test_gphoto2_peer.py",
     "tests/plugins/finding/test_serial_ports.py",
-    "tests/controller/calibrate/geometry/test_self_calibration.py",
-    "tests/controller/calibrate/geometry/test_self_calibration_failures.py",
-    "tests/controller/calibrate/test_chain.py",
-    "tests/controller/solve/regions/test_solver.py",
-    "tests/controller/cluster/test_cluster.py",
+    "tests/controller/optics/calibrate/geometry/test_self_calibration.py",
+    "tests/controller/optics/calibrate/geometry/test_self_calibration_failures.py",
+    "tests/controller/optics/calibrate/test_chain.py",
+    "tests/controller/optics/solve/regions/test_solver.py",
+    "tests/controller/stage/cluster/test_cluster.py",
     "tests/controller/cli/test_extras.py",
     "tests/end_to_end/test_killed_demo.py",
-    "tests/controller/study/test_beyond.py",
+    "tests/lab/study/test_beyond.py",
 )
 """What would keep one worker busy for a minute after the others have ended, were it to come last."""
 LONG: Final = (*NEEDS_THE_DEMO, *LONGEST_FIRST)

@@ -17,7 +17,6 @@ import hal.errors
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 TOPS = ("controller", "hal", "plugins", "firmware_configs")
-MOST_MODULES = 15
 
 
 def folders() -> list[Path]:
@@ -84,18 +83,6 @@ def test_each_equation_is_named_in_the_files_that_the_page_lists_for_it() -> Non
         assert files
         for file in files:
             assert numbers & equations((ROOT / file).read_text("utf-8")), f"{file} names none of {numbers}"
-
-
-def test_no_folder_has_too_many_modules_but_those_that_the_page_excuses() -> None:
-    excused = PAGE.partition("A folder has at most 15 modules.")[2].partition("\n## ")[0]
-    names = re.findall(r"^- `([\w/]+)`: \S", excused, re.MULTILINE)
-    count = Counter(
-        module.parent.relative_to(ROOT).as_posix()
-        for top in (*TOPS, "tests", "benchmarks")
-        for module in (ROOT / top).rglob("*.py")
-        if module.name != "__init__.py"
-    )
-    assert sorted(folder for folder, modules in count.items() if modules > MOST_MODULES) == sorted(names)
 
 
 def imports() -> dict[str, set[str]]:

@@ -27,7 +27,6 @@ import importlib
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from controller.api.benchmark import BenchmarkCalibration, BenchmarkStage, BenchmarkTarget
     from controller.api.calibration import CalibratedRun, calibrate, decode, fit_metapixels, measure_response, read_run
     from controller.api.captures import CaptureSet, draw_patterns, read_captures
     from controller.api.codes import decode_folder
@@ -43,8 +42,9 @@ if TYPE_CHECKING:
         solve_base,
     )
     from controller.api.transport import build_transport, indirect_light, transport_from_matrices
-    from controller.calibrate.metapixels.from_phase import FittedPixels
-    from controller.calibrate.values import (
+    from controller.core.errors import VelaturaError
+    from controller.optics.calibrate.metapixels.from_phase import FittedPixels
+    from controller.optics.calibrate.values import (
         Calibration,
         Correspondence,
         Geometry,
@@ -54,20 +54,16 @@ if TYPE_CHECKING:
         ProjectorCalibration,
         Radiometry,
     )
-    from controller.capture.brackets import MergedBracket
-    from controller.capture.profile import CameraNoise, CameraProfile
-    from controller.core.errors import VelaturaError
-    from controller.solve.appearance import Base
-    from controller.solve.bounded.problem import Solution
-    from controller.solve.metrics import Comparison
-    from controller.transport import LightTransport
-    from controller.transport.indirect import IndirectLight
+    from controller.optics.capture.brackets import MergedBracket
+    from controller.optics.capture.profile import CameraNoise, CameraProfile
+    from controller.optics.solve.appearance import Base
+    from controller.optics.solve.bounded.problem import Solution
+    from controller.optics.solve.result.metrics import Comparison
+    from controller.optics.transport import LightTransport
+    from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 __all__ = [
     "Base",
-    "BenchmarkCalibration",
-    "BenchmarkStage",
-    "BenchmarkTarget",
     "CalibratedRun",
     "Calibration",
     "CameraNoise",
@@ -113,7 +109,6 @@ __all__ = [
 ]
 
 _MODULES: Final = {
-    "controller.api.benchmark": ("BenchmarkCalibration", "BenchmarkStage", "BenchmarkTarget"),
     "controller.api.photographs": ("Developed", "develop", "merge_brackets"),
     "controller.api.captures": ("CaptureSet", "draw_patterns", "read_captures"),
     "controller.api.codes": ("decode_folder",),
@@ -125,19 +120,19 @@ _MODULES: Final = {
         "ReachableTarget", "base_image", "encode", "reachable_target", "scale", "solve", "solve_base",
     ),
     "controller.api.results": ("compare", "export"),
-    "controller.calibrate.metapixels.from_phase": ("FittedPixels",),
-    "controller.calibrate.values": (
+    "controller.optics.calibrate.metapixels.from_phase": ("FittedPixels",),
+    "controller.optics.calibrate.values": (
         "Calibration", "Correspondence", "Geometry", "Metapixels", "PhaseMap", "Pinhole", "ProjectorCalibration",
         "Radiometry",
     ),
-    "controller.capture.brackets": ("MergedBracket",),
-    "controller.capture.profile": ("CameraNoise", "CameraProfile"),
+    "controller.optics.capture.brackets": ("MergedBracket",),
+    "controller.optics.capture.profile": ("CameraNoise", "CameraProfile"),
     "controller.core.errors": ("VelaturaError",),
-    "controller.solve.appearance": ("Base",),
-    "controller.solve.bounded.solver": ("Solution",),
-    "controller.solve.metrics": ("Comparison",),
-    "controller.transport": ("LightTransport",),
-    "controller.transport.indirect": ("IndirectLight",),
+    "controller.optics.solve.appearance": ("Base",),
+    "controller.optics.solve.bounded.solver": ("Solution",),
+    "controller.optics.solve.result.metrics": ("Comparison",),
+    "controller.optics.transport": ("LightTransport",),
+    "controller.optics.transport.indirect.indirect_light": ("IndirectLight",),
 }  # fmt: skip
 _HOME: Final = {name: module for module, names in _MODULES.items() for name in names}
 

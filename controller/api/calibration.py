@@ -11,26 +11,26 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.captures import CaptureSet
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.calibration import object_mask, projectors_of
-from controller.artefacts.geometry import read_geometry
-from controller.artefacts.grade import graded
-from controller.calibrate.correspondence import decode as correspondence_decode
-from controller.calibrate.correspondence.colour_alignment import colour_shifts, colours_apart
-from controller.calibrate.correspondence.colour_places import ColourPlaces
-from controller.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
-from controller.calibrate.photometry.direct_light import tell_direct_light
-from controller.calibrate.photometry.radiometry import measure_radiometry
-from controller.calibrate.photometry.separation import sinusoid_contrast
-from controller.calibrate.photometry.waveform import coarse_waves
-from controller.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
-from controller.capture.patterns import plan_patterns
-from controller.capture.profile import CameraProfile, load_profile
-from controller.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
 from controller.core.errors import CalibrationError, UsageError
-from controller.transport import LightTransport
-from controller.transport.indirect import IndirectLight
-from controller.transport.indirect_stripes import dark_light
+from controller.optics.calibrate.correspondence import decode as correspondence_decode
+from controller.optics.calibrate.correspondence.colour_alignment import colour_shifts, colours_apart
+from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
+from controller.optics.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
+from controller.optics.calibrate.photometry.direct_light import tell_direct_light
+from controller.optics.calibrate.photometry.radiometry import measure_radiometry
+from controller.optics.calibrate.photometry.separation import sinusoid_contrast
+from controller.optics.calibrate.photometry.waveform import coarse_waves
+from controller.optics.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
+from controller.optics.capture.patterns import plan_patterns
+from controller.optics.capture.profile import CameraProfile, load_profile
+from controller.optics.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
+from controller.optics.transport import LightTransport
+from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.indirect.stripes import dark_light
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibration import object_mask, projectors_of
+from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.artefacts.grade import graded
 
 
 def decode(captures: CaptureSet) -> Correspondence:

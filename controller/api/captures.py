@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.photographs import develop, merge_brackets
-from controller.capture.pattern_frames import device_frame
-from controller.capture.patterns import plan_patterns
-from controller.capture.profile import CameraProfile, true_exposure
 from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import UsageError
+from controller.optics.capture.pattern_frames import device_frame
+from controller.optics.capture.patterns import plan_patterns
+from controller.optics.capture.profile import CameraProfile, true_exposure
 
 DESCRIPTION: Final = "captures.toml"
 _KEYS: Final = ("projector_px", "exposure_s", "pictures", "gray", "phase")

@@ -10,12 +10,12 @@ import numpy as np
 
 from controller.api.captures import DESCRIPTION, description_of, unfit
 from controller.api.photographs import develop
-from controller.calibrate.correspondence.any_code import Bits, Sinusoid, decode_any
-from controller.calibrate.values import Correspondence
-from controller.capture.profile import CameraProfile
 from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError
+from controller.optics.calibrate.correspondence.any_code import Bits, Sinusoid, decode_any
+from controller.optics.calibrate.values import Correspondence
+from controller.optics.capture.profile import CameraProfile
 
 _AS_THEY_ARE = CameraProfile(response=np.tile(np.linspace(0, 1, 256), (3, 1)))
 

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.arrays import as_images
-from controller.capture import brackets, linear_files, raw
-from controller.capture.brackets import MergedBracket
-from controller.capture.profile import CameraNoise, CameraProfile
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import WorkError
+from controller.optics.capture import brackets, linear_files, raw
+from controller.optics.capture.brackets import MergedBracket
+from controller.optics.capture.profile import CameraNoise, CameraProfile
 
 
 @dataclass(frozen=True, slots=True)

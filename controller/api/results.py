@@ -11,17 +11,17 @@ import numpy.typing as npt
 
 from controller.api.arrays import as_image
 from controller.bundle.export import png
-from controller.calibrate.mesh.export import write_glb, write_ply
-from controller.calibrate.mesh.grid_mesh import grid_mesh
-from controller.calibrate.values import Geometry
-from controller.capture.linear_files import exr_bytes
-from controller.capture.raw import SRGB_TO_XYZ
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.solve import metrics
-from controller.solve.metrics import Comparison
-from controller.solve.targets.values import linear_to_srgb
+from controller.optics.calibrate.mesh.export import write_glb, write_ply
+from controller.optics.calibrate.mesh.grid_mesh import grid_mesh
+from controller.optics.calibrate.values import Geometry
+from controller.optics.capture.linear_files import exr_bytes
+from controller.optics.capture.raw import SRGB_TO_XYZ
+from controller.optics.solve.result import metrics
+from controller.optics.solve.result.metrics import Comparison
+from controller.optics.solve.targets.values import linear_to_srgb
 
 if TYPE_CHECKING:
     from controller.core.arrays import ByteImage, Float64

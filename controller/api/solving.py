@@ -10,17 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.arrays import as_image, as_images
-from controller.calibrate.values import Calibration, Radiometry
 from controller.core.arrays import ByteImage, FloatImage, Mask
-from controller.solve import appearance
-from controller.solve.appearance import Base
-from controller.solve.bounded.problem import Solution
-from controller.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, solve_bounded
-from controller.solve.exposed import expose_target
-from controller.solve.feasibility import target_radiance
-from controller.solve.scaling.dither import to_device
-from controller.transport import LightTransport
-from controller.transport.indirect import IndirectLight
+from controller.optics.calibrate.values import Calibration, Radiometry
+from controller.optics.solve import appearance
+from controller.optics.solve.appearance import Base
+from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, solve_bounded
+from controller.optics.solve.reach.exposure import expose_target
+from controller.optics.solve.reach.feasibility import target_radiance
+from controller.optics.solve.scaling.dither import to_device
+from controller.optics.transport import LightTransport
+from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,14 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.api.arrays import as_image
-from controller.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
 from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
-from controller.transport import LightTransport, factory
-from controller.transport.gaussians.custom_weights import patches_of_weights
-from controller.transport.indirect import IndirectLight
-from controller.transport.indirect_fit import fit_indirect
+from controller.optics.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
+from controller.optics.transport import LightTransport, factory
+from controller.optics.transport.gaussians.custom_weights import patches_of_weights
+from controller.optics.transport.indirect.fit import fit_indirect
+from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 LINEAR = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
 

@@ -65,7 +65,7 @@ def work(do: Work, *, as_json: bool, stage: Path | None = None) -> None:
 
     with cancelled_by_signals() as cancel, console.reporter(as_json=as_json) as reporter:
         if stage is not None:
-            from controller.stage.check import check_stage
+            from controller.stage.sessions.check import check_stage
 
             check_stage(stage)
         result = do(reporter, cancel)

@@ -13,15 +13,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from controller.building import server as building
-from controller.building.protocol import Configured
-from controller.building.protocol import read as read_protocols
 from controller.config.loader import FILE
 from controller.core import kiosk_places
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.building import server as building
+from controller.kiosk.building.protocol import Configured
+from controller.kiosk.building.protocol import read as read_protocols
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.panel_address import PanelAccess, addresses, keep_first_login
 from controller.kiosk.service import Service
@@ -30,7 +30,7 @@ from controller.kiosk.store.accounts import FOLDER
 from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
 from controller.run.progress import Level, Reporter
-from controller.stage.run import leave_runtime_folder, stage_lock
+from controller.stage.sessions.run import leave_runtime_folder, stage_lock
 from hal.errors import DeviceError
 
 RETRY_S: Final = 5.0

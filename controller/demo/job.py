@@ -10,33 +10,38 @@ from typing import Any
 
 import numpy as np
 
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.kinds import StepKind, of_projectors
-from controller.artefacts.published import Dimmed, write_photograph
-from controller.artefacts.solved import RequestedTarget, read_solved
 from controller.core.arrays import FloatImage
-from controller.report.demo import write_demo_report
-from controller.rig.rig import Rig
+from controller.optics.solve.engines.choice import choose_engine
+from controller.optics.solve.engines.processor import Engine
+from controller.optics.solve.reach.feasibility import target_radiance
+from controller.optics.solve.traditional import exposed_for_one, traditional_compensation
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
-from controller.services.calibrate import calibrating, publishing
-from controller.solve.engines.choice import choose_engine
-from controller.solve.engines.processor import Engine
-from controller.solve.feasibility import target_radiance
-from controller.solve.traditional import exposed_for_one, traditional_compensation
-from controller.stage.bench import BenchProcess
-from controller.stage.calibrations import worst_grade
-from controller.stage.check import Checked, check_stage
-from controller.stage.run import marker
-from controller.stage.session import OwnSession
-from controller.steps import costs
-from controller.steps.appearance.photographing import photograph_hdr, photograph_step, photographs_s, playback_step
-from controller.steps.appearance.refining import RefineOptions, refine_steps
-from controller.steps.appearance.requests import requests_of
-from controller.steps.appearance.solving import device_frames, options_of, solve_steps
-from controller.steps.calibrate.gate import gate_step
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.kinds import StepKind, of_projectors
+from controller.stage.artefacts.published import Dimmed, write_photograph
+from controller.stage.artefacts.solved import RequestedTarget, read_solved
+from controller.stage.report.demo import write_demo_report
+from controller.stage.rig.rig import Rig
+from controller.stage.services.calibrate import calibrating, publishing
+from controller.stage.sessions.bench import BenchProcess
+from controller.stage.sessions.calibrations import worst_grade
+from controller.stage.sessions.check import Checked, check_stage
+from controller.stage.sessions.run import marker
+from controller.stage.sessions.session import OwnSession
+from controller.stage.steps import costs
+from controller.stage.steps.appearance.photographing import (
+    photograph_hdr,
+    photograph_step,
+    photographs_s,
+    playback_step,
+)
+from controller.stage.steps.appearance.refining import RefineOptions, refine_steps
+from controller.stage.steps.appearance.requests import requests_of
+from controller.stage.steps.appearance.solving import device_frames, options_of, solve_steps
+from controller.stage.steps.calibrate.gate import gate_step
 
 PLAYBACK_S = 2.0
 

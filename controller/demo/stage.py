@@ -16,10 +16,10 @@ from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import sha256_of, sync_folder, write_atomically
-from controller.solve.targets.files import shipped_photograph
-from controller.solve.targets.values import linear_to_srgb
-from controller.stage.bench import bench_of
-from controller.stage.calibrations import KEY_FILE
+from controller.optics.solve.targets.files import shipped_photograph
+from controller.optics.solve.targets.values import linear_to_srgb
+from controller.stage.sessions.bench import bench_of
+from controller.stage.sessions.calibrations import KEY_FILE
 from hal.errors import DeviceError
 
 MARK = "demo.json"

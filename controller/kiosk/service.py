@@ -39,9 +39,9 @@ from controller.kiosk.world import Thread, World
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
 from controller.run.state_machine import State
-from controller.stage.calibrations import finished_calibrations, stage_trust
-from controller.stage.check import Checked
-from controller.stage.open import player_settings, technicians_panel
+from controller.stage.sessions.calibrations import finished_calibrations, stage_trust
+from controller.stage.sessions.check import Checked
+from controller.stage.sessions.open import player_settings, technicians_panel
 from hal.interfaces import ButtonPanel
 
 STEP_S: Final = 0.25

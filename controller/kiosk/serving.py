@@ -16,8 +16,8 @@ from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.store.journal import journal_of
 from controller.kiosk.store.settings import checked_settings
 from controller.kiosk.world import World
-from controller.stage.check import Checked
-from controller.stage.run import stage_lock
+from controller.stage.sessions.check import Checked
+from controller.stage.sessions.run import stage_lock
 from hal.deadline import Stop
 
 

@@ -10,10 +10,10 @@ from typing import Any, Final
 from controller.config import load_stage, write_stage
 from controller.config.loader import FILE
 from controller.core.errors import UsageError
-from controller.doctor.examine import Tools, examine
-from controller.doctor.writing import new_stage
 from controller.run.progress import Silent
-from controller.services.bundle import make_key
+from controller.stage.doctor.examine import Tools, examine
+from controller.stage.doctor.writing import new_stage
+from controller.stage.services.bundle import make_key
 
 Ask = Callable[[str, str], str]
 """Question and suggested answer -> answer."""

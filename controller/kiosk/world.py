@@ -1,7 +1,7 @@
 """All that a kiosk has of the world outside: clock, threads, disk, processes, network, drivers.
 
 The code of the kiosk waits, starts threads and reaches devices through one ``World`` alone, so that a simulated one
-(``controller.simulate``) can make it run from a seed.
+(``lab.simulate``) can make it run from a seed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from controller.kiosk.decide.clock import synchronised
 from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_supervisor import Process, launched
 from controller.play.control.launch import PlayerSettings
-from controller.rig.lamp_ledger import SystemClock
-from controller.stage.recording import open_context
+from controller.stage.rig.lamp_ledger import SystemClock
+from controller.stage.sessions.recording import open_context
 from hal.deadline import Deadline
 from hal.registry import Drivers, OpenContext
 

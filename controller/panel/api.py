@@ -12,7 +12,7 @@ from prometheus_client.registry import Collector
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from controller.building.rates import Rate, Rates
+from controller.kiosk.building.rates import Rate, Rates
 from controller.kiosk.operations.fields import object_schema
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS

@@ -1,3 +1,1 @@
-"""A stage on disk: checking it (`check.check_stage`), opening its devices (`open.opened`), and runs with its
-lock and devices (`session.StageSession`).
-"""
+"""A stage and the work on it: its devices (`rig`), files (`artefacts`), `steps`, `sessions`, and its `services`."""

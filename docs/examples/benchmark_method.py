@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from controller.api import BenchmarkStage, BenchmarkTarget
+from lab.compare.api import BenchmarkStage, BenchmarkTarget
 
 Frames = list[npt.NDArray[np.uint8]]
 

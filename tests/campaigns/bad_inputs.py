@@ -95,10 +95,11 @@ class Warm:
 _SERVER: Final = f"""
 import gc, json, os, resource, signal, sys, time, traceback
 import controller.__main__ as program
-import controller.services.calibrate, controller.services.play, controller.services.live, controller.services.bundle
-import controller.services.camera, controller.services.plan, controller.kiosk.api.offline_dispatch
-import trimesh, cv2, OpenEXR, plugins.emulated.bench, controller.demo.job, controller.doctor.examine
-import controller.services.compare, controller.panel.server
+import controller.stage.services.calibrate, controller.stage.services.play, controller.stage.services.live
+import controller.stage.services.bundle
+import controller.stage.services.camera, controller.stage.services.plan, controller.kiosk.api.offline_dispatch
+import trimesh, cv2, OpenEXR, plugins.emulated.bench, controller.demo.job, controller.stage.doctor.examine
+import controller.stage.services.compare, controller.panel.server
 from tests.campaigns.bad_readers import COMMANDS
 program.COMMANDS = (*program.COMMANDS, *COMMANDS)
 program.application()

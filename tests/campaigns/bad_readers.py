@@ -10,14 +10,14 @@ from controller.cli.running import Json
 
 def read_target(file: Path, as_json: Json = False) -> None:
     """Read a target picture, as ``velatura appearance`` does, for a camera of 64 x 48 pixels."""
-    from controller.solve.targets.files import load_target
+    from controller.optics.solve.targets.files import load_target
 
     load_target(file, (64, 48))
 
 
 def read_live(source: Path, as_json: Json = False) -> None:
     """Open a stream of targets, as ``velatura live`` does, and take its first picture."""
-    from controller.live.sources import FolderSource, open_source
+    from controller.stage.live.sources import FolderSource, open_source
 
     opened = open_source(source, loop=False, rate_hz=25.0)
     if isinstance(opened, FolderSource):

@@ -50,14 +50,14 @@ PORTS: Final = ("command_port", "event_port")
 
 def work(stage: Path) -> int:
     """What a person would type, and type again: calibrate unless that is done, then the appearance."""
-    from controller.capture import latency
+    from controller.optics.capture import latency
     from controller.run.progress import Silent
-    from controller.services.calibrate import calibrate, make_appearances
-    from controller.stage.calibrations import finished_calibrations
-    from controller.stage.session import OwnSession
-    from controller.steps.capture import camera as camera_steps
-    from controller.steps.capture import patterns as capturing
-    from controller.steps.capture import photographs as shots
+    from controller.stage.services.calibrate import calibrate, make_appearances
+    from controller.stage.sessions.calibrations import finished_calibrations
+    from controller.stage.sessions.session import OwnSession
+    from controller.stage.steps.capture import camera as camera_steps
+    from controller.stage.steps.capture import patterns as capturing
+    from controller.stage.steps.capture import photographs as shots
 
     for module in (latency, camera_steps, capturing, shots):
         vars(module)["LONGEST_S"] = LONGEST_S
@@ -107,7 +107,7 @@ class Nursery:
 def nursery() -> int:
     """Fork what each line asks for, and print its number; nothing here has threads."""
     for name in (
-        "controller.services.calibrate",
+        "controller.stage.services.calibrate",
         "plugins.display.player",
         "plugins.ptp.camera",
         "plugins.projectors.serial",

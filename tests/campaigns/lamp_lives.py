@@ -12,10 +12,10 @@ import sys
 from collections.abc import Callable
 
 from controller.core.errors import WorkError
-from controller.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_guard import LampGuard
 from hal.errors import DeviceError
 from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import ROUNDING_S, RULES, Killed, Lamp, Shelf, World, check_light, soon
+from tests.controller.stage.rig.lamp_model import ROUNDING_S, RULES, Killed, Lamp, Shelf, World, check_light, soon
 
 
 class Life:

@@ -12,9 +12,9 @@ import random
 import sys
 import time
 
-from controller.simulate.happen.script import Item
-from controller.simulate.life import Life, Outcome
-from controller.simulate.scheduler import DAY_S
+from lab.simulate.incidents.script import Item
+from lab.simulate.life import Life, Outcome
+from lab.simulate.scheduler import DAY_S
 from tests.campaigns.simulate import judged
 
 LOG = "kiosk/events.sqlite"

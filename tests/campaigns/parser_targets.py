@@ -15,12 +15,12 @@ from typing import Final
 
 from sacn import DataPacket
 
-from controller.building import artnet_packets, osc, pjlink_lines
-from controller.building.sacn import SacnOptions, frame_of
 from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
 from controller.config import load_stage
 from controller.core.errors import BundleError, UsageError
+from controller.kiosk.building import artnet_packets, osc, pjlink_lines
+from controller.kiosk.building.sacn import SacnOptions, frame_of
 from hal.codecs.hid import light as hid_light
 from hal.codecs.hid import relay as hid_relay
 from hal.codecs.projectors import json_rpc, logins, pjlink, pjlink_udp

@@ -175,7 +175,9 @@ def atheris_child(name: str, folder: Path, options: list[str]) -> None:
     # What the fuzzer follows must be told to it before it is imported anew, with its branches counted.
     for module in [m for m in sys.modules if m.startswith(("hal", "controller", "plugins", "tests.campaigns.parser_"))]:
         del sys.modules[module]
-    with atheris.instrument_imports(include=["hal", "controller.building", "controller.bundle", "controller.config"]):
+    with atheris.instrument_imports(
+        include=["hal", "controller.kiosk.building", "controller.bundle", "controller.config"]
+    ):
         again = importlib.import_module("tests.campaigns.parser_targets")
     target: Any = again.targets(folder)[name]
     most_s = MOST_S * 2  # counting branches takes as long as the work itself
@@ -222,7 +224,7 @@ def row(outcome: Outcome) -> str:
 
 
 def main() -> int:
-    # python-osc would write a line for most of its inputs; the service filters them (controller.building.osc).
+    # python-osc would write a line for most of its inputs; the service filters them (controller.kiosk.building.osc).
     logging.disable()
     if sys.argv[1:2] == ["--atheris"]:
         atheris_child(sys.argv[2], Path(sys.argv[3]), sys.argv[4:])

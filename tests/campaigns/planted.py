@@ -27,7 +27,7 @@ BUGS = Path(__file__).parent / "planted_bugs"
 PARTS = ("controller", "hal", "plugins", "firmware_configs")
 LIVES = """
 import sys, time
-from controller.simulate.life import Life
+from lab.simulate.life import Life
 from tests.campaigns.log_lives import lived
 number, days = 0, 0.0
 while time.process_time() < float(sys.argv[1]):

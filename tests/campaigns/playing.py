@@ -6,7 +6,7 @@ Into memory as fast as they go, until so many have passed and so many were read 
 player's private memory is measured; then on the windows of an X server without monitors, three outputs of 1400x1050,
 30 times a second, three for ten of them and at most 10,800 (six minutes). Prints what was found; ends with 1 if a set
 mixes two appearances or memory grows. Pace depends on the machine and what else it does, so it is only printed
-(``benchmarks windows`` judges it). 100,000 take ten minutes on two free cores.
+(``lab.timings windows`` judges it). 100,000 take ten minutes on two free cores.
 """
 
 from __future__ import annotations

@@ -6,10 +6,10 @@ import sys
 import time
 from collections.abc import Iterable
 
-from controller.simulate.life import Outcome
-from controller.simulate.run import YEAR_DAYS, lives
-from controller.simulate.scheduler import DAY_S
-from controller.simulate.shrink import shortened
+from lab.simulate.life import Outcome
+from lab.simulate.run import YEAR_DAYS, lives
+from lab.simulate.scheduler import DAY_S
+from lab.simulate.shrink import shortened
 
 
 def judged(outcomes: Iterable[Outcome]) -> tuple[float, int]:

@@ -12,10 +12,10 @@ import threading
 from pathlib import Path
 
 from controller.cli.console import PlainReporter
-from controller.services.study import study
-from controller.study.catalogue import EXPERIMENTS
-from controller.study.output.keeping import StoredStudy, read_study
-from controller.study.output.pages import DATA
+from lab.study.catalogue import EXPERIMENTS
+from lab.study.output.keeping import StoredStudy, read_study
+from lab.study.output.pages import DATA
+from lab.study.service import study
 
 
 def faults(kept: StoredStudy) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from controller.study.output.keeping import StoredResult, StoredStudy
+from lab.study.output.keeping import StoredResult, StoredStudy
 from tests.campaigns.study import faults
 
 

@@ -17,12 +17,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from benchmarks.devices.serve import install_grey
 from controller.kiosk import service as services
 from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.run.state_machine import State
+from lab.timings.devices.serve import install_grey
 from plugins.emulated.cameras.body import CameraFaults, CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.usb_camera import UsbCameraFaults

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from controller.artefacts.photographs import BLACK, Taken, captures_folder, light_of
-from controller.artefacts.solved import Solved
 from controller.core.arrays import save_arrays
-from controller.services.export import export
+from controller.stage.artefacts.photographs import BLACK, Taken, captures_folder, light_of
+from controller.stage.artefacts.solved import Solved
+from controller.stage.services.export import export
 from tests.controller.api.test_photographs import write_captures
-from tests.controller.capture.test_raw import RGGB, mosaic_of, write_dng
-from tests.controller.solve.conftest import plane_calibration
+from tests.controller.optics.capture.test_raw import RGGB, mosaic_of, write_dng
+from tests.controller.optics.solve.conftest import plane_calibration
 
 CAMERA = (60, 80)
 """(rows, columns), as ``plane_calibration`` has it."""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.study.output import words
 from docs.figures import FIGURES, ROOT, STUDY, differing
+from lab.study.output import words
 
 
 def test_every_document_and_every_page_of_the_study_says_what_was_measured() -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from controller.solve.judged import TITLES
-from controller.study.catalogue import EXPERIMENTS
-from controller.study.output.keeping import SEEDS, read_study
-from controller.study.output.pages import DATA, up_to_date
-from controller.study.values import Experiment
+from controller.optics.solve.result.evaluation import TITLES
 from docs.figures import ROOT, STUDY
+from lab.study.catalogue import EXPERIMENTS
+from lab.study.output.keeping import SEEDS, read_study
+from lab.study.output.pages import DATA, up_to_date
+from lab.study.values import Experiment
 
 PRESENT = [
     one

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from controller.play.control.launch import start_player
-from controller.stage.check import check_stage
-from controller.stage.open import player_settings
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.open import player_settings
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from plugins.display.player import DRIVER, PlayerDisplay

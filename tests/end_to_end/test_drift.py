@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 
-from controller.artefacts.grade import graded
 from controller.core.errors import CalibrationError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
-from controller.services.calibrate import calibrate, make_appearances
-from controller.services.recalibrate import check_drift, recalibrate
-from controller.stage.calibrations import finished_calibration
-from controller.stage.session import OwnSession
+from controller.stage.artefacts.grade import graded
+from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.recalibrate import check_drift, recalibrate
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.session import OwnSession
 from plugins.emulated.optics.bumps import Bump, write_bumps
 from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY

@@ -16,11 +16,6 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.geometry import read_geometry
-from controller.artefacts.solved import read_solved
-from controller.blender.job import own_paint
-from controller.blender.run import find_blender
 from controller.config.models import SolveTable
 from controller.core.arrays import load_arrays
 from controller.core.errors import UsageError, WorkError
@@ -29,18 +24,23 @@ from controller.kiosk.interface import Job
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import Computed
+from controller.optics.solve.request import solve_appearance
+from controller.optics.solve.result.evaluation import by_pixels, visible_object
+from controller.optics.solve.targets.files import load_target
+from controller.optics.solve.targets.values import srgb_to_linear
 from controller.panel.uploads import Targets, UploadLimits
-from controller.report.pictures import crop_around, to_screen
-from controller.solve.judged import by_pixels, visible_object
-from controller.solve.request import solve_appearance
-from controller.solve.targets.files import load_target
-from controller.solve.targets.values import srgb_to_linear
-from controller.stage.calibrations import finished_calibration
-from controller.stage.check import check_stage
-from controller.steps.appearance.solving import options_of, solved_base
-from tests.controller.blender.test_render import PAINT_SCENE
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.artefacts.solved import read_solved
+from controller.stage.blender.job import own_paint
+from controller.stage.blender.run import find_blender
+from controller.stage.report.pictures import crop_around, to_screen
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.check import check_stage
+from controller.stage.steps.appearance.solving import options_of, solved_base
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
 from tests.controller.panel.served import served
+from tests.controller.stage.blender.test_render import PAINT_SCENE
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied, wait_for
 from tests.end_to_end.test_targets import CAMERA_PX, grey_png

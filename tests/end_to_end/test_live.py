@@ -13,10 +13,10 @@ import numpy.typing as npt
 import OpenEXR
 import pytest
 
-from controller.artefacts.calibrated import Calibrated
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.play.frames import FrameFile, OutputSize
-from controller.steps.appearance.live_parts import live_maps
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.steps.appearance.live_parts import live_maps
 from hal.values import Power
 from tests.controller.play.wire import Frames
 from tests.end_to_end.conftest import FinishedDemo

@@ -20,8 +20,8 @@ from controller.config.loader import FILE
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.decide.hours import WEEKDAYS
-from controller.stage.calibrations import KEY_FILE, output_sizes
-from controller.stage.check import check_stage
+from controller.stage.sessions.calibrations import KEY_FILE, output_sizes
+from controller.stage.sessions.check import check_stage
 from tests.campaigns.mini_stage import prepare_mini
 from tests.controller.kiosk.alerts.servers import MailServer, WebServer
 from tests.controller.play.wire import Wire

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.bundle.reader import Bundle
-from tests.controller.cluster.machines import machines
+from tests.controller.stage.cluster.machines import machines
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied
 from tests.end_to_end.program import Command, velatura

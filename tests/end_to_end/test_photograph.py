@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.api.control import call_kiosk
-from controller.stage.bench import BenchProcess
+from controller.stage.sessions.bench import BenchProcess
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command, velatura

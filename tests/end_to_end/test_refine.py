@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.stage.bench import BenchProcess, bench_of
+from controller.stage.sessions.bench import BenchProcess, bench_of
 from hal.values import Power
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.devices.serve import NAME, install_grey, wait_for
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.panel_address import FIRST_LOGIN
-from controller.stage.bench import BenchProcess
+from controller.stage.sessions.bench import BenchProcess
+from lab.timings.devices.serve import NAME, install_grey, wait_for
 from tests import waiting
 from tests.end_to_end.program import REPOSITORY, Command, lamps, processes_on
 from tests.ports import free_port

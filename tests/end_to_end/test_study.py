@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import tifffile
 
-from benchmarks.lab.truth import Truth, developed
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.geometry import read_geometry
 from controller.core.arrays import FloatImage
-from controller.stage.check import check_stage
-from controller.steps.appearance.solving import device_frames
-from controller.study.experiments.frequency.experiment import PLANNED, rising_sinusoid
-from controller.study.experiments.live import live_pictures
-from controller.study.experiments.residual import BRIGHT, residual
-from controller.study.lab.measuring import SET_COLUMNS
-from controller.study.lab.subject import Dots, Subject
-from controller.study.lab.trial import run_trial
-from controller.study.values import Result, column
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.sessions.check import check_stage
+from controller.stage.steps.appearance.solving import device_frames
+from lab.study.experiments.frequency.experiment import PLANNED, rising_sinusoid
+from lab.study.experiments.live import live_pictures
+from lab.study.experiments.residual import BRIGHT, residual
+from lab.study.subject.measuring import SET_COLUMNS
+from lab.study.subject.subject import Dots, Subject
+from lab.study.subject.trial import run_trial
+from lab.study.values import Result, column
+from lab.timings.tools.truth import Truth, developed
 from plugins.emulated.optics.sensor import REFERENCE_APERTURE_F
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.program import run_of

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.solved import read_solved
 from controller.core.arrays import FloatImage
 from controller.kiosk.api.control import call_kiosk
 from controller.run.progress import Silent
-from controller.services.calibrate import make_appearances
-from controller.stage.bench import BenchProcess
-from controller.stage.calibrations import finished_calibration
-from controller.stage.check import check_stage
-from controller.stage.session import OwnSession
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.solved import read_solved
+from controller.stage.services.calibrate import make_appearances
+from controller.stage.sessions.bench import BenchProcess
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.session import OwnSession
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import codes, copied, wait_for
 from tests.end_to_end.program import Command

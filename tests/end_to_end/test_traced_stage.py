@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.calibration.indirect import GOALS, Judge, traced_stage
-from benchmarks.calibration.rooms import possible_troubles
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.grade import read_troubles
-from controller.artefacts.solved import read_solved
 from controller.core.troubles import TroubleCode
 from controller.run.progress import Silent
-from controller.services.calibrate import calibrate, make_appearances
-from controller.services.refine import Refinement
-from controller.stage.bench import BenchProcess
-from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import check_stage
-from controller.stage.session import OwnSession
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.grade import read_troubles
+from controller.stage.artefacts.solved import read_solved
+from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.refine import Refinement
+from controller.stage.sessions.bench import BenchProcess
+from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.session import OwnSession
+from lab.timings.calibration.indirect import GOALS, Judge, traced_stage
+from lab.timings.calibration.rooms import possible_troubles
 from plugins.emulated.optics.truth import read_truth
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampFile
-from controller.rig.power import power_down
 from controller.run.signals import cancelled_by_signals
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import LampFile
+from controller.stage.rig.power import power_down
 from hal.deadline import Deadline, Stop, in_seconds
 from hal.driver_calls import Caller
 from hal.errors import DriverFault

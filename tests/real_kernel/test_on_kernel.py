@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from controller.capture.linearity import RawExposure, black_offset, check_series
-from controller.capture.raw import read_mosaic, read_photograph
+from controller.optics.capture.linearity import RawExposure, black_offset, check_series
+from controller.optics.capture.raw import read_mosaic, read_photograph
 from tests.real_kernel.machine import obstacle, run
 from tests.real_kernel.uvc_camera import BLACK, FULL, HEIGHT, WIDTH
 

@@ -38,7 +38,7 @@ def build(
     """Write the latest solved appearances to a bundle, signed with the stage's key, with the next revision number."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.bundle import build
+        from controller.stage.services.bundle import build
 
         return build(stage=stage, names=tuple(names or ()), out=out, live=live, reporter=reporter, cancel=cancel)
 
@@ -63,7 +63,7 @@ def verify(
     as_json: Json = False,
 ) -> None:
     """Check every byte of a bundle and its signature. --stage or --trusted also checks who signed it."""
-    from controller.services.bundle import verify as verified
+    from controller.stage.services.bundle import verify as verified
 
     _show(verified(file, stage=stage, trusted=tuple(trusted or ())), as_json=as_json)
 
@@ -98,14 +98,14 @@ def sign(
 
 def install(file: BundleFile, stage: StageFolder, as_json: Json = False) -> None:
     """Install a bundle that the stage trusts. The previous bundle is kept for rollback."""
-    from controller.services.bundle import install as installed
+    from controller.stage.services.bundle import install as installed
 
     _show(installed(file, stage=stage), as_json=as_json)
 
 
 def rollback(stage: StageFolder, as_json: Json = False) -> None:
     """Go back to the previously installed bundle."""
-    from controller.services.bundle import rollback as rolled_back
+    from controller.stage.services.bundle import rollback as rolled_back
 
     _show(rolled_back(stage), as_json=as_json)
 
@@ -118,7 +118,7 @@ def export(
     """Write every frame as a PNG picture, with an index.json. The signature is not checked."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.bundle import export
+        from controller.stage.services.bundle import export
 
         return export(file=file, out=out, reporter=reporter, cancel=cancel)
 

@@ -24,7 +24,7 @@ def board(
     out: Annotated[Path, typer.Option(help="Output file (PNG) to print.")] = Path("board.png"), as_json: Json = False
 ) -> None:
     """Write a ChArUco board to print on A4 or larger, at any scale. Glue the print on a flat plate."""
-    from controller.services.camera import board as written
+    from controller.stage.services.camera import board as written
 
     console.show_result(written(out=out), as_json=as_json)
 
@@ -39,7 +39,7 @@ def calibrate(
     """Compute focal length, principal point and distortion, with uncertainties, from photographs of the board."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.camera import calibrate
+        from controller.stage.services.camera import calibrate
 
         return calibrate(photographs=tuple(photographs), out=out, reporter=reporter, cancel=cancel)
 
@@ -52,7 +52,7 @@ def exif(
     as_json: Json = False,
 ) -> None:
     """Read the focal length from a photograph's EXIF data. This is quicker than the board, but less accurate."""
-    from controller.services.camera import from_exif
+    from controller.stage.services.camera import from_exif
 
     console.show_result(from_exif(photograph=photograph, out=out), as_json=as_json)
 

@@ -36,9 +36,9 @@ def doctor(
 ) -> int:
     """Find and test the connected devices without switching a lamp on. Report faults and how to correct them."""
     from controller.core.errors import UsageError
-    from controller.doctor.examine import examine
-    from controller.doctor.outputs import examine_outputs
     from controller.run.signals import cancelled_by_signals
+    from controller.stage.doctor.examine import examine
+    from controller.stage.doctor.outputs import examine_outputs
 
     if stage is None and (write or outputs):
         raise UsageError(

@@ -16,8 +16,8 @@ def drift(stage: StageFolder, as_json: Json = False) -> None:
     """Check with a few photographs whether anything moved, or a lamp dimmed, since the calibration."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.recalibrate import check_drift
-        from controller.stage.session import OwnSession
+        from controller.stage.services.recalibrate import check_drift
+        from controller.stage.sessions.session import OwnSession
 
         return check_drift(session=OwnSession(stage), details=as_json, reporter=reporter, cancel=cancel)
 

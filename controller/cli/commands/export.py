@@ -9,7 +9,7 @@ import typer
 
 from controller.cli import console
 from controller.cli.running import Json
-from controller.exchange.formats import FORMATS
+from controller.stage.exchange.formats import FORMATS
 
 
 def export(
@@ -27,6 +27,6 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Export a calibration: the object, the views of camera and projectors, warps, or the light transport."""
-    from controller.services.export import export as written
+    from controller.stage.services.export import export as written
 
     console.show_result(written(run=run, kind=kind, out=out, step=step, crop=crop), as_json=as_json)

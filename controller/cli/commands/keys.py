@@ -16,7 +16,7 @@ def keys(
     as_json: Json = False,
 ) -> None:
     """Make a key to sign the stage's bundles, and show the lines for stage.toml to trust it."""
-    from controller.services.bundle import make_key
+    from controller.stage.services.bundle import make_key
 
     made = make_key(stage, name)
     listed = ", ".join(f'"{key}"' for key in made["trusted_keys"])

@@ -42,8 +42,8 @@ def live(
     """Switch the projectors on and show a stream of targets live (base and scale)."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.live import feed, live
-        from controller.stage.session import OwnSession
+        from controller.stage.services.live import feed, live
+        from controller.stage.sessions.session import OwnSession
 
         if into is not None:
             return feed(

@@ -25,8 +25,8 @@ def photograph(
     """Photograph the installed appearances, compare them with their targets, and write a report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.compare import photograph
-        from controller.stage.session import OwnSession
+        from controller.stage.services.compare import photograph
+        from controller.stage.sessions.session import OwnSession
 
         return photograph(session=OwnSession(stage), names=tuple(names or ()), reporter=reporter, cancel=cancel)
 

@@ -28,13 +28,13 @@ def plan(
 ) -> None:
     """Plan projector positions on a mesh: predict detail, light, angle of incidence and focus."""
     if example:
-        from controller.services.plan import write_example
+        from controller.stage.services.plan import write_example
 
         console.show_result(write_example(file), as_json=as_json)
         return
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.services.plan import plan
+        from controller.stage.services.plan import plan
 
         return plan(file=file, out=file.parent if out is None else out, reporter=reporter, cancel=cancel)
 

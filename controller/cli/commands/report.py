@@ -19,6 +19,6 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write report.html and report.json again for a calibration, for photographs, or for a demo."""
-    from controller.services.report import report_of
+    from controller.stage.services.report import report_of
 
     console.show_result(report_of(where, out), as_json=as_json)

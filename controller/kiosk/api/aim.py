@@ -16,15 +16,15 @@ from controller.core.errors import VelaturaError
 from controller.kiosk.interface import Aiming, ProjectorAim, Sharpness
 from controller.kiosk.store.runs import began_s
 from controller.kiosk.supervisors.devices import Devices
-from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import Checked
+from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import Checked
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
 
 if TYPE_CHECKING:
-    from controller.artefacts.calibrated import Calibrated
-    from controller.calibrate.values import Geometry
+    from controller.optics.calibrate.values import Geometry
+    from controller.stage.artefacts.calibrated import Calibrated
 
 GRAZING: Final = 0.25
 """Below this cosine of the angle to the surface normal, light is grazing."""
@@ -33,7 +33,7 @@ DIM, BURNT = 0.25, 0.98
 DARK, CLIPPED = 0.1, 0.02
 """Below this share of the object's median light, a place is too dark."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
-"""Names as in ``controller.steps.capture.aiming``, which is loaded only to photograph."""
+"""Names as in ``controller.stage.steps.capture.aiming``, which is loaded only to photograph."""
 _ANSWER_S = 5.0
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, AttributeError)
 _measured: dict[Path, Aiming] = {}
@@ -82,7 +82,7 @@ def aiming(checked: Checked) -> Aiming:
 
 
 def _cached(run: Path, names: Sequence[str]) -> Aiming:
-    from controller.artefacts.calibrated import Calibrated
+    from controller.stage.artefacts.calibrated import Calibrated
 
     with _lock:
         if run not in _measured:
@@ -172,6 +172,6 @@ def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) ->
 
 def read_geometry_of(calibrated: Calibrated) -> Geometry:
     """As ``artefacts.geometry.read_geometry``."""
-    from controller.artefacts.geometry import read_geometry
+    from controller.stage.artefacts.geometry import read_geometry
 
     return read_geometry(calibrated.folder, calibrated.projectors)

@@ -12,11 +12,11 @@ from typing import Final
 from controller.config.writer import toml_text
 from controller.core.errors import VelaturaError
 from controller.core.text import printable
-from controller.doctor.examine import Tools, examine
-from controller.doctor.values import Examination
 from controller.kiosk.interface import Finding, FoundDevice, TriedDevice
 from controller.kiosk.service import Service
 from controller.run.progress import Silent
+from controller.stage.doctor.examine import Tools, examine
+from controller.stage.doctor.values import Examination
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.finding import Found

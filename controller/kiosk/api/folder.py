@@ -27,8 +27,8 @@ from controller.kiosk.store.diagnostics import diagnostics
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.schedule_file import ScheduleFile, check
 from controller.kiosk.supervisors.lamp_history import LampHistory
-from controller.stage.calibrations import finished_calibration, stage_trust, worst_grade
-from controller.stage.check import Checked, check_stage
+from controller.stage.sessions.calibrations import finished_calibration, stage_trust, worst_grade
+from controller.stage.sessions.check import Checked, check_stage
 
 
 class FolderKiosk:

@@ -41,8 +41,8 @@ from controller.kiosk.service import Service
 from controller.kiosk.store import archive, runs, settings, settings_change, targets
 from controller.kiosk.store.diagnostics import diagnostics
 from controller.kiosk.store.schedule_file import check
-from controller.stage.calibrations import finished_calibration
-from controller.stage.check import check_stage
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.check import check_stage
 
 LIT_FOR_AIMING_S: Final = 900.0
 """The lamps stay lit for so long after test shots, because the next ones follow soon."""
@@ -157,8 +157,8 @@ class StageKiosk(AttachedKiosk):
             return self._begun(service, Request("compute", arguments=(name,)), "New appearance")
 
     def compute_scene(self, name: str, scene: str) -> Job:
-        from controller.blender.run import find_blender
         from controller.kiosk.preview.scenes import entry
+        from controller.stage.blender.run import find_blender
 
         service = self.service
         settings.check_name(name)

@@ -22,8 +22,8 @@ from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.stage.calibrations import stage_trust
-from controller.stage.run import stage_lock
+from controller.stage.sessions.calibrations import stage_trust
+from controller.stage.sessions.run import stage_lock
 
 LEVELS: Final = ("info", "warning", "error")
 LONG_S: Final = 600.0

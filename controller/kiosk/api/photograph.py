@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.artefacts.names import CAPTURES
+from controller.stage.artefacts.names import CAPTURES
 
 LONGEST_PX: Final = 480
 AGE_S: Final = 900.0
@@ -61,7 +61,7 @@ def _decoded(file: Path) -> Any:
     import cv2
     import rawpy
 
-    from controller.capture import linear_files
+    from controller.optics.capture import linear_files
 
     try:
         if file.suffix.lower() in (".jpg", ".jpeg"):

@@ -9,12 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import json_path, read_json
 from controller.core.arrays import Float64
 from controller.core.errors import VelaturaError
 from controller.kiosk.state import Place
-from controller.stage.calibrations import finished_calibrations
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import json_path, read_json
+from controller.stage.sessions.calibrations import finished_calibrations
 
 ASIDE_DEG: Final = 12.0
 """Nearer to the camera's direction than this, a projector is in front, neither left nor right."""

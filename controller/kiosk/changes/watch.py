@@ -10,9 +10,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.grade import is_graded, passes
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import json_path, read_json, run_kind
 from controller.config.models import StageTables
 from controller.core.errors import VelaturaError
 from controller.kiosk.changes import compare, inventory
@@ -21,7 +18,10 @@ from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.values import Changes
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.stage.calibrations import finished_calibrations
+from controller.stage.artefacts.grade import is_graded, passes
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import json_path, read_json, run_kind
+from controller.stage.sessions.calibrations import finished_calibrations
 
 NIGHT_H: Final = range(3, 15)
 """Local hours in which a night's inventory is taken: a computer that is off at night takes it in the morning."""

@@ -179,8 +179,8 @@ def _with_places(text: str, found: Mapping[str, str], there: Sequence[Connected]
 
 def _with_own_key(stage: Path, text: str) -> str:
     """stage.toml that trusts a new signing key of this computer, too: keys are in no backup."""
-    from controller.services.bundle import make_key
-    from controller.stage.calibrations import KEY_FILE
+    from controller.stage.services.bundle import make_key
+    from controller.stage.sessions.calibrations import KEY_FILE
 
     content = tomlkit.parse(text)
     trusted = content.get("bundle", {}).get("trusted_keys")

@@ -12,10 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from controller.artefacts.calibrated import Calibrated
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.published import BUNDLE
-from controller.artefacts.solved import read_solved
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
@@ -26,13 +22,17 @@ from controller.run.journal import Journal
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Runner, Step
 from controller.run.step_id import StepId
-from controller.stage.calibrations import output_sizes, signing_key, stage_trust, usable_calibration
-from controller.stage.check import Checked, check_stage
-from controller.stage.run import LONGEST_RUN_S
-from controller.stage.session import StageSession
-from controller.steps import costs
-from controller.steps.appearance.requests import requests_of
-from controller.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.published import BUNDLE
+from controller.stage.artefacts.solved import read_solved
+from controller.stage.sessions.calibrations import output_sizes, signing_key, stage_trust, usable_calibration
+from controller.stage.sessions.check import Checked, check_stage
+from controller.stage.sessions.run import LONGEST_RUN_S
+from controller.stage.sessions.session import StageSession
+from controller.stage.steps import costs
+from controller.stage.steps.appearance.requests import requests_of
+from controller.stage.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
 from hal.deadline import in_seconds
 
 FOLDER: Final = "without"

@@ -16,11 +16,11 @@ from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, run_name
 from controller.kiosk.store import settings
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision
-from controller.rig.rig import Rig
 from controller.run.progress import Phase, Progress
-from controller.stage.calibrations import stage_trust
-from controller.stage.check import check_stage
-from controller.stage.session import BorrowedSession
+from controller.stage.rig.rig import Rig
+from controller.stage.sessions.calibrations import stage_trust
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.session import BorrowedSession
 from hal.deadline import in_seconds
 
 AIM_S: Final = 300.0
@@ -84,7 +84,7 @@ class JobHandlers:
             yield BorrowedSession(self._stage, rig)
 
     def _drift(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.recalibrate import check_drift
+        from controller.stage.services.recalibrate import check_drift
 
         with self.lend() as rig:
             result = check_drift(
@@ -103,7 +103,7 @@ class JobHandlers:
         return Finished(request, changed, then=(replace(QUICK, key=request.key),))
 
     def _aim(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.steps.capture.aiming import take_test_shots
+        from controller.stage.steps.capture.aiming import take_test_shots
 
         began_s = time.monotonic()
 
@@ -121,14 +121,14 @@ class JobHandlers:
         return Finished(request, Decision("aimed", "The test shots are done. See the aiming page."))
 
     def _quick(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.recalibrate import recalibrate
+        from controller.stage.services.recalibrate import recalibrate
 
         with self._borrowed() as session:
             result = recalibrate(session=session, reporter=reporter, cancel=cancel)
         return self._after_calibration(request, reporter, result)
 
     def _projector(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.recalibrate import recalibrate
+        from controller.stage.services.recalibrate import recalibrate
 
         (name,) = request.arguments
         with self.lend() as rig:
@@ -138,7 +138,7 @@ class JobHandlers:
         return self._after_calibration(request, reporter, result)
 
     def _full(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.calibrate import calibrate
+        from controller.stage.services.calibrate import calibrate
 
         with self._borrowed() as session:
             result = calibrate(session=session, reporter=reporter, cancel=cancel)
@@ -157,7 +157,7 @@ class JobHandlers:
         return Finished(request, done, then=(replace(PUBLISH, key=request.key), report, *(last if wanted else ())))
 
     def _compare(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.compare import photograph
+        from controller.stage.services.compare import photograph
 
         if request.key and self._open_now():
             return Finished(request, Decision("photographs-left-out", "The appearances were not photographed, because"
@@ -200,7 +200,7 @@ class JobHandlers:
         return BundleStore(self._stage, stage_trust(check_stage(self._stage).stage)).names()
 
     def _report(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-        from controller.services.report import calibration_report
+        from controller.stage.services.report import calibration_report
 
         (run,) = request.arguments
         calibration_report(self._stage / "runs" / run, check_stage(self._stage))

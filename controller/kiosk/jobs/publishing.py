@@ -9,8 +9,8 @@ from pathlib import Path
 
 from controller.core.errors import VelaturaError
 from controller.run.progress import Reporter
-from controller.stage.check import check_stage
-from controller.stage.session import StageSession
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.session import StageSession
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
 
     Raises what ``services.calibrate.make_appearances`` raises if no appearance can be solved, and Cancelled.
     """
-    from controller.services.calibrate import make_appearances
+    from controller.stage.services.calibrate import make_appearances
 
     names, failed = _checked(session.stage)
     if failed and not names:
@@ -63,9 +63,9 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
 
 def _checked(stage: Path) -> tuple[tuple[str, ...], dict[str, str]]:
     """The appearances of stage.toml that can be solved, and why the others can't."""
-    from controller.artefacts.calibrated import Calibrated
-    from controller.stage.calibrations import finished_calibration
-    from controller.steps.appearance.requests import requests_of
+    from controller.stage.artefacts.calibrated import Calibrated
+    from controller.stage.sessions.calibrations import finished_calibration
+    from controller.stage.steps.appearance.requests import requests_of
 
     checked = check_stage(stage)
     calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)

@@ -22,22 +22,22 @@ from typing import Any, Final, TextIO
 import cv2
 import numpy as np
 
-from controller.artefacts.calibrated import Calibrated
 from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.kiosk.preview.computed import no_device
 from controller.kiosk.preview.pictures import write_picture
 from controller.kiosk.store.targets import fitted, png_size
-from controller.report.pictures import to_screen
-from controller.solve.engines.choice import choose_engine
-from controller.solve.engines.processor import Processor
-from controller.solve.judged import by_pixels, visible_object
-from controller.solve.memory_need import check_memory, solve_peak_bytes, stage_size
-from controller.solve.request import AppearanceResult, solve_appearance
-from controller.solve.targets.files import load_target
-from controller.solve.targets.values import Target
-from controller.steps.appearance.solving import options_of, solved_base
+from controller.optics.solve.engines.choice import choose_engine
+from controller.optics.solve.engines.processor import Processor
+from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
+from controller.optics.solve.request import AppearanceResult, solve_appearance
+from controller.optics.solve.result.evaluation import by_pixels, visible_object
+from controller.optics.solve.targets.files import load_target
+from controller.optics.solve.targets.values import Target
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.report.pictures import to_screen
+from controller.stage.steps.appearance.solving import options_of, solved_base
 from hal.runtime.memory import free_bytes
 
 JUDGED_PX: Final = 960

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, Mask
 from controller.core.storage import write_atomically
-from controller.report.pictures import crop_around
+from controller.stage.report.pictures import crop_around
 
 LONGEST_PX: Final = 960
 """The longer side."""

@@ -20,10 +20,10 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.storage import write_atomically
 
 if TYPE_CHECKING:
-    from controller.artefacts.calibrated import Calibrated
-    from controller.solve.drive_levels import DriveLevels
-    from controller.transport.indirect import IndirectLight
-    from controller.transport.sampled import SampledLight
+    from controller.optics.solve.reach.drive_levels import DriveLevels
+    from controller.optics.transport.indirect.indirect_light import IndirectLight
+    from controller.optics.transport.sampled import SampledLight
+    from controller.stage.artefacts.calibrated import Calibrated
 
 FOLDER: Final = "kiosk/preview"
 LONGEST_PX: Final = 480
@@ -58,7 +58,7 @@ def preview_light(stage: Path, run: Path, names: tuple[str, ...]) -> PreviewLigh
             file = stage / FOLDER / f"{run.name}.npz"
             found = _read(file)
             if found is None:
-                from controller.artefacts.calibrated import Calibrated
+                from controller.stage.artefacts.calibrated import Calibrated
 
                 calibrated = Calibrated(run, names)
                 found = sampled(calibrated)
@@ -86,9 +86,9 @@ def view_picture(stage: Path, run: Path, names: tuple[str, ...]) -> Path:
 
 def sampled(calibrated: Calibrated) -> PreviewLight:
     """The light of a whole calibration at about ``LONGEST_PX`` pixels along its longer side."""
-    from controller.solve.drive_levels import DriveLevels
-    from controller.transport.indirect import IndirectLight
-    from controller.transport.sampled import SampledLight
+    from controller.optics.solve.reach.drive_levels import DriveLevels
+    from controller.optics.transport.indirect.indirect_light import IndirectLight
+    from controller.optics.transport.sampled import SampledLight
 
     whole, indirect = calibrated.transport, calibrated.indirect
     rows, columns = whole.camera_shape
@@ -118,7 +118,7 @@ def _samples(pixels: int, step: float) -> npt.NDArray[np.int64]:
 
 def _in_white(calibrated: Calibrated) -> bytes:
     from controller.bundle.export import png
-    from controller.report.pictures import to_screen
+    from controller.stage.report.pictures import to_screen
 
     calibration = calibrated.calibration
     lit = np.asarray(sum((part.white for part in calibration.projectors), start=calibration.black), np.float32)
@@ -138,9 +138,9 @@ def _bytes(light: PreviewLight) -> bytes:
 
 def _read(file: Path) -> PreviewLight | None:
     """What an earlier service has kept; None if it is not there or damaged."""
-    from controller.solve.drive_levels import DriveLevels
-    from controller.transport.indirect import IndirectLight
-    from controller.transport.sampled import SampledLight
+    from controller.optics.solve.reach.drive_levels import DriveLevels
+    from controller.optics.transport.indirect.indirect_light import IndirectLight
+    from controller.optics.transport.sampled import SampledLight
 
     try:
         with np.load(file) as parts:

@@ -16,14 +16,14 @@ from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays
 from controller.core.storage import write_atomically
 from controller.kiosk.store.targets import fitted, png_size
 from controller.kiosk.values import Reach
-from controller.stage.calibrations import finished_calibration
-from controller.stage.check import Checked
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.check import Checked
 
 if TYPE_CHECKING:
     from controller.kiosk.preview.preview_light import PreviewLight
-    from controller.solve.feasibility import Feasibility
-    from controller.solve.request import Aim
-    from controller.solve.targets.values import Target
+    from controller.optics.solve.reach.feasibility import Feasibility
+    from controller.optics.solve.request import Aim
+    from controller.optics.solve.targets.values import Target
 
 FOLDER, KEPT = "kiosk/feasibility", 20
 FIGURES: Final = "reach.json"
@@ -74,9 +74,9 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     from controller.kiosk.preview.pictures import write_picture
     from controller.kiosk.preview.preview_light import preview_light
-    from controller.solve.judged import visible_object
-    from controller.solve.request import aim_at
-    from controller.steps.appearance.solving import options_of
+    from controller.optics.solve.request import aim_at
+    from controller.optics.solve.result.evaluation import visible_object
+    from controller.stage.steps.appearance.solving import options_of
 
     light = preview_light(checked.stage.folder, run, checked.names)
     wanted = _wanted(light, target)
@@ -99,8 +99,8 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
 
 
 def _wanted(light: PreviewLight, target: Path) -> Target:
-    from controller.solve.targets.files import load_target
-    from controller.solve.targets.values import Target
+    from controller.optics.solve.targets.files import load_target
+    from controller.optics.solve.targets.values import Target
 
     rows, columns = light.transport.camera_shape
     if target.suffix == ".npz":
@@ -131,7 +131,7 @@ def _shrunk(image: FloatImage, size_px: tuple[int, int]) -> FloatImage:
 
 def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
     """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture."""
-    from controller.solve.feasibility import FORGIVEN_DRIVE
+    from controller.optics.solve.reach.feasibility import FORGIVEN_DRIVE
 
     bright, dark = (part.max(axis=2) > FORGIVEN_DRIVE for part in (possible.too_bright, possible.too_dark))
     out = asked & ~possible.reachable
@@ -146,7 +146,7 @@ def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
 def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
     """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
     from controller.kiosk.preview.pictures import write_picture
-    from controller.report.pictures import to_screen
+    from controller.stage.report.pictures import to_screen
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
     made = light if of.indirect is None else light + of.indirect.forward(light)

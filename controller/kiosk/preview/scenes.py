@@ -16,17 +16,17 @@ from controller.core.errors import UsageError
 from controller.core.storage import sha256_of, write_atomically
 from controller.kiosk.preview import reach
 from controller.kiosk.values import Reach, Scene
-from controller.stage.calibrations import finished_calibration
-from controller.stage.check import Checked
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.sessions.check import Checked
 
 if TYPE_CHECKING:
-    from controller.calibrate.values import Pinhole
     from controller.kiosk.preview.preview_light import PreviewLight
+    from controller.optics.calibrate.values import Pinhole
 
 FOLDER: Final = "kiosk/scenes"
 OWN: Final = "scenes"
 """The stage's folder of the user's own scenes, .blend files."""
-SHIPPED: Final = Path(__file__).parents[2] / "blender" / "pictures"
+SHIPPED: Final = Path(__file__).parents[2] / "stage" / "blender" / "pictures"
 """A small picture of each scene that comes with Velatura, on the object of the demo."""
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,47}"
 MOST_OWN: Final = 24
@@ -37,7 +37,7 @@ _one_at_a_time = threading.Lock()
 
 def scenes(stage: Path) -> tuple[Scene, ...]:
     """Those that come with Velatura, then the stage's own by name."""
-    from controller.blender.job import BUILTIN
+    from controller.stage.blender.job import BUILTIN
 
     own = sorted(file.name for file in (stage / OWN).glob("*.blend") if re.fullmatch(NAME, file.name))
     return tuple(Scene(name, name in BUILTIN, _picture(stage, name)) for name in (*BUILTIN, *own[:MOST_OWN]))
@@ -97,13 +97,13 @@ def _read(facts: Path) -> Any:
 
 def _render(checked: Checked, run: Path, kept: Path, *, builtin: str | None, scene_file: Path | None) -> None:
     """Write the target as the preview's samples see it, into ``kept``."""
-    from controller.artefacts.calibrated import Calibrated
-    from controller.artefacts.geometry import read_geometry
-    from controller.blender.job import RenderSettings, as_seen, write_job
-    from controller.blender.run import find_blender, render
     from controller.core.arrays import save_arrays
     from controller.kiosk.preview.preview_light import preview_light
-    from controller.solve.targets.files import read_picture
+    from controller.optics.solve.targets.files import read_picture
+    from controller.stage.artefacts.calibrated import Calibrated
+    from controller.stage.artefacts.geometry import read_geometry
+    from controller.stage.blender.job import RenderSettings, as_seen, write_job
+    from controller.stage.blender.run import find_blender, render
 
     blender = find_blender()
     light = preview_light(checked.stage.folder, run, checked.names)

@@ -14,9 +14,9 @@ def wrapped(run: Path, names: tuple[str, ...], picture: Path) -> bytes:
     """
     import cv2
 
-    from controller.artefacts.calibrated import Calibrated
-    from controller.solve.targets.values import linear_to_srgb
-    from controller.steps.appearance.requests import make_target
+    from controller.optics.solve.targets.values import linear_to_srgb
+    from controller.stage.artefacts.calibrated import Calibrated
+    from controller.stage.steps.appearance.requests import make_target
 
     made = make_target("photograph", picture, {}, Calibrated(run, names))
     seen = np.rint(255 * np.dstack([linear_to_srgb(made.image), made.mask])).astype(np.uint8)

@@ -22,7 +22,7 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.files import require_regular
 from controller.core.storage import sync_folder
 from controller.kiosk.changes.devices import outputs_of_x
-from controller.stage.calibrations import finished_calibrations
+from controller.stage.sessions.calibrations import finished_calibrations
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.names import safe_name
 from controller.bundle.fallback import chosen
 from controller.bundle.format import Index
 from controller.bundle.install import current, previous
@@ -21,6 +20,7 @@ from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn
 from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
+from controller.stage.artefacts.names import safe_name
 
 PREVIEWS: Final = "kiosk/thumbnails"
 OUTPUTS: Final = "kiosk/outputs"

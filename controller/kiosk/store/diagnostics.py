@@ -13,12 +13,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from controller.artefacts.grade import FIGURES
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import json_path
-from controller.artefacts.published import BUNDLE_FIGURES
 from controller.kiosk.store.archive import add, new_file, write_tar
-from controller.stage.recording import tapes
+from controller.stage.artefacts.grade import FIGURES
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import json_path
+from controller.stage.artefacts.published import BUNDLE_FIGURES
+from controller.stage.sessions.recording import tapes
 from hal.runtime.caches import kept
 
 LARGEST_TAPE: Final = 64 << 20

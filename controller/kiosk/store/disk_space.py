@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.names import run_kind
 from controller.bundle.format import Index
 from controller.kiosk.store import archive
 from controller.kiosk.store.photo_retention import expired, outcome_of, purge
 from controller.run.journal import Journal
+from controller.stage.artefacts.names import run_kind
 
 GOING: Final = ".going"
 """The end of a run's name while it is removed."""

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.names import CAPTURES, run_kind
 from controller.core.storage import sync_folder
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
+from controller.stage.artefacts.names import CAPTURES, run_kind
 
 GOING: Final = f"{CAPTURES}.going"
 """The name during the removal, so that a power cut leaves no incomplete folder of photographs."""

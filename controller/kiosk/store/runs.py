@@ -8,14 +8,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.comparison import Compared, all_compared, history_of, pictures_of
-from controller.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
-from controller.artefacts.kinds import StepKind
-from controller.artefacts.names import REPORT_PAGE, json_path, read_json, run_kind
 from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.interface import Achieved, Comparison, DriftCheck, Grade, Results
-from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import Checked
+from controller.stage.artefacts.comparison import Compared, all_compared, history_of, pictures_of
+from controller.stage.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import REPORT_PAGE, json_path, read_json, run_kind
+from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import Checked
 
 MOST: Final = 50
 _NAME: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z]+")
@@ -92,7 +92,7 @@ def report(stage: Path, run: str, checked: Checked) -> Path:
     folder = _folder(stage, run)
     page = folder / REPORT_PAGE
     if not page.exists():
-        from controller.services.report import calibration_report
+        from controller.stage.services.report import calibration_report
 
         calibration_report(folder, checked)
     return page
@@ -102,7 +102,7 @@ def _comparison_report(folder: Path, checked: Checked) -> Path:
     page = folder / REPORT_PAGE
     if page.exists():
         return page
-    from controller.services.compare import comparison_report
+    from controller.stage.services.compare import comparison_report
 
     return comparison_report(folder, checked)
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from controller.artefacts.solved import remove_solved
 from controller.config.editing import rewrite_stage
 from controller.config.lines import KeyLines
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
@@ -18,8 +17,9 @@ from controller.core.errors import UsageError
 from controller.core.files import LARGEST_TEXT, read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.store.schedule_file import of_table
-from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import Checked, check_stage
+from controller.stage.artefacts.solved import remove_solved
+from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import Checked, check_stage
 from hal.registry import Drivers
 
 BEFORE: Final = "stage.toml.before"
@@ -83,8 +83,8 @@ def with_own_key(stage: Path, content: str) -> str:
     Without it the stage would refuse its own bundles. Raises as ``validate``, and what ``make_key`` raises.
     """
     from controller.bundle.signing import load_signing_key
-    from controller.services.bundle import make_key
-    from controller.stage.calibrations import KEY_FILE
+    from controller.stage.services.bundle import make_key
+    from controller.stage.sessions.calibrations import KEY_FILE
 
     validate(content)
     if tables_of(content).bundle.trusted_keys:

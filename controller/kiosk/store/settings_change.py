@@ -14,7 +14,7 @@ from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.store.settings import checked_settings
-from controller.stage.check import Checked
+from controller.stage.sessions.check import Checked
 from hal.registry import Drivers
 
 GOOD: Final = "kiosk/stage.toml.good"

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.stage.calibrations import finished_calibrations
+from controller.stage.sessions.calibrations import finished_calibrations
 
 Region = tuple[tuple[float, float], ...]
 """Corners of one part of a target, as shares of its width and height."""
@@ -23,7 +23,7 @@ def camera_view_px(stage: Path, names: tuple[str, ...]) -> tuple[int, int] | Non
 
     ``names`` of the projectors.
     """
-    from controller.artefacts.calibrated import Calibrated
+    from controller.stage.artefacts.calibrated import Calibrated
 
     try:
         run = next(iter(finished_calibrations(stage)), None)
@@ -46,7 +46,7 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill",
     """
     import cv2
 
-    from controller.solve.targets.profiles import Unsuitable, embedded_profile, with_profile
+    from controller.optics.solve.targets.profiles import Unsuitable, embedded_profile, with_profile
 
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
     if decoded is None:

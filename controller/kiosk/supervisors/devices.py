@@ -20,12 +20,12 @@ from controller.kiosk.supervisors.light_dose import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import World
-from controller.rig.ambient_light import AmbientLightLimit, LightWatch
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampFile
-from controller.rig.rig import Rig
-from controller.stage.check import Checked
-from controller.stage.open import light_sensor, mains_circuits, open_device, open_projector, rig_of
+from controller.stage.rig.ambient_light import AmbientLightLimit, LightWatch
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import LampFile
+from controller.stage.rig.rig import Rig
+from controller.stage.sessions.check import Checked
+from controller.stage.sessions.open import light_sensor, mains_circuits, open_device, open_projector, rig_of
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Camera, Device, Display, LightSensor, WatchedCamera

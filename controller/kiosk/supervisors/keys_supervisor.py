@@ -42,7 +42,7 @@ class KeysSupervisor:
         if self._opened is not None:
             return
         # Imported late: it loads OpenCV, which would delay the first picture after a boot.
-        from controller.rig.key_panel import KeyService, technicians_keys
+        from controller.stage.rig.key_panel import KeyService, technicians_keys
 
         with contextlib.ExitStack() as stack:
             try:

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from controller.capture.acquire import DISK_CODES
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.reopening import pause_s
-from controller.rig.lamp_faults import fatal_faults, faulty
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import Clock, SystemClock
+from controller.optics.capture.acquire import DISK_CODES
+from controller.stage.rig.lamp_faults import fatal_faults, faulty
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.values import Power, ProjectorStatus

@@ -15,8 +15,8 @@ from typing import Final
 import aiomqtt
 import anyio
 
-from controller.building.verbs import Verbs
 from controller.core.files import read_text
+from controller.kiosk.building.verbs import Verbs
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from controller import api
-from tests.controller.capture.test_raw import RGGB, mosaic_of, write_dng
+from tests.controller.optics.capture.test_raw import RGGB, mosaic_of, write_dng
 
 PROJECTOR, CAMERA = (64, 48), (240, 176)  # (width, height)
 SOME = 8000

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from controller import api
-from tests.controller.calibrate.simulator import Scene, photographed, positions
-from tests.controller.capture.test_raw import RGGB, mosaic_of, write_dng
+from tests.controller.optics.calibrate.simulator import Scene, photographed, positions
+from tests.controller.optics.capture.test_raw import RGGB, mosaic_of, write_dng
 
 SCENE = Scene((132, 100), (64, 48), 1.9, 3.0, seed=3)
 EXPOSURE_S = 0.5

@@ -15,8 +15,8 @@ from skimage import color
 
 from controller import api
 from controller.core.arrays import Float64
-from tests.controller.solve.conftest import plane_calibration
-from tests.controller.study.array_stage import shell
+from tests.controller.optics.solve.conftest import plane_calibration
+from tests.lab.study.array_stage import shell
 
 CAMERA, PROJECTOR = (32, 24), (8, 6)
 

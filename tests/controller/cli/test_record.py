@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import WorkError
-from controller.stage import recording
+from controller.stage.sessions import recording
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.tape.reading import read_tape

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from controller.config import load_stage, toml_text
 from controller.config.editing import KeyChange, edited, rewrite_stage
 from controller.core.errors import UsageError
-from tests.controller.stage.run_models import STAGE
+from tests.controller.stage.sessions.run_models import STAGE
 
 TEXT = STAGE.replace('port = "A"', 'port = "A"   # by the window') + "# the end\n"
 

@@ -12,7 +12,6 @@ import jsonschema_rs
 import pytest
 from PIL import Image
 
-from controller.blender.job import BUILTIN
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import (
     Aiming,
@@ -35,6 +34,7 @@ from controller.kiosk.operations.dispatch import AT_SOCKET, local_values
 from controller.kiosk.operations.operation import Answer
 from controller.panel.answer_schemas import Schemas
 from controller.panel.answers import plain
+from controller.stage.blender.job import BUILTIN
 from tests.controller.kiosk import vase
 
 PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"

@@ -13,13 +13,13 @@ from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampRecord
 from controller.run.state_machine import State
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import LampRecord
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.values import Power, ProjectorStatus
-from tests.controller.rig.lamp_model import RULES, Lamp, Shelf, World
+from tests.controller.stage.rig.lamp_model import RULES, Lamp, Shelf, World
 
 NAMES = ("left", "right", "above")
 STEP_S = 1.0

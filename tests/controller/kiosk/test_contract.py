@@ -15,7 +15,6 @@ import pytest
 from controller.bundle.export import png
 from controller.bundle.install import current, install
 from controller.bundle.writer import NewAppearance, write_bundle
-from controller.doctor.values import Examination
 from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
@@ -25,7 +24,8 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.stage.check import check_stage
+from controller.stage.doctor.values import Examination
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk import contract
 from tests.controller.kiosk.contract import OTHER, PLAYING, RUN, Contract
 from tests.controller.kiosk.vase import graded_run, vase

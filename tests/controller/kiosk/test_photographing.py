@@ -17,8 +17,8 @@ from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobReporter
 from controller.kiosk.store import runs
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.services import compare as comparison_services
-from controller.services import recalibrate as drift_services
+from controller.stage.services import compare as comparison_services
+from controller.stage.services import recalibrate as drift_services
 from tests.controller.kiosk.vase import graded_run, vase
 
 ROWS = [{"name": "marble", "headline": 1.5}, {"name": "glass", "headline": 2.25}]

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import UsageError
-from controller.doctor.examine import Tools
 from controller.kiosk.setup import set_up
-from controller.stage.check import check_stage
+from controller.stage.doctor.examine import Tools
+from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.finding import Finder, Found, SearchScope
 from hal.registry import load_drivers

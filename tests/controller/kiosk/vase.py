@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from controller.artefacts.kinds import CALIBRATED
-from controller.calibrate.verify.grade import grade_of
+from controller.optics.calibrate.verify.grade import grade_of
 from controller.run.journal import Journal
+from controller.stage.artefacts.kinds import CALIBRATED
 
 TEXT = """
 [stage]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from PIL import Image
 
-from controller.blender.job import BUILTIN
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.interface import (
     Achieved,
@@ -41,6 +40,7 @@ from controller.kiosk.interface import (
 )
 from controller.kiosk.store import settings, targets
 from controller.kiosk.store.schedule_file import check
+from controller.stage.blender.job import BUILTIN
 from tests.controller.kiosk.vase import TEXT
 from tests.controller.panel import example_values as examples
 from tests.controller.panel.example_values import BORN, OUTPUTS

@@ -1,4 +1,4 @@
-"""Live values: for many, and cheap. How soon they come is measured by `python -m benchmarks serve`."""
+"""Live values: for many, and cheap. How soon they come is measured by `python -m lab.timings serve`."""
 
 from __future__ import annotations
 

@@ -208,7 +208,7 @@ def test_starting_loads_neither_the_window_library_nor_the_rest_of_the_controlle
         "pydantic",
         "typer",
         "rich",
-        "controller.stage.run",
+        "controller.stage.sessions.run",
         "controller.config",
         "hal",
     }

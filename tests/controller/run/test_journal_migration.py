@@ -12,13 +12,13 @@ from pathlib import Path
 
 from hypothesis import given, settings
 
-from controller.artefacts.kinds import OF_PROJECTORS, StepKind
 from controller.run.journal import Journal
 from controller.run.journal_migration import OLD_SHOT, step_id_of
 from controller.run.runner import Context, Runner, Step
 from controller.run.step_id import ShotId, StepId
+from controller.stage.artefacts.kinds import OF_PROJECTORS, StepKind
 from hal.deadline import in_seconds
-from tests.controller.artefacts.names import projectors
+from tests.controller.stage.artefacts.names import projectors
 
 FORMAT_1 = """
 CREATE TABLE runs (

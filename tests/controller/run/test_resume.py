@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.rig.lamp_ledger import LampFile
 from controller.run.journal import Journal
+from controller.stage.rig.lamp_ledger import LampFile
 
 TOY = Path(__file__).with_name("toy_pipeline.py")
 

@@ -13,14 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from controller.core.storage import write_atomically
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampFile
-from controller.rig.power import power_down
 from controller.run.journal import Journal
 from controller.run.runner import Context, Runner, Step
 from controller.run.signals import cancelled_by_signals
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import ShotId, StepId
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import LampFile
+from controller.stage.rig.power import power_down
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 

@@ -31,16 +31,16 @@ print(scaled(np.ones(4)), sum(scaled.stats.cache_hits.values()), numba.get_num_t
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
-    """A copy of what kernels need, with one kernel, benchmarks/kernel.py, which uses benchmarks/constants.py."""
+    """A copy of what kernels need, with one kernel, lab/timings/kernel.py, which uses lab/timings/constants.py."""
     return _tree(tmp_path / "tree")
 
 
 def _tree(root: Path) -> Path:
     for package in ("hal", "controller"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (root / "benchmarks").mkdir()
-    (root / "benchmarks" / "constants.py").write_text("FACTOR = 2.0\n")
-    (root / "benchmarks" / "kernel.py").write_text(KERNEL.format(package="benchmarks"))
+    (root / "lab" / "timings").mkdir()
+    (root / "lab" / "timings" / "constants.py").write_text("FACTOR = 2.0\n")
+    (root / "lab" / "timings" / "kernel.py").write_text(KERNEL.format(package="lab.timings"))
     return root
 
 
@@ -48,7 +48,7 @@ def _run(root: Path, cache: Path, environment: Mapping[str, str] | None = None, 
     """Words that the kernel prints: result, kernels found in the cache, threads."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_", "OMP_", "VELATURA_"))}
     clean |= {"VELATURA_CACHE": str(cache), "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
-    code = f"{before}\nimport benchmarks.kernel"
+    code = f"{before}\nimport lab.timings.kernel"
     done = subprocess.run(
         [sys.executable, "-c", code], env=clean | dict(environment or {}), capture_output=True, text=True, check=True,
         cwd=root,
@@ -65,7 +65,7 @@ def test_a_kernel_is_compiled_once_for_every_copy_of_one_version(tree: Path, tmp
 
 def test_a_constant_that_changes_in_an_imported_file_is_compiled_in(tree: Path, tmp_path: Path) -> None:
     assert _run(tree, tmp_path / "cache")[0] == "8.0"
-    (tree / "benchmarks" / "constants.py").write_text("FACTOR = 3.0\n")
+    (tree / "lab" / "timings" / "constants.py").write_text("FACTOR = 3.0\n")
     assert _run(tree, tmp_path / "cache")[:2] == ["12.0", "0"]
 
 
@@ -112,14 +112,14 @@ print(threads_may_compute())
 
 def test_kernels_run_on_openmp_also_where_the_system_has_tbb(tree: Path, tmp_path: Path) -> None:
     # ``.ci/system-packages`` brings libtbb; by itself numba would take it, whose threads spin
-    with (tree / "benchmarks" / "kernel.py").open("a") as file:
+    with (tree / "lab" / "timings" / "kernel.py").open("a") as file:
         file.write(PARALLEL)
     assert _run(tree, tmp_path)[-1] == "omp"
     assert _run(tree, tmp_path, {"NUMBA_THREADING_LAYER": "workqueue"})[-1] == "workqueue"
 
 
 def test_threads_compute_together_only_where_numba_would_not_end_the_process(tree: Path, tmp_path: Path) -> None:
-    with (tree / "benchmarks" / "kernel.py").open("a") as file:
+    with (tree / "lab" / "timings" / "kernel.py").open("a") as file:
         file.write(TOGETHER)
     assert _run(tree, tmp_path)[-1] == "True"
     assert _run(tree, tmp_path, {"NUMBA_THREADING_LAYER": "workqueue"})[-1] == "False"

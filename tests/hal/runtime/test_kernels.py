@@ -22,7 +22,7 @@ from hal.runtime import kernels
 from hal.runtime.kernels import TABLES, Compilation, are_compiled, decode, encode, main, record
 from tests.processes import children
 
-MODULE = "controller.capture.encoding"
+MODULE = "controller.optics.capture.encoding"
 """A small one, with several kernels, of which some call others and some use all cores."""
 
 numbers = st.sampled_from([types.float32, types.float64, types.int64, types.uint8, types.uint16, types.boolean])

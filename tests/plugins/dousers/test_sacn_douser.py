@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sacn import DataPacket, sACNreceiver
 
-from controller.rig.doused import DousedProjector
+from controller.stage.rig.doused import DousedProjector
 from hal.conformance import DouserConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError

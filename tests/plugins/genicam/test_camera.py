@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.capture.linearity import RawExposure, black_offset, check_series
-from controller.capture.raw import read_mosaic, read_photograph
+from controller.optics.capture.linearity import RawExposure, black_offset, check_series
+from controller.optics.capture.raw import read_mosaic, read_photograph
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.rig.key_panel import technicians_keys
+from controller.stage.rig.key_panel import technicians_keys
 from hal.deadline import in_seconds
 from hal.errors import DeviceGone, PluginError
 from hal.registry import OpenContext, check_device

@@ -16,8 +16,8 @@ import pytest
 from pymodbus.datastore import ModbusDeviceContext, ModbusSequentialDataBlock, ModbusServerContext
 from pymodbus.server import ModbusTcpServer
 
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.mains_relays import Circuit, close_circuits, open_circuits
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.mains_relays import Circuit, close_circuits, open_circuits
 from hal.conformance import PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
@@ -25,7 +25,7 @@ from hal.interfaces import PowerSwitch
 from hal.registry import OpenContext
 from plugins.emulated.projectors.lamp import LampPhase
 from plugins.mains import modbus_relay, snmp_pdu
-from tests.controller.rig.lamp_model import Shelf
+from tests.controller.stage.rig.lamp_model import Shelf
 from tests.waiting import wait_for
 
 SNMPD = shutil.which("snmpd", path="/usr/sbin:/usr/bin")

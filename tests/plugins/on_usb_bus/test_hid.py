@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from controller.rig.ambient_light import AmbientLightLimit
+from controller.stage.rig.ambient_light import AmbientLightLimit
 from hal.conformance import LightSensorConformance, PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError

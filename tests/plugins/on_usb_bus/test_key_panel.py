@@ -14,8 +14,8 @@ import pytest
 from StreamDeck.DeviceManager import DeviceManager
 from StreamDeck.Devices.StreamDeckOriginalV2 import StreamDeckOriginalV2
 
-from controller.rig.key_panel import KeyService, key_picture, technicians_keys
 from controller.run.state_machine import Event, Machine, State
+from controller.stage.rig.key_panel import KeyService, key_picture, technicians_keys
 from hal.conformance import ButtonPanelConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused

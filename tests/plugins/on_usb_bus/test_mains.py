@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import serial
 
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.mains_relays import Circuit, close_circuits, open_circuits
-from controller.rig.power import light, power_down
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.mains_relays import Circuit, close_circuits, open_circuits
+from controller.stage.rig.power import light, power_down
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.registry import OpenContext
@@ -24,7 +24,7 @@ from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.usb.process import UsbBusProcess
 from plugins.hid.relay import RelayBoard
 from plugins.projectors.serial import open_serial_projector
-from tests.controller.rig.lamp_model import Shelf
+from tests.controller.stage.rig.lamp_model import Shelf
 from tests.waiting import eventually
 
 LAMP = LampTiming(warm_up_s=0.2, cool_down_s=600.0)

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from controller.rig.rig import Rig
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.stage.check import check_stage
-from controller.stage.session import OwnSession
+from controller.stage.rig.rig import Rig
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.session import OwnSession
 from hal.errors import DeviceRefused
 from hal.registry import Drivers, load_drivers
 from plugins.emulated.usb.process import UsbBusProcess
-from tests.controller.stage.run_models import STAGE, Models
+from tests.controller.stage.sessions.run_models import STAGE, Models
 
 TABLES = """
 [[relays]]

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from controller import __main__ as shell
-from controller.artefacts.kinds import CALIBRATED
-from controller.artefacts.solved import Solved
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER, generate_key
 from controller.config import load_stage
 from controller.play.cache import check_fits
 from controller.play.frames import OutputSize
 from controller.run.journal import Journal
+from controller.stage.artefacts.kinds import CALIBRATED
+from controller.stage.artefacts.solved import Solved
 
 STAGE = """\
 [stage]
@@ -282,7 +282,7 @@ def test_the_groups_help_names_its_commands_and_loads_nothing_heavy() -> None:
 import sys
 from controller.__main__ import run
 assert run(["bundle", "--help"]) == 0
-print(sorted({"numpy", "nacl", "cv2", "controller.config", "controller.stage.run"} & set(sys.modules)))
+print(sorted({"numpy", "nacl", "cv2", "controller.config", "controller.stage.sessions.run"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

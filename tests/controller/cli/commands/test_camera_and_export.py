@@ -13,10 +13,10 @@ import scipy.sparse
 import trimesh
 
 from controller.__main__ import run
-from controller.artefacts.projectors import Light
-from controller.calibrate.camera.charuco import find_corners
 from controller.core.arrays import save_arrays
-from controller.exchange.formats import FORMATS, Format
+from controller.optics.calibrate.camera.charuco import find_corners
+from controller.stage.artefacts.projectors import Light
+from controller.stage.exchange.formats import FORMATS, Format
 from tests.docs.synthetic_data import write_full_run, write_run
 
 

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from controller import __main__ as shell
-from controller.study.catalogue import EXPERIMENTS
+from lab.study.catalogue import EXPERIMENTS
 
 
 def test_the_experiments_that_may_be_named_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

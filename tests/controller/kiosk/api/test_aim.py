@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from controller.calibrate.values import Geometry, Pinhole
 from controller.kiosk.api.aim import FIGURES, FOLDER, aiming, camera_picture, grazing_share
 from controller.kiosk.interface import Aiming, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
-from controller.stage.check import check_stage
+from controller.optics.calibrate.values import Geometry, Pinhole
+from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Device

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from controller.doctor.examine import Tools
 from controller.kiosk.api.finding import find, findings, try_device
+from controller.stage.doctor.examine import Tools
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone
 from hal.finding import Finder, Found, Problem, SearchScope
 from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity
-from tests.controller.rig.rig_model import ModelCamera
+from tests.controller.stage.rig.rig_model import ModelCamera
 
 HOSTILE = "EOS \x1b]0;pwned\x07<script>\n\u202e"
 

@@ -28,7 +28,7 @@ from controller.kiosk.api.offline_dispatch import (
 )
 from controller.kiosk.interface import Aiming, DeviceRow, Job, JobStep, KioskState, LiveValue, ProjectorAim, Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.stage.run import stage_lock
+from controller.stage.sessions.run import stage_lock
 from tests.controller.kiosk.vase import graded_run, vase
 
 HOSTILE = "left\x1b[2J\x1b]0;pwned\x07\r\u202e"

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from controller.artefacts.names import CAPTURES
 from controller.kiosk.api.photograph import AGE_S, newest_photograph
+from controller.stage.artefacts.names import CAPTURES
 
 
 def taken(folder: Path, name: str, level: int, at_s: float) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
-from controller.stage.check import check_stage
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk import contract
 from tests.controller.kiosk.test_contract import install_two
 from tests.controller.kiosk.vase import graded_run, vase

@@ -10,7 +10,7 @@ import pytest
 from controller.core.errors import VelaturaError
 from controller.kiosk.jobs.failover import solve_without
 from controller.run.progress import Silent
-from controller.stage.session import BorrowedSession
+from controller.stage.sessions.session import BorrowedSession
 from tests.controller.kiosk.vase import TEXT, vase
 
 RIGHT = """

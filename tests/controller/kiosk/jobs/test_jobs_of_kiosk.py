@@ -26,7 +26,7 @@ from controller.kiosk.store import archive
 from controller.kiosk.store.accounts import Accounts, Role
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.run.progress import Silent
-from controller.stage.check import check_stage
+from controller.stage.sessions.check import check_stage
 from hal.deadline import Cancelled
 from tests.controller.kiosk.vase import graded_run, vase
 

@@ -12,8 +12,8 @@ import pytest
 from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.kiosk.jobs.publishing import publish_appearances
 from controller.run.progress import Silent
-from controller.services import calibrate as services
-from controller.stage.session import BorrowedSession
+from controller.stage.services import calibrate as services
+from controller.stage.sessions.session import BorrowedSession
 from hal.deadline import Cancelled
 from tests.controller.kiosk.vase import graded_run, vase
 

@@ -8,7 +8,7 @@ import pytest
 
 from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.preview.computed import ComputedPreviews
-from controller.stage.check import check_stage
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
 

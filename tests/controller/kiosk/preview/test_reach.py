@@ -10,8 +10,8 @@ import pytest
 
 from controller.core.errors import UsageError
 from controller.kiosk.preview.reach import BRIGHT, COLOURFUL, DARK, FOLDER, UNLIT, kinds_of, map_of, reach
-from controller.solve.feasibility import Feasibility
-from controller.stage.check import check_stage
+from controller.optics.solve.reach.feasibility import Feasibility
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import graded_run, vase
 
 

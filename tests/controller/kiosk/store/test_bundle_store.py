@@ -20,7 +20,7 @@ from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.store import bundle_store as stock_module
 from controller.kiosk.store.bundle_store import PREVIEWS, UNREAD_S, BundleStore, slots_without
-from tests.controller.artefacts.names import projectors as stages
+from tests.controller.stage.artefacts.names import projectors as stages
 
 UNSIGNED = Trust((), allow_unsigned=True)
 

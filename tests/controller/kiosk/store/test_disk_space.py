@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from controller.artefacts.names import CAPTURES
 from controller.bundle.signing import Trust
 from controller.config.upkeep import DiskTable
 from controller.kiosk.store import archive
@@ -12,6 +11,7 @@ from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import GOING, make_room
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors.disk_supervisor import GB, DiskSupervisor
+from controller.stage.artefacts.names import CAPTURES
 from tests.controller.kiosk.store.test_photo_retention import run_of
 
 

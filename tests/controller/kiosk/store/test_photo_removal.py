@@ -6,10 +6,10 @@ import os
 import time
 from pathlib import Path
 
-from controller.artefacts.names import CAPTURES
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.photo_retention import purge_old_photographs
 from controller.run.journal import Journal
+from controller.stage.artefacts.names import CAPTURES
 
 DAY_S = 86400.0
 FIRST_S = 1_800_000_000.0

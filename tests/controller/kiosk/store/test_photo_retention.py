@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.artefacts.names import CAPTURES
 from controller.kiosk.store.photo_retention import GOING, KEPT_S, expired, purge
 from controller.run.journal import Journal
+from controller.stage.artefacts.names import CAPTURES
 
 NOW_S = 1_800_000_000.0
 

@@ -17,8 +17,8 @@ from controller.kiosk.store import runs
 from controller.kiosk.store.event_log import EventLog
 from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
-from controller.stage.calibrations import finished_calibrations
-from controller.stage.check import check_stage
+from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import graded_run, vase
 
 FIRST, SECOND, THIRD = (f"2026010{day}-100000-calibrate" for day in (1, 2, 3))

@@ -11,8 +11,8 @@ from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.store import settings, settings_change
 from controller.kiosk.store.settings_change import GOOD, Change, GoodSettings, change, last_good
-from controller.stage.calibrations import signing_key
-from controller.stage.check import check_stage
+from controller.stage.sessions.calibrations import signing_key
+from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import TEXT, vase
 
 TWO = (

@@ -17,13 +17,13 @@ from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES
 from controller.kiosk.world import World
-from controller.rig.lamp_ledger import LampFile, LampRecord
-from controller.stage.check import check_stage
+from controller.stage.rig.lamp_ledger import LampFile, LampRecord
+from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.registry import Driver, Drivers
 from hal.values import ProjectorCapabilities, ProjectorStatus
-from tests.controller.stage.run_models import Models, QuickLamp
+from tests.controller.stage.sessions.run_models import Models, QuickLamp
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
-from controller.rig.key_panel import KeyService
 from controller.run.state_machine import State
+from controller.stage.rig.key_panel import KeyService
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.values import DeviceIdentity, PanelCapabilities

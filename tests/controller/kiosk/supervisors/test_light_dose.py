@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.light_dose import EVERY_S, FILE, LONGEST_GAP_S, LightDose
 from controller.kiosk.world import World
-from controller.stage.check import check_stage
-from tests.controller.stage.test_relays_and_light import LIGHT, Hall
+from controller.stage.sessions.check import check_stage
+from tests.controller.stage.sessions.test_relays_and_light import LIGHT, Hall
 
 
 class Clock:

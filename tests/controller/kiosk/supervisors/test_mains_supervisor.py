@@ -13,13 +13,13 @@ from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.mains_relays import Circuit
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.mains_relays import Circuit
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Device
 from hal.values import DeviceIdentity
-from tests.controller.rig.lamp_model import Lamp, Shelf, World
+from tests.controller.stage.rig.lamp_model import Lamp, Shelf, World
 
 BOOT_S = 3.0
 

@@ -14,13 +14,13 @@ from controller.kiosk.supervisors.projector_supervisor import (
     REOPEN_AFTER_FAULT_S,
     ProjectorSupervisor,
 )
-from controller.rig.lamp_guard import LampGuard
-from controller.rig.lamp_ledger import LampFile, LampLedger, LampRecord
+from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_ledger import LampFile, LampLedger, LampRecord
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import FragileLamp
-from tests.controller.rig.lamp_model import RULES, Shelf, World
+from tests.controller.stage.rig.lamp_model import RULES, Shelf, World
 
 FAULT = ProjectorStatus(Power.FAULT, ("lamp-failed",))
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from controller.calibrate.verify.error_causes import COLOURS, WORDS
 from controller.kiosk.interface import Aiming, EventRow, ProjectorAim
 from controller.kiosk.store.accounts import Role
+from controller.optics.calibrate.verify.error_causes import COLOURS, WORDS
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf, served
 

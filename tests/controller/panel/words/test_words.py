@@ -20,7 +20,7 @@ from controller.kiosk.state import LiveValue
 from controller.kiosk.supervisors.devices import DARK_ENOUGH, TOO_BRIGHT
 from controller.panel.words import figures, spoken
 from controller.panel.words.language import COOKIE, LANGUAGES, chosen, gettext, ngettext, speaking
-from controller.steps.appearance.requests import TITLES as SOURCE_TITLES
+from controller.stage.steps.appearance.requests import TITLES as SOURCE_TITLES
 from docs.panel_words import PANEL, WORDS, catalogue, compiled, words
 from tests.controller.panel.served import Served
 

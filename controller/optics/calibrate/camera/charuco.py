@@ -1,0 +1,190 @@
+"""The camera's lens from a handful of photographs of a printed ChArUco board (Zhang 2000; OpenCV's detector).
+
+The board's size on paper does not matter: a focal length in pixels follows from angles alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Float64
+from controller.core.errors import CalibrationError
+from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics
+
+SQUARES: Final = (11, 8)
+MARKER_SHARE: Final = 0.75
+DICTIONARY: Final = cv2.aruco.DICT_5X5_50
+FEWEST_CORNERS: Final = 15
+FEWEST_VIEWS: Final = 5
+LEAST_TILT_DEGREES: Final = 12.0
+"""Between the two most different views; with less, focal length and distance can't be separated."""
+LARGEST_FOCAL_REL_SIGMA: Final = 0.01
+LARGEST_RMS_PX: Final = 2.0
+MOST_SIGMAS: Final = 4.0
+LEAST_SIGMAS: Final = np.array([3e-4, 0.3, 0.3, 1e-3])
+"""What a printed board that is not quite flat leaves uncertain, however many corners there are (log f, cx, cy, k1)."""
+FLAGS: Final = (
+    cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+)  # the bundle adjustment has k1 alone, and must get the k1 that stands for all of them
+
+Grey = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """One photograph's corners: ``board`` (corners, 3) float32 in squares, ``seen_px`` (corners, 2) float32 x, y."""
+
+    board: npt.NDArray[np.float32]
+    seen_px: npt.NDArray[np.float32]
+
+
+def board_picture(width_px: int = 3300) -> Grey:
+    """The board to print, (rows, columns) uint8, 0 or 255, half a square of white around it."""
+    margin = width_px // (2 * SQUARES[0] + 2)
+    height_px = round((width_px - 2 * margin) * SQUARES[1] / SQUARES[0]) + 2 * margin
+    return np.asarray(_board().generateImage((width_px, height_px), marginSize=margin), dtype=np.uint8)
+
+
+def find_corners(photograph: Grey) -> BoardView | None:
+    """The board's corners in a grey photograph (rows, columns); None where too few are seen."""
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(_board()).detectBoard(photograph)
+    if ids is None or corners is None or len(ids) < FEWEST_CORNERS:
+        return None
+    known = np.asarray(_board().getChessboardCorners(), dtype=np.float32)[np.asarray(ids).ravel()]
+    return BoardView(known, np.asarray(corners, dtype=np.float32).reshape(-1, 2))
+
+
+def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> CameraIntrinsics:
+    """Focal length, principal point and k1 with their covariance, from the board's corners in several photographs.
+
+    ``size_px``: (width, height) of the photographs, which were taken with the zoom and focus of the stage
+
+    Raises CalibrationError("camera-too-few-views", "camera-views-parallel", or "camera-fit-poor": no lens explains the
+    corners).
+    """
+    _require_enough(views)
+    fit = _fit(views, size_px)
+    scatter = float(np.sqrt(np.mean([np.mean(off**2) for off in fit.off_px])))
+    kept = [_trimmed(view, off, MOST_SIGMAS * max(scatter, 0.02)) for view, off in zip(views, fit.off_px, strict=True)]
+    kept = [view for view in kept if len(view.board) >= FEWEST_CORNERS]
+    _require_enough(kept)
+    fit = _fit(kept, size_px)
+    covariance = fit.covariance()
+    rms_px = float(np.sqrt(np.mean(np.concatenate([off.ravel() ** 2 for off in fit.off_px]))))
+    if rms_px > LARGEST_RMS_PX:
+        raise CalibrationError(
+            "camera-fit-poor",
+            what=f"No lens model explains the corners of the board: they are off by {rms_px:.1f} px rms.",
+            remedy="Do not change zoom and focus between photographs, and mount the board flat on something stiff.",
+        )
+    if _tilt_degrees(fit.turns) < LEAST_TILT_DEGREES or covariance[0, 0] > LARGEST_FOCAL_REL_SIGMA**2:
+        raise CalibrationError(
+            "camera-views-parallel",
+            what="The board had nearly the same angle in all photographs, so focal length and distance can't be "
+            "separated.",
+            remedy="Turn the board by 20 to 45 degrees to the left, right, up and down between photographs.",
+        )
+    return CameraIntrinsics(
+        size_px=size_px,
+        focal_px=float(fit.matrix[0, 0]),
+        centre_px=(float(fit.matrix[0, 2]), float(fit.matrix[1, 2])),
+        k1=float(fit.distortion[0]),
+        covariance=covariance + np.diag(LEAST_SIGMAS**2),
+        method="charuco",
+        rms_px=rms_px,
+        views=len(kept),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _LensFit:
+    """A lens and the board's poses; ``off_px`` (corners, 2) of each view, found less seen."""
+
+    views: Sequence[BoardView]
+    matrix: Float64
+    distortion: Float64
+    turns: list[Float64]
+    moves: list[Float64]
+    off_px: list[Float64]
+
+    def covariance(self) -> Float64:
+        """(4, 4) of log f, cx, cy, k1, the poses eliminated, with the corners' own scatter as their noise."""
+        information = np.zeros((4, 4))
+        squares, free = 0.0, -4
+        for view, turn, move, off in zip(self.views, self.turns, self.moves, self.off_px, strict=True):
+            _, jacobian = cv2.projectPoints(view.board, turn, move, self.matrix, self.distortion)
+            pose = jacobian[:, :6]
+            focal = (jacobian[:, 6] + jacobian[:, 7]) * self.matrix[0, 0]
+            lens = np.stack([focal, jacobian[:, 8], jacobian[:, 9], jacobian[:, 10]], axis=1)
+            cross = pose.T @ lens
+            information += lens.T @ lens - cross.T @ np.linalg.solve(pose.T @ pose, cross)
+            squares += float(np.sum(off**2))
+            free += off.size - 6
+        scale = 1.0 / np.sqrt(np.diag(information))
+        inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+        return np.asarray(inverse * squares / max(free, 1))
+
+
+def _board() -> Any:
+    dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARY)
+    return cv2.aruco.CharucoBoard(SQUARES, 1.0, MARKER_SHARE, dictionary)
+
+
+def _require_enough(views: Sequence[BoardView]) -> None:
+    if len(views) < FEWEST_VIEWS:
+        raise CalibrationError(
+            "camera-too-few-views",
+            what=f"Only {len(views)} photographs show the board well enough; {FEWEST_VIEWS} are needed.",
+            remedy="Take ten to fifteen sharp and evenly lit photographs, with the board at different angles and "
+            "places.",
+        )
+
+
+def _fit(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
+    try:
+        _, matrix, distortion, turns, moves = cv2.calibrateCamera(
+            [view.board for view in views],
+            [view.seen_px.reshape(-1, 1, 2) for view in views],
+            size_px,
+            np.eye(3),
+            np.zeros(5),
+            flags=FLAGS,
+        )
+    except cv2.error as error:
+        raise CalibrationError(
+            "camera-fit-poor",
+            what="No lens model explains the corners of the board.",
+            remedy="Photograph the board from more angles, whole and in focus.",
+        ) from error
+    off = []
+    for view, turn, move in zip(views, turns, moves, strict=True):
+        found, _ = cv2.projectPoints(view.board, turn, move, matrix, distortion)
+        off.append(np.asarray(found.reshape(-1, 2) - view.seen_px, dtype=np.float64))
+    lens = np.asarray(distortion, dtype=np.float64).ravel()
+    return _LensFit(
+        views,
+        np.asarray(matrix, dtype=np.float64),
+        lens,
+        [np.asarray(t, np.float64) for t in turns],
+        [np.asarray(m, np.float64) for m in moves],
+        off,
+    )
+
+
+def _trimmed(view: BoardView, off_px: Float64, most_px: float) -> BoardView:
+    kept = np.linalg.norm(off_px, axis=1) < most_px
+    return BoardView(view.board[kept], view.seen_px[kept])
+
+
+def _tilt_degrees(turns: Sequence[Float64]) -> float:
+    """The largest angle between the board's normals in two views."""
+    normals = [cv2.Rodrigues(turn)[0][:, 2] for turn in turns]
+    largest = min(float(a @ b) for a, b in combinations(normals, 2))
+    return float(np.degrees(np.arccos(np.clip(largest, -1.0, 1.0))))

@@ -1,0 +1,217 @@
+"""From correspondences to a few complete starting points for the global bundle adjustment.
+
+Each camera-projector pair gives several candidates; a whole stage is chained from them by the ratios of their depths at
+shared camera pixels. None is dropped for costing a little more: a depth-reversed one can look better in one pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core import channels
+from controller.core.arrays import Float64, Mask
+from controller.optics.calibrate.geometry import bundle_adjustment as ba
+from controller.optics.calibrate.geometry import epipolar
+from controller.optics.calibrate.values import Correspondence
+
+_CANDIDATES = 6
+_KEPT = 4
+_PAIR_POINTS = 400
+_FEWEST_SHARED = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One projector by itself: ``candidates`` each with its depths at every sampled pixel, cheapest first.
+
+    ``noise_px`` and ``parallax_px`` tell a flat scene from a deep one; ``inliers`` (points,)
+    """
+
+    candidates: tuple[tuple[ba.AdjustmentState, float], ...]
+    noise_px: float
+    parallax_px: float
+    inliers: Mask
+
+
+def sample_pixels(correspondences: Sequence[Correspondence], most: int) -> tuple[Float64, Float64, Mask]:
+    """Camera pixels that at least two projectors see, the same ones in whatever order the projectors come.
+
+    Returns ``camera_px`` (points, 2), ``projector_px`` (points, N, 2), ``seen`` (points, N).
+    """
+    valid = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
+    shared = valid.sum(axis=0) >= 2
+    chosen = np.zeros(shared.shape, dtype=np.bool_)
+    for own in valid:
+        inner = own & shared
+        inner[1:-1, 1:-1] &= own[:-2, 1:-1] & own[2:, 1:-1] & own[1:-1, :-2] & own[1:-1, 2:]
+        pixels = np.flatnonzero(inner)
+        share = most // len(valid)
+        if len(pixels) > share:
+            pixels = np.random.default_rng(7).choice(pixels, share, replace=False)
+        chosen.ravel()[pixels] = True
+    rows, columns = np.nonzero(chosen)
+    observed = np.stack([c.projector_px[rows, columns] for c in correspondences], axis=1).astype(np.float64)
+    seen = valid[:, rows, columns].T.copy()
+    observed[~seen] = 0.0
+    return np.stack([columns, rows], axis=1).astype(np.float64), observed, seen
+
+
+def solve_pair(
+    problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, int], tick: Callable[[], None]
+) -> Pair | None:
+    """Candidates for one projector from its correspondences alone; None where no epipolar geometry fits them."""
+    seen = np.flatnonzero(problem.seen[:, index])
+    camera_px, observed = problem.camera_px[seen], problem.projector_px[seen, index]
+    focal = float(np.exp(problem.camera_prior[0]))
+    # MAGSAC measures in both images with one threshold: bring the camera's pixels to the projector's size
+    shrink = float(np.sqrt(_spread(observed) / max(_spread(camera_px), 1e-9)))
+    found = epipolar.fundamental(camera_px * shrink, observed)
+    if found is None:
+        return None
+    matrix, fits = found[0] @ np.diag([shrink, shrink, 1.0]), found[1]
+    noise = 1.4826 * float(np.median(epipolar.epipolar_distance_px(matrix, camera_px[fits], observed[fits])))
+    inliers = np.zeros(len(problem.seen), dtype=np.bool_)
+    inliers[seen[fits]] = True
+    rays = ba.undistorted(problem.camera_prior, camera_px[fits])
+    camera_matrix = np.array(
+        [[focal, 0, problem.camera_prior[1]], [0, focal, problem.camera_prior[2]], [0, 0, 1.0]], dtype=np.float64
+    )
+    starts = epipolar.candidates(matrix, rays, camera_matrix, observed[fits], size_px, _CANDIDATES)
+    chosen = seen[fits][:: max(1, int(fits.sum()) // _PAIR_POINTS)]
+    small = replace(restricted(problem, chosen, [index]), noise_px=max(noise, 0.02))
+    solved = []
+    for start in starts:
+        adjusted = ba.adjust(small, _from_start(small, start), tolerance=1e-5, tick=tick)
+        ahead = float(np.mean(adjusted.state.inverse_depth > 0))
+        if ahead > 0.95:
+            solved.append((adjusted.state, adjusted.cost))
+    parallax = epipolar.parallax_px(camera_px[fits], observed[fits])
+    kept = tuple(_distinct(sorted(solved, key=lambda pair: pair[1]))[:_KEPT])
+    return Pair(kept, noise, parallax, inliers)
+
+
+def chain(problem: ba.AdjustmentProblem, pairs: Sequence[Pair]) -> list[ba.AdjustmentState]:
+    """Complete stages, one for every candidate of every pair, completed by the candidates that agree with it best."""
+    depths = [[_depths(problem, n, state) for state, _ in pair.candidates] for n, pair in enumerate(pairs)]
+    picks: set[tuple[int, ...]] = set()
+    hypotheses = []
+    for base, pair in enumerate(pairs):
+        for candidate in range(len(pair.candidates)):
+            chained = _complete(depths, base, candidate)
+            if chained is None or tuple(chained[0]) in picks:
+                continue
+            picks.add(tuple(chained[0]))
+            hypotheses.append(_assembled(pairs, *chained, depths))
+    return hypotheses
+
+
+def restricted(
+    problem: ba.AdjustmentProblem, points: npt.NDArray[np.intp] | Mask, projectors: Sequence[int]
+) -> ba.AdjustmentProblem:
+    """The same problem with some of its points and projectors."""
+    n = list(projectors)
+    return replace(
+        problem,
+        camera_px=problem.camera_px[points],
+        projector_px=problem.projector_px[points][:, n],
+        seen=problem.seen[points][:, n],
+        projector_prior=problem.projector_prior[n],
+        projector_sigma=problem.projector_sigma[n],
+    )
+
+
+def triangulated(problem: ba.AdjustmentProblem, state: ba.AdjustmentState) -> Float64:
+    """(points,) inverse depths from all projectors that see each point; NaN where none does."""
+    xy = ba.undistorted(state.camera, problem.camera_px)
+    total, weight = np.zeros(len(xy)), np.zeros(len(xy))
+    for n in range(problem.seen.shape[1]):
+        rays = ba.undistorted(state.intrinsics[n], problem.projector_px[:, n])
+        own = epipolar.inverse_depths(xy, rays, state.rotations[n], state.centres[n])
+        usable = np.where(problem.seen[:, n], np.sum(state.centres[n] ** 2), 0.0)
+        total, weight = total + usable * own, weight + usable
+    return np.asarray(np.where(weight > 0, total / np.maximum(weight, 1e-300), np.nan))
+
+
+def _from_start(problem: ba.AdjustmentProblem, start: epipolar.PairStart) -> ba.AdjustmentState:
+    intrinsics = np.array([[np.log(start.focal_px), *start.principal_px, 0.0]])
+    empty = np.ones(len(problem.camera_px))
+    state = ba.AdjustmentState(problem.camera_prior, intrinsics, start.rotation[None], start.centre[None], empty)
+    return replace(state, inverse_depth=triangulated(problem, state))
+
+
+def _depths(problem: ba.AdjustmentProblem, index: int, state: ba.AdjustmentState) -> Float64:
+    one = restricted(problem, np.ones(len(problem.seen), dtype=np.bool_), [index])
+    inverse = triangulated(one, state)
+    return np.asarray(np.where(inverse > 0, inverse, np.nan))
+
+
+def _distinct(solved: list[tuple[ba.AdjustmentState, float]]) -> list[tuple[ba.AdjustmentState, float]]:
+    """One of each group that differs by less than 1 % in focal length and 0.02 in pose."""
+    kept: list[tuple[ba.AdjustmentState, float]] = []
+    for state, cost in solved:
+        same = (
+            abs(state.intrinsics[0, 0] - other.intrinsics[0, 0]) < 0.01
+            and float(np.abs(state.centres - other.centres).max()) < 0.02
+            and float(np.abs(state.rotations - other.rotations).max()) < 0.02
+            for other, _ in kept
+        )
+        if not any(same):
+            kept.append((state, cost))
+    return kept
+
+
+def _complete(depths: list[list[Float64]], base: int, candidate: int) -> tuple[list[int], list[float]] | None:
+    """Candidate and scale for every projector, joined where most pixels are shared; None if not connected."""
+    picks, scales = [-1] * len(depths), [1.0] * len(depths)
+    picks[base] = candidate
+    known = depths[base][candidate].copy()
+    while -1 in picks:
+        joins = [_closest(options, known) for n, options in enumerate(depths) if picks[n] < 0]
+        waiting = [n for n, pick in enumerate(picks) if pick < 0]
+        shared, middle, k, n = max((*join, n) for join, n in zip(joins, waiting, strict=True))
+        if shared < _FEWEST_SHARED:
+            return None
+        picks[n], scales[n] = k, float(np.exp(middle))
+        known = np.where(np.isfinite(known), known, depths[n][k] / scales[n])
+    return picks, scales
+
+
+def _closest(options: list[Float64], known: Float64) -> tuple[int, float, int]:
+    """Points shared, middle log ratio of depths, and index of the candidate whose ratios to ``known`` differ least."""
+    best, lowest = (0, 0.0, -1), np.inf
+    for k, own in enumerate(options):
+        ratio = np.log(own / known)
+        ratio = ratio[np.isfinite(ratio)]
+        if len(ratio) < _FEWEST_SHARED:
+            continue
+        middle = float(np.median(ratio))
+        disorder = float(np.median(np.abs(ratio - middle)))
+        if disorder < lowest:
+            best, lowest = (len(ratio), middle, k), disorder
+    return best
+
+
+def _assembled(
+    pairs: Sequence[Pair], picks: list[int], scales: list[float], depths: list[list[Float64]]
+) -> ba.AdjustmentState:
+    states = [pair.candidates[k][0] for pair, k in zip(pairs, picks, strict=True)]
+    # a candidate's inverse depths are scales[n] times too large, so its baseline is too small by as much
+    scaled = np.array([own[k] / s for own, k, s in zip(depths, picks, scales, strict=True)])
+    known = np.isfinite(scaled)
+    inverse = np.where(known, scaled, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    typical = float(np.median(inverse[known.any(axis=0)]))
+    return ba.AdjustmentState(
+        np.mean([s.camera for s in states], axis=0),
+        np.concatenate([s.intrinsics for s in states]),
+        np.concatenate([s.rotations for s in states]),
+        np.concatenate([s.centres * scale for s, scale in zip(states, scales, strict=True)]),
+        np.where(known.any(axis=0), inverse, typical),
+    )
+
+
+def _spread(px: Float64) -> float:
+    return float(np.sum(np.var(px, axis=0)))

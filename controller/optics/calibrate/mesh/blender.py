@@ -1,0 +1,177 @@
+"""A script that sets up the calibrated stage in Blender 4: the object, the camera, and the projectors as cameras.
+
+Blender's cameras have no radial distortion. The script therefore renders a margin around the picture, and
+``bend_picture`` brings a rendered picture into the calibrated camera's own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage
+from controller.optics.calibrate.values import Geometry, Pinhole
+
+TO_BLENDER: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From the camera's frame (x right, y down, z forward) to Blender's world (x right, y forward, z up)."""
+_LOOKING: Final = np.diag([1.0, -1.0, -1.0])
+
+
+def margin_px(camera: Pinhole) -> int:
+    """How much wider than the picture, on each side, a picture without distortion must be to hold all of it."""
+    width, height = camera.size_px
+    edge_x = np.concatenate([np.arange(width), np.arange(width), np.zeros(height), np.full(height, width - 1)])
+    edge_y = np.concatenate([np.zeros(width), np.full(width, height - 1), np.arange(height), np.arange(height)])
+    straight = _straightened(camera, np.stack([edge_x, edge_y], axis=1).astype(np.float64))
+    beyond = np.max([-straight.min(), *(straight.max(axis=0) - (width - 1, height - 1))])
+    return max(0, math.ceil(float(beyond)) + 1)
+
+
+def bend_picture(rendered: FloatImage, camera: Pinhole) -> FloatImage:
+    """What the calibrated camera sees, (rows, columns, channels) float32, of a picture that ``scene_script`` rendered.
+
+    ``rendered`` is larger than the camera's picture by ``margin_px`` on each side.
+    """
+    from scipy import ndimage
+
+    at = places_in_rendering(camera)
+    # splines, since OpenCV's remap rounds places to 1/32 px
+    planes = [
+        ndimage.map_coordinates(rendered[..., channel], (at[..., 1], at[..., 0]), order=3, mode="nearest")
+        for channel in range(rendered.shape[2])
+    ]
+    return np.stack(planes, axis=2).astype(np.float32)
+
+
+def places_in_rendering(camera: Pinhole) -> Float64:
+    """(rows, columns, 2) float64: x and y, in a rendering with its margin, of what each camera pixel sees."""
+    width, height = camera.size_px
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    straight = _straightened(camera, np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64))
+    return (straight + margin_px(camera)).reshape(height, width, 2)
+
+
+def scene_script(geometry: Geometry, names: Sequence[str], mesh_file: str) -> str:
+    """Python for ``blender --python`` or for a Python with bpy; it reads ``mesh_file`` (.glb) from its own folder.
+
+    ``names`` of the projectors in order; ``-- --render FILE`` renders, ``-- --save FILE`` keeps a .blend.
+    """
+    views = [_view("camera", geometry.camera, margin_px(geometry.camera))]
+    views += [_view(f"projector {name}", own, 0) for name, own in zip(names, geometry.projectors, strict=True)]
+    return _SCRIPT.replace("@MESH@", json.dumps(mesh_file)).replace("@VIEWS@", json.dumps(views, indent=4))
+
+
+def _straightened(camera: Pinhole, px: Float64) -> Float64:
+    """Where (points, 2) of the camera's picture lie in one without distortion."""
+    middle, focal = camera.matrix[:2, 2], np.diag(camera.matrix)[:2]
+    bent = (px - middle) / focal
+    flat = bent
+    for _ in range(20):
+        r2 = np.sum(flat * flat, axis=1, keepdims=True)
+        flat = bent / (1.0 + r2 * (camera.distortion[0] + r2 * camera.distortion[1]))
+    return np.asarray(flat * focal + middle)
+
+
+def _view(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:
+    """A Blender camera: focal length and shift in widths of the rendered picture, and its matrix in the world."""
+    width, height = own.size_px
+    whole_width, whole_height = width + 2 * margin, height + 2 * margin
+    # Blender measures focal length and shift in the larger side, where the sensor's fit is automatic; the script fixes
+    # the fit to the width
+    matrix = np.eye(4)
+    matrix[:3, :3] = TO_BLENDER @ own.rotation.T @ _LOOKING
+    matrix[:3, 3] = TO_BLENDER @ (-own.rotation.T @ own.translation_m)
+    return {
+        "name": name,
+        "resolution": [whole_width, whole_height],
+        "margin_px": margin,
+        "focal_widths": float(own.matrix[0, 0]) / whole_width,
+        "shift_x": ((width - 1) / 2 - float(own.matrix[0, 2])) / whole_width,
+        "shift_y": (float(own.matrix[1, 2]) - (height - 1) / 2) / whole_width,
+        "matrix_world": matrix.tolist(),
+    }
+
+
+_SCRIPT: Final = '''\
+"""A calibrated Velatura stage in Blender 4: blender --python scene.py, or python scene.py where bpy is installed.
+
+After --: --render FILE renders the camera's view as it is lit (16-bit PNG, or EXR by its name), --save FILE keeps a
+.blend. Rendered pictures have margin_px more on each side than the camera's, and no lens distortion.
+"""
+
+import sys
+from pathlib import Path
+
+import bpy
+from mathutils import Matrix
+
+MESH = @MESH@
+VIEWS = @VIEWS@
+SENSOR_MM = 36.0
+
+
+def load_object(path):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.import_scene.gltf(filepath=str(path))
+    return next(thing for thing in bpy.data.objects if thing.type == "MESH")
+
+
+def add_view(view):
+    lens = bpy.data.cameras.new(view["name"])
+    lens.sensor_fit = "HORIZONTAL"
+    lens.sensor_width = SENSOR_MM
+    lens.lens = view["focal_widths"] * SENSOR_MM
+    lens.shift_x, lens.shift_y = view["shift_x"], view["shift_y"]
+    lens.clip_start, lens.clip_end = 0.01, 100.0
+    camera = bpy.data.objects.new(view["name"], lens)
+    camera.matrix_world = Matrix(view["matrix_world"])
+    bpy.context.scene.collection.objects.link(camera)
+    return camera
+
+
+def set_up(folder):
+    load_object(folder / MESH)
+    cameras = [add_view(view) for view in VIEWS]
+    scene = bpy.context.scene
+    scene.camera = cameras[0]
+    scene.render.resolution_x, scene.render.resolution_y = VIEWS[0]["resolution"]
+    scene.render.resolution_percentage = 100
+    scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
+    scene.unit_settings.system = "METRIC"
+    scene.view_settings.view_transform = "Standard"
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 64
+    world = bpy.data.worlds.new("stage")
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.6, 0.6, 0.6, 1.0)
+    scene.world = world
+    return scene
+
+
+def render(scene, path):
+    image = scene.render.image_settings
+    image.file_format = "OPEN_EXR" if path.suffix == ".exr" else "PNG"
+    image.color_depth = "32" if path.suffix == ".exr" else "16"
+    image.color_mode = "RGB"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+
+
+def main(arguments):
+    scene = set_up(Path(__file__).resolve().parent)
+    for option, value in zip(arguments[::2], arguments[1::2]):
+        if option == "--render":
+            render(scene, Path(value).resolve())
+        elif option == "--save":
+            bpy.ops.wm.save_as_mainfile(filepath=str(Path(value).resolve()))
+        else:
+            sys.exit(f"unknown option {option}: --render FILE and --save FILE are known")
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
+'''

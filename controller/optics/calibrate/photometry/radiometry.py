@@ -1,0 +1,138 @@
+"""A projector's response and colour mixing from colour tiles (idea of Raij 2003), and whether the camera is linear.
+
+Every tile of a picture shows a triple of device values of its own, so that two photographs hold some hundreds to
+thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Where colours
+depend on the paint, the tiles tell that, too (``paint_mixing``). ``tile_fit`` fits all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.core.arrays import FloatImage
+from controller.core.errors import CalibrationError
+from controller.optics.calibrate.correspondence.captures import Captures, coloured
+from controller.optics.calibrate.correspondence.gray_code import Cells
+from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
+from controller.optics.calibrate.photometry.tile_fit import evened, fit_tiles, with_paint
+from controller.optics.calibrate.values import Radiometry
+from controller.optics.capture.patterns import PatternPlan
+from controller.optics.capture.profile import CameraNoise
+
+FEWEST_TILES = 60
+SUSPECT_ADDITIVITY = 0.02
+"""From here on a white segment is looked for."""
+BETTER = 0.7
+LEAST_SEGMENT = 0.03
+REMEDY = (
+    "Switch off the projector's brilliant-colour, white-boost and dynamic modes (often called BrilliantColor, "
+    "White Peaking or Dynamic). Then calibrate again."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RadiometryReport:
+    """What the measurement was worth.
+
+    ``pixels`` camera pixels used; ``tiles`` that were measured, of all patterns together; ``scatter`` median absolute
+    deviation of the tiles from the fit, of full scale; ``stray`` share of a tile's white that comes from other tiles;
+    ``additivity`` largest relative difference between white and what the tiles say of it, over the camera's channels
+    ``segment``: see ``Radiometry``; 0 where colours add; ``flicker``: largest difference of a photograph's light from
+    white's, relative; ``paint``: rms of what paints change of the tiles' light, of white; 0 if one mixing holds for all
+    """
+
+    pixels: int
+    tiles: int
+    scatter: float
+    stray: float
+    additivity: float
+    segment: float = 0.0
+    flicker: float = 0.0
+    paint: float = 0.0
+
+
+def measure_radiometry(
+    captures: Captures,
+    plan: PatternPlan,
+    *,
+    indirect: KnownIndirect | None = None,
+    known_px: FloatImage | None = None,
+    noise: CameraNoise | None = None,
+    code: tuple[Cells, Cells] | None = None,
+) -> tuple[Radiometry, RadiometryReport]:
+    """Response and mixing of one projector.
+
+    Parameters
+    ----------
+    captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
+    indirect : what is known of it by an earlier measurement; the response is then fitted to direct light alone
+    known_px, noise : as for ``decode``
+    code : as for ``measure_tiles``
+
+    Returns
+    -------
+    the radiometry, and a report on the measurement
+
+    Raises
+    ------
+    CalibrationError("capture-missing"), CalibrationError("capture-shape-wrong")
+    CalibrationError("projector-dark")  too few colour tiles are seen
+    CalibrationError("colours-do-not-add")  the tiles do not follow from three responses and a mixing
+    CalibrationError("colours-alike")  the primaries can't be separated
+    """
+    black = coloured(captures, "black")
+    white = coloured(captures, "white", black.shape[:2]) - black
+    tiles = measure_tiles(captures, plan, black, white, indirect=indirect, known_px=known_px, noise=noise, code=code)
+    if tiles.ratio.shape[0] < FEWEST_TILES:
+        raise CalibrationError(
+            "projector-dark",
+            what=f"The camera sees only {tiles.ratio.shape[0]} lit colour tiles of this projector.",
+            remedy="Check that its lamp is lit, its shutter open and its picture on the object, then calibrate again.",
+        )
+    fit = fit_tiles(tiles)
+    if not fit.good or fit.additivity > SUSPECT_ADDITIVITY:
+        # white may have a light of its own
+        other = fit_tiles(tiles, with_segment=True)
+        if other.good and other.segment > LEAST_SEGMENT and other.scatter < BETTER * fit.scatter:
+            fit = other
+    seen = tiles.ratio
+    tiles, fit, paint = with_paint(tiles, fit)
+    of_paint = float(np.sqrt(np.mean((seen - tiles.ratio) ** 2)))
+    scatter = fit.scatter
+    if not fit.good:
+        raise CalibrationError(
+            "colours-do-not-add",
+            what=f"The projector's colours are not additive: tiles differ by {100 * scatter:.0f} % from the sum of "
+            f"three responses, white by {100 * fit.additivity:.0f} %.",
+            remedy=REMEDY,
+        )
+    if indirect is not None:
+        fit = evened(tiles, fit)
+    stray = float(fit.stray.mean())
+    flicker = float(np.abs(fit.strength - 1).max())
+    report = RadiometryReport(
+        tiles.pixels, tiles.ratio.shape[0], scatter, stray, fit.additivity, fit.segment, flicker, of_paint
+    )
+    return Radiometry(fit.response, fit.mixing, fit.segment, paint), report
+
+
+def painted(name: str, change: float) -> str | None:
+    """What a technician should know of ``RadiometryReport.paint``; None where one mixing holds for all paints."""
+    if not change:
+        return None
+    return (
+        f"Colours of projector {name} depend on the paint that they fall on, by {100 * change:.1f} % of white (colour "
+        "tiles, standard deviation). Velatura calculates with it. Nothing has to be done."
+    )
+
+
+def white_segment(name: str, share: float) -> str | None:
+    """What a technician should know of a projector with a white segment; None without one."""
+    if not share:
+        return None
+    return (
+        f"Projector {name} adds white light of its own: {100 * share:.0f} % of its white is not the sum of red, green "
+        f"and blue. {REMEDY} If it can't be switched off, Velatura calculates with it; bright colours are then darker."
+    )

@@ -1,0 +1,343 @@
+"""What has changed since a calibration, from a few photographs: what moved, by how much, and which lamps have dimmed.
+
+Each projector shows one random pattern alone, then all show white, then black. Every photograph is compared with what
+the light transport predicts. A projector that moved shifts its own pattern; a camera that moved shifts the object's
+paint and all patterns alike; an object that moved shifts the paint, and patterns lie elsewhere on it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import finite, smallest, total
+from controller.optics.calibrate.values import Calibration, ProjectorCalibration
+from controller.optics.calibrate.verify.registration import Motion, no_motion, register, warp
+
+STILL_PX = 0.1
+"""Motion of a projector's picture, in its pixels, or of the camera's that still counts as none: the model's own
+error."""
+SAME_LIGHT = 0.015
+"""A gain within this of 1 is the model's own error."""
+LOCAL_PX = 0.35
+"""Parts of a picture whose motion disagrees by more were not moved by a simple turn of the projector."""
+PARALLAX_SHARE = 0.15
+"""Of the camera's own motion: what a homography may leave unexplained on an object with depth."""
+CAMERA_PIXELS = 1_200_000
+"""Larger camera images are shrunk before they are registered."""
+LEAST_LIGHT = 0.25
+"""Below this share of its light a projector counts as dark, and the position of its picture is not reported."""
+AMBIENT_SHARE = 0.003
+"""Of white: a larger change of the black image is reported."""
+
+
+class TransportModel(Protocol):
+    """The part of the light transport that the drift check needs."""
+
+    @property
+    def lit(self) -> Mask: ...
+
+    def forward_part(self, n: int, p: FloatImage) -> FloatImage: ...
+
+    def gaussian_mean(self, image: FloatImage, n: int) -> FloatImage: ...
+
+
+@dataclass(frozen=True, slots=True)
+class DriftPhotographs:
+    """The photographs: (rows, columns, 3) float32, full scales per second, NaN where saturated.
+
+    ``patterns``: of each projector alone, by name; ``white``: of all projectors at white; ``black``: at black.
+    """
+
+    black: FloatImage
+    white: FloatImage
+    patterns: Mapping[str, FloatImage]
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorDrift:
+    """One projector since the calibration.
+
+    ``motion`` in its own pixels: where a point of the object lies in its image now, from where it lay
+    ``gain`` (3,) light of its red, green and blue channel now over then, with ``gain_sigma`` (3,)
+    ``local_px`` how far parts of its picture, once registered, still lie from where they should
+    ``light_share`` what reaches the camera, over what should
+    """
+
+    name: str
+    motion: Motion
+    gain: tuple[float, float, float]
+    gain_sigma: tuple[float, float, float]
+    local_px: float
+    light_share: float
+
+    @property
+    def known(self) -> bool:
+        """Whether its picture was recognised."""
+        return self.motion.found
+
+    @property
+    def moved(self) -> bool:
+        return self.motion.moved(STILL_PX)
+
+    @property
+    def turned_only(self) -> bool:
+        """Whether a homography explains all of its motion."""
+        return self.known and self.local_px <= LOCAL_PX
+
+    @property
+    def dimmed(self) -> bool:
+        """Whether the light of some channel has changed, either way."""
+        return self.known and any(
+            abs(gain - 1) > max(SAME_LIGHT, 3 * sigma) for gain, sigma in zip(self.gain, self.gain_sigma, strict=True)
+        )
+
+
+class DriftCause(enum.Enum):
+    """What shifted the picture as a whole."""
+
+    NONE = "none"
+    CAMERA = "camera"
+    OBJECT = "object"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What has changed since the calibration.
+
+    ``projectors``: as seen after the camera's own motion was taken out; ``camera``: how the object's picture moved, in
+    camera pixels; ``ambient_share``: change of the black image over white; ``ambient_ratio``: black now over then
+    """
+
+    projectors: tuple[ProjectorDrift, ...]
+    camera: Motion
+    culprit: DriftCause
+    ambient_share: float
+    ambient_ratio: float
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """Projectors whose pictures moved on the object, or were not recognised."""
+        return tuple(one.name for one in self.projectors if one.moved or not one.known)
+
+    @property
+    def dimmed(self) -> tuple[str, ...]:
+        return tuple(one.name for one in self.projectors if one.dimmed)
+
+    @property
+    def ambient_changed(self) -> bool:
+        return abs(self.ambient_share) > AMBIENT_SHARE
+
+    @property
+    def nothing(self) -> bool:
+        """Whether the calibration still holds."""
+        return self.culprit is DriftCause.NONE and not (self.moved or self.dimmed or self.ambient_changed)
+
+
+def find_drift(
+    light: TransportModel, calibration: Calibration, frames: Sequence[FloatImage], seen: DriftPhotographs
+) -> Drift:
+    """Compare photographs with the prediction.
+
+    Parameters
+    ----------
+    light : the light transport of ``calibration``
+    frames : (rows, columns, 3) float32 linear light that each projector showed
+    """
+    names = [part.name for part in calibration.projectors]
+    black = np.where(np.isfinite(seen.black), seen.black, calibration.black).astype(np.float32)
+    patterns = [seen.patterns[name] - black for name in names]
+    parts = list(zip(range(len(names)), calibration.projectors, frames, strict=True))
+    found = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
+    camera = _camera(calibration, found, seen)
+    culprit = DriftCause.NONE if camera.found else DriftCause.UNKNOWN
+    if camera.moved(STILL_PX) and not _explained_by_projectors(camera, found):
+        back = np.asarray(np.linalg.inv(camera.matrix), np.float64)
+        patterns = [warp(pattern, back) for pattern in patterns]
+        found = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
+        camera = _camera(calibration, found, seen)
+        culprit = _culprit(camera, found, light, calibration)
+    share, ratio = _ambient(calibration, seen)
+    return Drift(tuple(found), _backwards(camera), culprit, share, ratio)
+
+
+def _explained_by_projectors(camera: Motion, found: Sequence[ProjectorDrift]) -> bool:
+    """Shading that went with a projector can shift the object's picture a little, though the others lie still."""
+    still = [one for one in found if one.known and not one.moved]
+    return bool(still) and camera.rms_px < 3 * STILL_PX
+
+
+def _culprit(
+    camera: Motion, found: Sequence[ProjectorDrift], light: TransportModel, calibration: Calibration
+) -> DriftCause:
+    """After the camera's motion was taken out, patterns lie still on the object, unless it was the object."""
+    known = [(n, one) for n, one in enumerate(found) if one.known]
+    if not known or not camera.found:
+        return DriftCause.UNKNOWN
+    elsewhere = []
+    for n, one in known:
+        # A homography leaves a part of the camera's motion unexplained where the object has depth.
+        tolerated = PARALLAX_SHARE * camera.rms_px / camera_px_per_pixel(calibration.projectors[n])
+        elsewhere.append(one.motion.moved(STILL_PX + tolerated))
+    if 2 * sum(elsewhere) <= len(known) - (len(known) == 2):
+        return DriftCause.CAMERA
+    return DriftCause.OBJECT if all(elsewhere) or sum(elsewhere) >= 2 else DriftCause.UNKNOWN
+
+
+def camera_px_per_pixel(part: ProjectorCalibration) -> float:
+    """How many camera pixels lie between two neighbouring pixels of a projector, in the median."""
+    apart = np.hypot(*np.moveaxis(np.diff(part.metapixels.centre_px, axis=1), -1, 0))
+    apart = apart[np.isfinite(apart)]
+    return float(np.median(apart)) if apart.size else math.nan
+
+
+def _projector(
+    light: TransportModel, n: int, part: ProjectorCalibration, frame: FloatImage, seen: FloatImage
+) -> ProjectorDrift:
+    """Register one projector's picture in its own pixels."""
+    use = light.lit[n] & finite(seen)
+    white = np.where(use[:, :, None], part.white, 0).astype(np.float32)
+    strength = light.gaussian_mean(white * white, n)
+    faint = 1e-3 * float(np.percentile(strength, 99)) + 1e-30
+
+    def on_projector(image: FloatImage) -> FloatImage:
+        """What each pixel shows, as least squares over the camera pixels that it lights."""
+        filled = np.where(use[:, :, None], image, 0).astype(np.float32)
+        return np.asarray(light.gaussian_mean(filled * white, n) / np.maximum(strength, faint), np.float32)
+
+    channels = []
+    for k in range(3):
+        alone = np.zeros_like(frame)
+        alone[:, :, k] = frame[:, :, k]
+        channels.append(on_projector(light.forward_part(n, alone)))
+    picture, reference = on_projector(seen), np.asarray(np.sum(channels, axis=0), np.float32)
+    level: FloatImage = smallest(strength)
+    weight = np.clip(level / max(float(np.median(level[level > faint])) if np.any(level > faint) else 1.0, faint), 0, 1)
+    weight = np.where(level > faint, weight, 0).astype(np.float32)
+    share = float((weight[:, :, None] * picture).sum() / max(float((weight[:, :, None] * reference).sum()), 1e-30))
+    motion = register(reference, picture, weight)
+    if not motion.found or share < LEAST_LIGHT:
+        nothing = (math.nan, math.nan, math.nan)
+        motion = motion if share >= LEAST_LIGHT else no_motion(weight.shape, 3)
+        return ProjectorDrift(part.name, motion, nothing, nothing, math.nan, share)
+    there = [warp(channel, motion.matrix) for channel in channels]
+    gain, sigma = _gains(there, picture, weight)
+    fitted = np.einsum("krcx,k->rcx", np.stack(there), gain).astype(np.float32)
+    local = _local_px(fitted, picture, weight)
+    return ProjectorDrift(part.name, motion, _three(gain), _three(sigma), local, share)
+
+
+def _gains(channels: Sequence[FloatImage], seen: FloatImage, weight: FloatImage) -> tuple[Float64, Float64]:
+    """Least squares for the strength of each of the projector's channels, and its uncertainty from parts that differ.
+
+    ``channels``: what each looks like alone; an outer frame of NaN is left out.
+    """
+    rows, columns = weight.shape
+    known = (weight > 0) & np.isfinite(np.stack(channels)).all(axis=(0, 3)) & finite(seen)
+    y, x = np.nonzero(known)
+    a = np.stack([channel[known] for channel in channels]).astype(np.float64)
+    b, w = seen[known].astype(np.float64), weight[known].astype(np.float64)
+    block = (y * 6 // rows) * 6 + x * 6 // columns
+    gain, inverse = np.ones(3), np.eye(3)
+    for _ in range(4):
+        error = b - np.einsum("knc,k->nc", a, gain)
+        spread = 1.4826 * np.median(np.abs(error)) + 1e-12
+        robust = w[:, None] * np.maximum(1 - (error / (4 * spread)) ** 2, 0) ** 2
+        inverse = np.linalg.pinv(np.einsum("knc,lnc,nc->kl", a, a, robust), hermitian=True)
+        gain = inverse @ np.einsum("knc,nc,nc->k", a, robust, b)
+    error = b - np.einsum("knc,k->nc", a, gain)
+    scores = np.stack([np.bincount(block, (one * robust * error).sum(axis=1), 36) for one in a], axis=1)
+    return gain, np.sqrt(np.maximum(np.diag(inverse @ (scores.T @ scores) @ inverse), 0))
+
+
+def _local_px(fitted: FloatImage, seen: FloatImage, weight: FloatImage) -> float:
+    """The rms, over parts of the picture, of the shift that they still ask for (Lucas and Kanade 1981)."""
+    known = (weight > 0) & finite(fitted) & finite(seen)
+    known &= cv2.erode(known.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    if not known.any():
+        return math.nan
+    blur = [cv2.GaussianBlur(np.where(known[:, :, None], image, 0).astype(np.float32), (0, 0), 1.0)
+            for image in (fitted, seen)]  # fmt: skip
+    w = np.where(known, weight, 0)[:, :, None]
+    dx, dy = (np.gradient(blur[0], axis=axis) for axis in (1, 0))
+    error = blur[1] - blur[0]
+    size = (max(16, weight.shape[1] // 8), max(16, weight.shape[0] // 8))
+
+    def around(image: FloatImage) -> FloatImage:
+        return np.asarray(cv2.boxFilter(total(w * image), -1, size), np.float32)
+
+    xx, xy, yy, ex, ey = (around(image) for image in (dx * dx, dx * dy, dy * dy, dx * error, dy * error))
+    det = xx * yy - xy * xy
+    enough = known & (det > 0.05 * np.percentile(det[known], 50))
+    across = (yy * ex - xy * ey)[enough] / det[enough]
+    down = (xx * ey - xy * ex)[enough] / det[enough]
+    return float(np.sqrt(np.mean(np.minimum(across**2 + down**2, 100.0))))
+
+
+def _camera(calibration: Calibration, found: Sequence[ProjectorDrift], seen: DriftPhotographs) -> Motion:
+    """Register the object's picture in full light: its paint and its outline."""
+    expected = calibration.black.astype(np.float32)
+    for part, one in zip(calibration.projectors, found, strict=True):
+        tint = part.radiometry.mixing @ np.asarray(one.gain) if one.known else np.full(3, max(one.light_share, 0.0))
+        expected = expected + (part.white * tint).astype(np.float32)
+    rows, columns = expected.shape[:2]
+    factor = max(1, math.ceil(math.sqrt(rows * columns / CAMERA_PIXELS)))
+    near = cv2.dilate(calibration.object_mask.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    known = near & finite(seen.white)
+    pictures = [np.where(known[:, :, None], image, 0).astype(np.float32) for image in (expected, seen.white)]
+    whole = _shrunk(known.astype(np.float32), factor) > 0.99
+    motion = register(_shrunk(pictures[0], factor), _shrunk(pictures[1], factor), whole.astype(np.float32))
+    return motion if factor == 1 else _enlarged(motion, factor)
+
+
+def _backwards(motion: Motion) -> Motion:
+    """How the object's picture moved, from where in the calibration's picture a pixel now looks."""
+    if not motion.found:
+        return motion
+    matrix = np.linalg.inv(motion.matrix)
+    x, y = motion.shift_px
+    return dataclasses.replace(
+        motion, matrix=matrix / matrix[2, 2], shift_px=(-x, -y), rotation_deg=-motion.rotation_deg,
+        scale=1 / motion.scale,
+    )  # fmt: skip
+
+
+def _shrunk(image: FloatImage, factor: int) -> FloatImage:
+    rows, columns = (length // factor for length in image.shape[:2])
+    whole = image[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _enlarged(motion: Motion, factor: int) -> Motion:
+    """The same motion in the pixels of the camera, whose centres lie elsewhere in a shrunk picture."""
+    up = np.array([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1.0]])
+    return Motion(
+        up @ motion.matrix @ np.linalg.inv(up),
+        (factor * motion.middle_px[0] + up[0, 2], factor * motion.middle_px[1] + up[1, 2]),
+        (factor * motion.shift_px[0], factor * motion.shift_px[1]),
+        factor * motion.sigma_px, factor * motion.rms_px, motion.rotation_deg, motion.rotation_sigma_deg,
+        motion.scale, motion.scale_sigma, motion.gain, motion.correlation, motion.found,
+    )  # fmt: skip
+
+
+def _ambient(calibration: Calibration, seen: DriftPhotographs) -> tuple[float, float]:
+    use = calibration.object_mask & finite(seen.black)
+    if not use.any():
+        return math.nan, math.nan
+    white = sum(float(part.white[use].mean(dtype=np.float64)) for part in calibration.projectors)
+    now, then = (float(image[use].mean(dtype=np.float64)) for image in (seen.black, calibration.black))
+    return (now - then) / max(white, 1e-30), now / max(then, 1e-30)
+
+
+def _three(values: Float64) -> tuple[float, float, float]:
+    a, b, c = (float(value) for value in values)
+    return (a, b, c)

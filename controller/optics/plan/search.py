@@ -1,0 +1,242 @@
+"""Choosing places: greedy, then exchanges until none helps; in the spirit of Law et al. 2010, on our own measure.
+
+The measure at a surface point is the geometric mean of three shares of what is wanted, each at most 1: detail (of the
+sharpest projector there), light (of all together), and the number of projectors that reach it. Its mean over the seen
+area is the plan's quality.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from controller.core.arrays import Float64, Mask
+from controller.core.errors import UsageError, WorkError
+from controller.optics.plan.aim import aimed
+from controller.optics.plan.optics import Shadows, lit_by
+from controller.optics.plan.values import Illumination, MountingPoint, Placement, PlanGoal, ProjectorModel, Surface
+
+MOST_EXCHANGES: Final = 50
+STARTS: Final = 4
+LEAST_GAIN: Final = 1e-6
+LINES: Final = 200
+"""Lines of sight on which the search tests whether a projector's body blocks the view."""
+ProgressCallback = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A projector at a place, and what it does. ``useful`` (N,) bool: reached, and not too steep."""
+
+    placement: Placement
+    lit: Illumination
+    useful: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementPlan:
+    """A plan. ``quality`` 0..1; ``at_points`` (N,) its measure at each point; ``tried``: how many sets were judged."""
+
+    candidates: tuple[Candidate, ...]
+    quality: float
+    at_points: Float64
+    tried: int
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """Arrays (candidates, N) from which any set of candidates is judged by sums and minima."""
+
+    goal: PlanGoal
+    weight: Float64
+    detail_mm: Float64
+    lux: Float64
+    count: Float64
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], surface: Surface, goal: PlanGoal) -> Measure:
+        useful = np.stack([one.useful for one in candidates])
+        return cls(
+            goal,
+            surface.area_m2 / surface.area_m2.sum(),
+            np.where(useful, np.stack([one.lit.detail_mm for one in candidates]), np.inf),
+            np.where(useful, np.stack([one.lit.lux for one in candidates]), 0.0),
+            useful.astype(np.float64),
+        )
+
+    def at_points(self, rest: Sequence[int], others: slice = slice(0, 0)) -> Float64:
+        """The measure (k, N) of the set ``rest`` with each of ``others`` added, or (1, N) of the set alone."""
+        rest = list(rest)
+        detail = np.min(self.detail_mm[rest], axis=0, initial=np.inf)
+        lux, count = self.lux[rest].sum(axis=0), self.count[rest].sum(axis=0)
+        if others.stop > others.start:
+            detail = np.minimum(detail, self.detail_mm[others])
+            lux, count = lux + self.lux[others], count + self.count[others]
+        shares = np.minimum(1.0, self.goal.detail_mm / np.atleast_2d(detail))
+        shares = shares * np.minimum(1.0, np.atleast_2d(lux) / self.goal.lux)
+        return np.asarray(np.cbrt(shares * np.minimum(1.0, np.atleast_2d(count) / self.goal.overlap)))
+
+    def quality(self, rest: Sequence[int], others: slice = slice(0, 0)) -> Float64:
+        return np.asarray(self.at_points(rest, others) @ self.weight)
+
+
+def candidates_of(
+    models: Sequence[ProjectorModel],
+    mounting_points: Sequence[MountingPoint],
+    surface: Surface,
+    shadows: Shadows,
+    goal: PlanGoal,
+    audience_m: Float64,
+    *,
+    tell: ProgressCallback = lambda share, text: None,
+    cancel: threading.Event | None = None,
+) -> list[list[Candidate]]:
+    """For each model, it at every mounting point where it can stand and reaches the object at all.
+
+    Where its body would stand between audience and object is no place. Raises UsageError("plan-no-place") if a model
+    has none, WorkError("cancelled").
+    """
+    known: dict[ProjectorModel, list[Candidate]] = {}
+    different = list(dict.fromkeys(models))
+    for number, (model, mounting_point) in enumerate(itertools.product(different, mounting_points)):
+        check(cancel)
+        tell(number / (len(different) * len(mounting_points)), f"{model.name} at {mounting_point.name}")
+        found = known.setdefault(model, [])
+        placement = aimed(model, mounting_point, surface, goal.fill)
+        if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
+            continue
+        lit = lit_by(placement, surface, shadows)
+        useful = lit.useful(goal.steepest_degrees)
+        if np.any(useful & (surface.area_m2 > 0)):
+            found.append(Candidate(placement, lit, useful))
+    for model, found in known.items():
+        if not found:
+            raise UsageError(
+                "plan-no-place",
+                what=f"No position is possible for {model.name}: from each, it reaches nothing or hides the object.",
+                remedy="Add positions farther to the side of the audience, or use a smaller [goal] body_m.",
+            )
+    return [known[model] for model in models]
+
+
+def choose_placements(
+    by_model: Sequence[Sequence[Candidate]],
+    surface: Surface,
+    goal: PlanGoal,
+    *,
+    tell: ProgressCallback = lambda share, text: None,
+    cancel: threading.Event | None = None,
+) -> PlacementPlan:
+    """One place for every model, best together. The same arguments give the same plan.
+
+    Raises UsageError("plan-too-crowded") where no set keeps its distances, WorkError("cancelled").
+    """
+    flat = [one for group in by_model for one in group]
+    ends = np.cumsum([len(group) for group in by_model])
+    groups = [slice(int(end) - len(group), int(end)) for end, group in zip(ends, by_model, strict=True)]
+    measure, fits = Measure.of(flat, surface, goal), _Fits(flat, surface, goal)
+    alone = measure.quality([], groups[0])
+    firsts = groups[0].start + np.argsort(-alone, kind="stable")[:STARTS]
+    best: tuple[float, list[int]] | None = None
+    tried = 0
+    for number, first in enumerate(firsts):
+        check(cancel)
+        tell(number / len(firsts), f"start {number + 1} of {len(firsts)}")
+        picked, judged = _greedy(int(first), groups, measure, fits)
+        tried += judged
+        if picked is None:
+            continue
+        picked, judged = _exchanged(picked, groups, measure, fits, cancel)
+        tried += judged
+        quality = float(measure.quality(picked)[0])
+        if best is None or quality > best[0] + LEAST_GAIN:
+            best = quality, picked
+    if best is None:
+        raise UsageError(
+            "plan-too-crowded",
+            what="There is no room for all projectors: they stand too near each other or in each other's light.",
+            remedy="Add positions, or use a smaller [goal] apart_m or body_m.",
+        )
+    at_points = measure.at_points(best[1])[0]
+    return PlacementPlan(tuple(flat[index] for index in best[1]), best[0], at_points, tried)
+
+
+def _greedy(first: int, groups: Sequence[slice], measure: Measure, fits: _Fits) -> tuple[list[int] | None, int]:
+    picked, tried = [first], 0
+    for group in groups[1:]:
+        quality = measure.quality(picked, group)
+        tried += len(quality)
+        following = next((group.start + int(k) for k in np.argsort(-quality, kind="stable")
+                          if fits.together(group.start + int(k), picked)), None)  # fmt: skip
+        if following is None:
+            return None, tried
+        picked.append(following)
+    return picked, tried
+
+
+def _exchanged(
+    picked: list[int], groups: Sequence[slice], measure: Measure, fits: _Fits, cancel: threading.Event | None
+) -> tuple[list[int], int]:
+    """Each projector in turn to its best place with the others where they are, until nothing changes."""
+    tried = 0
+    for _ in range(MOST_EXCHANGES):
+        before = list(picked)
+        for turn, group in enumerate(groups):
+            check(cancel)
+            rest = picked[:turn] + picked[turn + 1 :]
+            quality = measure.quality(rest, group)
+            tried += len(quality)
+            now = quality[picked[turn] - group.start]
+            for k in np.argsort(-quality, kind="stable"):
+                if quality[k] <= now + LEAST_GAIN:
+                    break
+                if fits.together(group.start + int(k), rest):
+                    picked[turn] = group.start + int(k)
+                    break
+        if picked == before:
+            break
+    return picked, tried
+
+
+class _Fits:
+    """Whether candidates can stand beside each other; what was found is kept."""
+
+    def __init__(self, candidates: Sequence[Candidate], surface: Surface, goal: PlanGoal) -> None:
+        self._candidates, self._surface, self._goal = candidates, surface, goal
+        self._known: dict[tuple[int, int], bool] = {}
+
+    def together(self, one: int, others: Sequence[int]) -> bool:
+        return all(self._pair(min(one, other), max(one, other)) for other in others)
+
+    def _pair(self, one: int, other: int) -> bool:
+        if (one, other) not in self._known:
+            a, b = (self._candidates[k].placement.position_m for k in (one, other))
+            apart = float(np.linalg.norm(a - b)) >= max(self._goal.apart_m, 1e-9)
+            self._known[one, other] = apart and not (
+                in_the_way(a, b[None], self._surface, self._goal.body_m)
+                or in_the_way(b, a[None], self._surface, self._goal.body_m)
+            )
+        return self._known[one, other]
+
+
+def in_the_way(body_m: Float64, from_m: Float64, surface: Surface, radius_m: float) -> bool:
+    """Whether a ball at ``body_m`` (3,) stands between any of ``from_m`` (M, 3) and the seen surface."""
+    seen = surface.points_m[surface.area_m2 > 0]
+    points = seen[:: max(1, len(seen) // LINES)]
+    for eye in from_m:
+        line = points - eye
+        along = np.clip((line @ (body_m - eye)) / np.sum(line**2, axis=1), 0.0, 1.0)
+        if np.min(np.linalg.norm(eye + along[:, None] * line - body_m, axis=1)) < radius_m:
+            return True
+    return False
+
+
+def check(cancel: threading.Event | None) -> None:
+    """Raises WorkError("cancelled") once ``cancel`` is set."""
+    if cancel is not None and cancel.is_set():
+        raise WorkError("cancelled", what="The planning was stopped.", remedy="Run the same command to start again.")

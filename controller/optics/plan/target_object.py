@@ -1,0 +1,182 @@
+"""The object of a plan: its mesh in the room, points that stand for its surface, and the shadows that it casts."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Float64, Mask
+from controller.core.errors import UsageError
+from controller.core.files import LARGEST_MESH, require_regular
+from controller.optics.plan.values import Surface
+
+AXES: Final = {"+x": 0, "+y": 1, "+z": 2, "-x": 3, "-y": 4, "-z": 5}
+BIAS: Final = 1e-4
+"""Of the object's size: nothing this near to a point can shade it, except the point's own face."""
+AFTER_M: Final = 1e6
+SMALLEST, LARGEST = 1e-9, 1e9
+"""Of a mesh, in whatever unit its file has."""
+FLATTEST: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class TargetObject:
+    """A mesh in the room (see ``values``), with a scene for rays. ``vertices_m`` (V, 3), ``faces`` (F, 3)."""
+
+    vertices_m: Float64
+    faces: npt.NDArray[np.int32]
+    scene: Any
+
+    @property
+    def size_m(self) -> float:
+        """The bounding box' diagonal."""
+        return float(np.linalg.norm(np.ptp(self.vertices_m, axis=0)))
+
+    def hit(self, from_m: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        """Metres (N,) along unit ``directions`` (N, 3) from ``from_m`` (3,) to the surface, AFTER_M where none.
+
+        And the faces' normals there (N, 3), unit, on the side to which they point; 0 where none.
+        """
+        if not len(directions):
+            return np.zeros(0), np.zeros((0, 3))
+        origins = np.broadcast_to(from_m.astype(np.float32), directions.shape).copy()
+        found = self.scene.run(origins, np.ascontiguousarray(directions, np.float32), output=1)
+        hit = found["primID"] >= 0
+        cross = _crosses(self.vertices_m, self.faces[np.where(hit, found["primID"], 0)])
+        normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+        return np.where(hit, np.asarray(found["tfar"], np.float64), AFTER_M), np.where(hit[:, None], normals, 0.0)
+
+    def hidden(self, from_m: Float64, points_m: Float64) -> Mask:
+        """``optics.Shadows``."""
+        towards = points_m - from_m
+        distance = np.linalg.norm(towards, axis=1)
+        first, _ = self.hit(from_m, towards / np.maximum(distance, 1e-12)[:, None])
+        return np.asarray(first < distance - BIAS * self.size_m)
+
+
+def read_target_object(path: Path, *, height_m: float | None, up: str, front: str) -> TargetObject:
+    """Read a mesh of any format that trimesh reads, and stand it in the room.
+
+    ``height_m``: what its height becomes; None: the file's unit is the metre. ``up``, ``front``: the file's axes that
+    point up and towards the audience, "+x" to "-z". Raises UsageError "plan-mesh-unreadable", "plan-mesh-no-faces",
+    "plan-mesh-no-size", "plan-axes".
+    """
+    if AXES[up] % 3 == AXES[front] % 3:
+        raise UsageError(
+            "plan-axes",
+            what=f"The object can't have {up} up and {front} in front.",
+            remedy='Give two different axes in [object], e.g. up = "+y" and front = "+z".',
+        )
+    vertices, faces = _read(path)
+    above, towards = _axis(up), _axis(front)
+    # room: x right, y down, z away from the audience
+    placed = vertices @ np.stack((np.cross(above, towards), -above, -towards)).T
+    low, high = placed[faces].min(axis=(0, 1)), placed[faces].max(axis=(0, 1))
+    placed -= 0.5 * (low + high)
+    if height_m is not None:
+        height = float((high - low)[1])
+        if height < FLATTEST * float((high - low).max()):
+            raise _no_size(path, f"the object has no height along {up}, so height_m can't be applied")
+        placed *= height_m / height
+    embree: Any = importlib.import_module("embreex.rtcore_scene")
+    meshes: Any = importlib.import_module("embreex.mesh_construction")
+    scene = embree.EmbreeScene(robust=True)
+    meshes.TriangleMesh(scene, placed.astype(np.float32), faces)
+    return TargetObject(placed, faces, scene)
+
+
+def sampled(target_object: TargetObject, count: int, audience_m: Float64, seed: int) -> Surface:
+    """``count`` points evenly over the surface by area; those that no one of ``audience_m`` (M, 3) sees have area 0.
+
+    Normals point to the side that is seen, since a mesh may be inside out. The same seed gives the same points.
+    Raises UsageError("plan-nothing-seen").
+    """
+    rng = np.random.default_rng(seed)
+    corners = target_object.vertices_m[target_object.faces]
+    cross = _crosses(target_object.vertices_m, target_object.faces)
+    double = np.linalg.norm(cross, axis=1)
+    # stratified: even steps of area, each with one point
+    edges = np.cumsum(double) / double.sum()
+    chosen = np.minimum(np.searchsorted(edges, (np.arange(count) + rng.random(count)) / count), len(edges) - 1)
+    u, v = rng.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (corners[chosen, k] for k in range(3))
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    normals = cross[chosen] / double[chosen, None]
+    seen, facing = np.zeros(count, bool), np.zeros(count)
+    for eye in audience_m:
+        visible = ~target_object.hidden(eye, points)
+        side = np.sum(normals * (eye - points), axis=1)
+        visible &= np.abs(side) > 0
+        facing = np.where(visible & ~seen, np.sign(side), facing)
+        seen |= visible
+    if not seen.any():
+        raise UsageError(
+            "plan-nothing-seen",
+            what="The audience sees nothing of the object from its positions.",
+            remedy="Check [audience] positions_m, the object's axes, and its height_m.",
+        )
+    area = np.where(seen, 0.5 * double.sum() / count, 0.0)
+    return Surface(points, normals * np.where(facing == 0, 1.0, facing)[:, None], area)
+
+
+def _read(path: Path) -> tuple[Float64, npt.NDArray[np.int32]]:
+    trimesh: Any = importlib.import_module("trimesh")
+    try:
+        require_regular(path, LARGEST_MESH)
+        mesh = trimesh.load(path, force="mesh", process=False)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)
+    except OSError as error:
+        raise _unreadable(path, error.strerror or str(error)) from error
+    # Every format's reader has its own errors, and there are thirty of them: to the planner they are one.
+    except Exception as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    if len(faces) and (not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices)):
+        raise _unreadable(path, "its coordinates or face indices are not valid numbers")
+    if len(faces):
+        size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+        if not SMALLEST < size < LARGEST:
+            raise _no_size(path, f"its largest side is {size:g} units of the file long")
+        faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 1e-12 * size**2]
+        if not len(faces):
+            raise _no_size(path, "none of its faces has an area")
+    if not len(faces):
+        raise UsageError(
+            "plan-mesh-no-faces",
+            what=f"{path} contains no faces, so there is no surface to light.",
+            remedy="Export the object as a triangle mesh (.obj, .ply or .glb), not as a point cloud.",
+        )
+    return vertices, faces
+
+
+def _crosses(vertices: Float64, faces: npt.NDArray[np.int32]) -> Float64:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _no_size(path: Path, why: str) -> UsageError:
+    return UsageError(
+        "plan-mesh-no-size",
+        what=f"The object {path} can't be lit: {why}.",
+        remedy="Export it as a surface in metres, or correct [object] height_m, up and front.",
+    )
+
+
+def _unreadable(path: Path, why: str) -> UsageError:
+    return UsageError(
+        "plan-mesh-unreadable",
+        what=f"The object {path} can't be read as a mesh ({why}).",
+        remedy="Check the file, or export it again as .obj, .ply or .glb.",
+    )
+
+
+def _axis(name: str) -> Float64:
+    axis = np.zeros(3)
+    axis[AXES[name] % 3] = 1.0 if AXES[name] < 3 else -1.0
+    return axis

@@ -1,0 +1,287 @@
+"""New appearances at interactive speed: base times scale (paper 3, eqs 4-6), and the full solve.
+
+C_t = C_b x C_s for every camera pixel; the base's frames P_b are solved once; each projector pixel's P_s is the mean of
+C_s over its metapixel; then P_t = P_b x P_s. Light is counted above the black image K, and the product is taken in the
+camera's colours, M p, so that projectors of different primaries are scaled alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import FloatImage, Mask, moved_to_file
+from controller.core.channels import largest
+from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.solver import SMOOTHNESS, TOLERANCE, check_target, solve_bounded
+from controller.optics.solve.engines.processor import Engine, Processor
+from controller.optics.transport import LightTransport
+from controller.optics.transport.planes import frame_planes, plane_frames, planes_above
+
+BaseKind = Literal["minimum", "white"]
+BaseChoice = Literal["minimum", "white", "high-pass"]
+Mode = Literal["auto", "scale", "full"]
+
+FAINTEST_BASE: Final = 1e-2
+"""Below this fraction of the mean base light, a pixel is not used in its metapixels' means."""
+HEADROOM: Final = 0.5
+"""A white base uses this part of the reachable light, so that scales above 1 are possible."""
+FINE_DETAIL: Final = 0.02
+"""Share of a target's light above one projector's frequency limit from which a full solve is advised."""
+
+MOST_LOST, LITTLE_LOST = 1.7, 0.02
+"""Base x scale may miss so many times what the base misses, or so much of the light; else the solve is a full one."""
+WELL_BELOW: Final = 0.5
+"""Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """A solved base image, ready to be scaled.
+
+    ``image`` (rows, columns, 3): C_b with the black image; ``solution``: its frames P_b
+    ``inverse`` (3, rows, columns): 1 / base light, 0 where the base is (nearly) zero
+    ``coverage`` (3, pixels): 1 / share of each metapixel that has base light, 0 where none has
+    ``mixed`` (3, pixels): M p_b
+    """
+
+    image: FloatImage
+    solution: Solution
+    inverse: FloatImage
+    coverage: FloatImage
+    mixed: FloatImage
+
+    def in_files(self, folder: Path) -> Base:
+        """The same; what is large need not stay in memory, but in nameless files of ``folder``."""
+        frames = tuple(moved_to_file(frame, folder) for frame in self.solution.frames)
+        image, inverse, coverage, mixed = (
+            moved_to_file(one, folder) for one in (self.image, self.inverse, self.coverage, self.mixed)
+        )
+        solution = dataclasses.replace(self.solution, frames=frames)
+        return Base(image, solution, inverse, coverage, mixed)
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """Frames (rows, columns, 3) linear in [0, 1], one a projector; ``mode`` is how they were made."""
+
+    frames: tuple[FloatImage, ...]
+    mode: Literal["scale", "full"]
+    fine_detail: float
+    solution: Solution | None
+
+
+def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage:
+    """The base image C_b as radiance, (rows, columns, 3); the black image alone outside the object.
+
+    ``"minimum"``: the darkest white image among the projectors that light a pixel, which drops specular highlights and
+    keeps the object's own pattern (paper 3.1, 5). ``"white"``: even light over the object, so that its pattern is
+    cancelled in the base, at full resolution, and the scale has only the target's detail.
+    """
+    # one projector after the other: their white images are in files, and together larger than all else
+    first, *others = (p.white for p in calibration.projectors)
+    brightest = largest(first)
+    for white in others:
+        np.maximum(brightest, largest(white), out=brightest)
+    mask = calibration.object_mask & (brightest > 0)
+    if kind == "minimum":
+        light = _where_lit(first)
+        for white in others:
+            np.minimum(light, _where_lit(white), out=light)
+        light[~np.isfinite(light)] = 0
+        light[~mask] = 0
+        return np.asarray(light + calibration.black, np.float32)
+    whole = first[mask]
+    for white in others:
+        whole += white[mask]
+    whole += calibration.black[mask]
+    reach = whole.min(axis=1)
+    level = HEADROOM * float(np.quantile(reach, 0.05)) if reach.size else 0.0
+    return np.where(mask[..., None], np.maximum(calibration.black, np.float32(level)), calibration.black)
+
+
+def _where_lit(white: FloatImage) -> FloatImage:
+    """A white image, infinite where the projector hardly shines."""
+    faint = np.float32(1e-3) * white.max(initial=0)
+    return np.where(white.max(axis=2, keepdims=True) > faint, white, np.float32(np.inf))
+
+
+def high_pass_base(transport: LightTransport, level: FloatImage, target: FloatImage, black: FloatImage) -> FloatImage:
+    """A base image for one target: ``level`` with the target's detail above one projector's frequency limit.
+
+    The scale image that remains is smooth, so that the product keeps all of the target (paper 3.3, Fig. 12).
+
+    Parameters
+    ----------
+    level : (rows, columns, 3) an even base image (``base_image(calibration, "white")``), with the black image
+    target, black : (rows, columns, 3) radiance
+    """
+    even = np.maximum(level - black, 0)
+    scale = np.divide(np.maximum(target - black, 0), even, out=np.zeros_like(even), where=even > 0)
+    low = _low_pass(transport, scale, (even > 0).astype(np.float32), of_limit=WELL_BELOW)
+    detail = np.divide(scale, low, out=np.zeros_like(scale), where=low > 0)
+    return np.asarray(black + even * detail, np.float32)
+
+
+def solve_base(
+    transport: LightTransport,
+    image: FloatImage,
+    black: FloatImage,
+    *,
+    smoothness: float = SMOOTHNESS,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
+) -> Base:
+    """Solve the frames of a base ``image`` (``base_image``) and prepare to scale them; errors as ``solve_bounded``."""
+    solution = solve_bounded(
+        transport, image, black, smoothness=smoothness, tolerance=tolerance, progress=progress, cancelled=cancelled,
+        engine=engine,
+    )  # fmt: skip
+    return prepare_base(transport, image, black, solution)
+
+
+def prepare_base(transport: LightTransport, image: FloatImage, black: FloatImage, solution: Solution) -> Base:
+    """A Base from frames that were solved before for ``image``."""
+    light = planes_above(image, black)
+    mask = transport.object_mask
+    faint = FAINTEST_BASE * light[:, mask].mean() if mask.any() else 0.0
+    present = mask & (light > max(faint, np.finfo(np.float32).tiny))
+    # made again after the means: both together would be the peak of the whole solve
+    del light
+    coverage = transport.gaussian_mean_planes(present.astype(np.float32))
+    np.divide(1, coverage, out=coverage, where=coverage > 0)
+    inverse = planes_above(image, black)
+    np.divide(1, inverse, out=inverse, where=present)
+    inverse[~present] = 0
+    mixed = np.empty_like(coverage)
+    for n, M in enumerate(transport.mixing):
+        mixed[:, transport.span(n)] = M @ frame_planes([solution.frames[n]])
+    return Base(image, solution, inverse, coverage, mixed)
+
+
+def scale_frames(
+    transport: LightTransport, base: Base, target: FloatImage, black: FloatImage, *, engine: Engine | None = None
+) -> list[FloatImage]:
+    """P_t = P_b x P_s (paper eqs 4-6): frames (rows, columns, 3) in [0, 1] for a target radiance (rows, columns, 3).
+
+    Exact where C_t / C_b has no detail finer than one projector's pixels (paper 3.3).
+    Raises UsageError("image-wrong-size", "target-not-finite").
+    """
+    check_target(transport, target)
+    light = planes_above(target, black)
+    out = (engine or Processor()).scaled(transport, light, base.inverse, base.mixed, base.coverage)
+    return plane_frames(out, transport.sizes)
+
+
+def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> float:
+    """Share of the target's light (rms) that the scale image would need above one projector's frequency limit F.
+
+    F is half a cycle a projector pixel, whose pitch in the camera is the root of camera pixels by projector pixels.
+    """
+    mask = transport.object_mask
+    whole = fine = 0.0
+    for channel, inverse in enumerate(base.inverse):
+        light = np.maximum(target[..., channel] - black[..., channel], 0)
+        scale = light * inverse
+        left = scale - _low_pass(transport, scale, (inverse > 0).astype(np.float32))
+        np.divide(left, inverse, out=left, where=inverse > 0)
+        whole += float((light[mask].astype(np.float64) ** 2).sum())
+        fine += float((left[mask & (inverse > 0)].astype(np.float64) ** 2).sum())
+    return float(np.sqrt(fine / whole)) if whole > 0 else 0.0
+
+
+def _as_good(
+    transport: LightTransport,
+    base: Base,
+    frames: Sequence[FloatImage],
+    target: FloatImage,
+    black: FloatImage,
+    reachable: Mask,
+) -> bool:
+    """Whether scaled frames come about as near their target in reach as the base's own frames come to the base image.
+
+    Beside the shadow of a projector, and around what is out of reach, the pixels of one projector have to make up for
+    another's. A scale, a mean over each pixel's light, does not know of that; a full solve does.
+    """
+    if not reachable.any():
+        return True
+    lost, least = (
+        _lost(transport.forward(shown) + black, wanted, reachable)
+        for shown, wanted in ((frames, target), (base.solution.frames, base.image))
+    )
+    return lost < max(MOST_LOST * least, LITTLE_LOST)
+
+
+def _lost(seen: FloatImage, wanted: FloatImage, mask: Mask) -> float:
+    """95th percentile over a mask of how far a picture misses another, as a share of the pixel's light."""
+    missed = np.abs(seen - wanted)[mask].sum(axis=1)
+    return float(np.percentile(missed / np.maximum(wanted[mask].sum(axis=1), 1e-30), 95))
+
+
+def _low_pass(
+    transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
+) -> FloatImage:
+    """The image, (rows, columns) or with channels, below that part of the coarsest projector's frequency limit."""
+    pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
+    # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
+    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi / of_limit
+    blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image, present))
+    return np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
+
+
+def _pitch(transport: LightTransport, n: int) -> float:
+    pixels = int((transport.per_weight[transport.span(n)] > 0).sum())
+    return float(np.sqrt(transport.lit[n].sum() / pixels)) if pixels else 0.0
+
+
+def make_appearance(
+    transport: LightTransport,
+    base: Base,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    mode: Mode = "auto",
+    smoothness: float = SMOOTHNESS,
+    weights: FloatImage | None = None,
+    reachable: Mask | None = None,
+    start: Sequence[FloatImage] | None = None,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    engine: Engine | None = None,
+) -> Appearance:
+    """Frames for a target radiance: by base and scale, by a full solve, or depending on target and result.
+
+    ``reachable`` (rows, columns): where base and scale must come near the target, for the mode "auto" to keep them;
+    None: they are judged by the target's detail alone. ``start``: frames of a similar target, for a full solve.
+
+    A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
+    """
+    check_target(transport, target)
+    detail = fine_detail(transport, base, target, black)
+    if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
+        scaled = scale_frames(transport, base, target, black, engine=engine)
+        if mode == "scale" or reachable is None or _as_good(transport, base, scaled, target, black, reachable):
+            return Appearance(tuple(scaled), "scale", detail, None)
+    solution = solve_bounded(
+        transport,
+        target,
+        black,
+        smoothness=smoothness,
+        weights=weights,
+        start=start,
+        tolerance=tolerance,
+        progress=progress,
+        cancelled=cancelled,
+        engine=engine,
+    )
+    return Appearance(solution.frames, "full", detail, solution)

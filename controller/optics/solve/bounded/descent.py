@@ -1,0 +1,99 @@
+"""Block coordinate descent over the projectors, with momentum: the work of the bounded solver.
+
+A sweep is one Gauss-Seidel pass: each projector takes a projected gradient step against what the others show by then,
+scaled by a diagonal preconditioner that bounds its own part of the Hessian alone; with n projectors alike that is n
+times as far as a step of all at once could go. Momentum carries on from sweep to sweep, with over-relaxation by part of
+the sweep's own step (Kim and Fessler 2016), and restarts where it points uphill (O'Donoghue and Candes 2015). What the
+constants are worth: docs/decisions/0025.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from controller.core.arrays import FloatImage
+from controller.core.errors import WorkError
+from controller.optics.solve.bounded.gradient import extrapolate, extrapolate_buffer, projected_step
+from controller.optics.solve.bounded.problem import Problem
+from controller.optics.transport import LightTransport
+
+MOST_GROWTH: Final = 5.0
+"""Without momentum sweeps never go uphill; with it nothing is proven, so it ends where the residual grows as much."""
+OVERRELAXATION: Final = 0.9
+"""Part of a sweep's step that is taken once more: 1 is optimal for steps of all at once, and too far from 1.2 on."""
+RECOMPUTE_EVERY: Final = 50
+"""Sweeps until light is computed from the frames again: sums of steps drift, by 1e-4 of the objective in 1000."""
+
+
+@dataclass(frozen=True, slots=True)
+class IterationControl:
+    """When to stop, and what to call each sweep; see ``solve_bounded``.
+
+    ``on_iterate`` gets each sweep's number and point (3, pixels), to be read before it returns
+    """
+
+    tolerance: float
+    most_iterations: int
+    progress: Callable[[int, float], None] | None = None
+    cancelled: Callable[[], bool] | None = None
+    on_iterate: Callable[[int, FloatImage], None] | None = None
+
+
+def block_coordinate_descent(
+    problem: Problem, x: FloatImage, control: IterationControl
+) -> tuple[FloatImage, float, int]:
+    """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps."""
+    transport = problem.transport
+    right_hand_side = transport.right_hand_side(problem.target(), problem.weights)
+    # buffers of light: of the point x, of the extrapolated point y, of y before the sweep
+    light, light_y, before = (transport.sensor_buffer() for _ in range(3))
+    residual = np.empty_like(right_hand_side)
+    y, step = x.copy(), np.empty_like(x)
+    total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
+    inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
+    for iteration in range(1, control.most_iterations + 1):
+        if control.cancelled is not None and control.cancelled():
+            raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
+        squared_step = uphill = 0.0
+        if iteration % RECOMPUTE_EVERY == 1:
+            _write_forward(transport, x, light)
+            light_y[:] = light
+            if iteration > 1:
+                _write_forward(transport, y, light_y)
+        before[:] = light_y
+        for n, (rows, columns) in enumerate(transport.sizes):
+            transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
+            transport.adjoint_of_buffer(n, residual, step)
+            start, segment = transport.span(n).start, transport.segment(n)
+            smoothness = problem.majoriser, problem.across, problem.down, problem.strength_per_step
+            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment)
+            squared_step, uphill = squared_step + a, uphill + b
+            transport.accumulate_forward(n, step, light_y)
+        kkt = float(np.sqrt(squared_step / total))
+        next_inertia = (1 + np.sqrt(1 + 4 * inertia**2)) / 2
+        momentum, overrelaxation = (inertia - 1) / next_inertia, OVERRELAXATION * inertia / next_inertia
+        inertia = next_inertia
+        least = min(least, kkt)
+        if uphill > 0 or kkt > MOST_GROWTH * least:
+            momentum, overrelaxation, inertia = 0.0, 0.0, 1.0
+        extrapolate(y, x, step, momentum, overrelaxation)
+        if control.on_iterate is not None:
+            control.on_iterate(iteration, x)
+        # the buffers follow: ``light_y`` is the light of the new point by now, and becomes that of y
+        extrapolate_buffer(light_y, light, before, momentum, overrelaxation)
+        if control.progress is not None:
+            control.progress(iteration, kkt)
+        if kkt <= control.tolerance:
+            break
+    return x, kkt, iteration
+
+
+def _write_forward(transport: LightTransport, x: FloatImage, buffer: FloatImage) -> None:
+    """Write the light of ``x`` (3, pixels) to a sensor buffer."""
+    buffer[:] = 0
+    for n in range(len(transport.sizes)):
+        transport.accumulate_forward(n, x, buffer)

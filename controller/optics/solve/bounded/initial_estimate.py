@@ -1,0 +1,184 @@
+"""Where a solve starts: the best frames for a stage whose light were smooth, place by place.
+
+At one place of the camera's image, all projectors together make the light B p, with three rows and three columns a
+projector. Where one colour for all projectors gives the wanted light within [0, 1], that is the initial estimate.
+Elsewhere the projectors have to differ: one may give a colour without crosstalk, another one's crosstalk may be needed.
+Sweeps find that slowly, since it changes the light by little; here it is a problem of a few unknowns
+(docs/decisions/0025).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numba import prange
+
+from controller.core.arrays import Float64, FloatImage
+from controller.core.jit import compiled
+from controller.optics.transport import LightTransport
+
+BLOCK_PX: Final = 4
+"""Places are blocks of camera pixels, about one and a half metapixels wide; of 2, a sweep less, for twice the time."""
+RIDGE: Final = 1e-4
+"""Pull towards equal projectors, of the mean squared light: decides where the light leaves a choice."""
+MOST_STEPS: Final = 40
+MOST_HALVINGS: Final = 30
+CLOSE: Final = 1e-6
+"""The light may miss its optimum by this part of the root of the pull, a hundredth of all projectors' light."""
+LEVEL: Final = 1e-3
+"""Share of a step's slope that may be left, uphill, at its end."""
+LEAST_DETERMINANT: Final = 1e-3
+"""Of the three colours at a place, relative to those of pure primaries."""
+
+
+def initial_estimate(transport: LightTransport, target_light: FloatImage) -> FloatImage:
+    """(3, pixels of all projectors) in [0, 1] for ``target_light`` (3, camera rows, columns), the light to be made.
+
+    The latter is overwritten.
+    """
+    count = len(transport.sizes)
+    blocks = tuple(-(-side // BLOCK_PX) for side in transport.camera_shape)
+    white = np.empty((count, 3, *blocks), np.float32)
+    target = np.empty((3, *blocks), np.float32)
+    _block_means(target_light, target)
+    ones, light = np.ones((3, transport.pixels), np.float32), target_light
+    for n in range(count):
+        transport.forward_planes(ones, projectors=(n, n + 1), out=light)
+        _block_means(light, white[n])
+    del ones
+    _solve_blocks(white, transport.mixing.astype(np.float64), target)
+    found = np.zeros((3, transport.pixels), np.float32)
+    for n in range(count):
+        _upsample(white[n], light)
+        found[:, transport.span(n)] = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, transport.span(n)]
+    return np.clip(found, 0, 1, out=found)
+
+
+@compiled(parallel=True)
+def _block_means(image: FloatImage, out: FloatImage) -> None:
+    """Means of (3, rows, columns) over blocks."""
+    _, rows, columns = image.shape
+    for y in prange(out.shape[1]):
+        for c in range(3):
+            for x in range(out.shape[2]):
+                total, n = np.float32(0), 0
+                for r in range(BLOCK_PX * y, min(BLOCK_PX * (y + 1), rows)):
+                    for k in range(BLOCK_PX * x, min(BLOCK_PX * (x + 1), columns)):
+                        total += image[c, r, k]
+                        n += 1
+                out[c, y, x] = total / np.float32(n)
+
+
+@compiled(parallel=True)
+def _upsample(blocks: FloatImage, out: FloatImage) -> None:
+    """Each pixel of (3, rows, columns) from its block."""
+    for y in prange(out.shape[1]):
+        for c in range(3):
+            for x in range(out.shape[2]):
+                out[c, y, x] = blocks[c, y // BLOCK_PX, x // BLOCK_PX]
+
+
+@compiled(parallel=True)
+def _solve_blocks(white: FloatImage, mixing: Float64, target: FloatImage) -> None:
+    """Replace ``white`` (projectors, 3, rows, columns) by what each projector should show there."""
+    count, _, rows, columns = white.shape
+    for y in prange(rows):
+        B, p, light = np.empty((3, 3 * count)), np.empty(3 * count), np.empty(3)
+        for x in range(columns):
+            for n in range(count):
+                for c in range(3):
+                    for d in range(3):
+                        B[c, 3 * n + d] = white[n, c, y, x] * mixing[n, c, d]
+            for c in range(3):
+                light[c] = target[c, y, x]
+            _solve_block(B, light, p)
+            for n in range(count):
+                for c in range(3):
+                    white[n, c, y, x] = p[3 * n + c]
+
+
+@compiled()
+def _solve_block(B: Float64, light: Float64, p: Float64) -> None:
+    """Write what makes the ``light`` (3,) by B p, 0 <= p <= 1, as nearly and as alike as possible to ``p``."""
+    a, b, c, d, e, f, g, h, i = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(0, p.size, 3):
+        a, b, c = a + B[0, k], b + B[0, k + 1], c + B[0, k + 2]
+        d, e, f = d + B[1, k], e + B[1, k + 1], f + B[1, k + 2]
+        g, h, i = g + B[2, k], h + B[2, k + 1], i + B[2, k + 2]
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    size = (a * a + e * e + i * i) / 3
+    if not determinant > LEAST_DETERMINANT * size * np.sqrt(size):
+        # without light, or in fewer than three colours: channel by channel
+        r, s, t = light[0] / max(a, 1e-30), light[1] / max(e, 1e-30), light[2] / max(i, 1e-30)
+    else:
+        r = light[0] * (e * i - f * h) + light[1] * (c * h - b * i) + light[2] * (b * f - c * e)
+        s = light[0] * (f * g - d * i) + light[1] * (a * i - c * g) + light[2] * (c * d - a * f)
+        t = light[0] * (d * h - e * g) + light[1] * (b * g - a * h) + light[2] * (a * e - b * d)
+        r, s, t = r / determinant, s / determinant, t / determinant
+    for k in range(0, p.size, 3):
+        p[k], p[k + 1], p[k + 2] = min(max(r, 0.0), 1.0), min(max(s, 0.0), 1.0), min(max(t, 0.0), 1.0)
+    if size > 0 and (min(r, s, t) < 0 or max(r, s, t) > 1):
+        _shared_out(B, light, RIDGE * size, p)
+
+
+@compiled()
+def _shared_out(B: Float64, light: Float64, ridge: float, p: Float64) -> None:
+    """Write min |B p - light|^2 + ridge |p - start|^2 in the unit box to ``p``, which holds the start.
+
+    With y = (B p - light) / ridge, the best p is start - B' y, bounds kept. So there are three unknowns, however many
+    projectors there are: Newton's method on ridge y = B p(y) - light, the gradient of a convex function of y. A step
+    is halved until that function still falls at its end.
+    """
+    start = p.copy()
+    y, gradient, step = np.zeros(3), np.empty(3), np.empty(3)
+    _dual(B, light, ridge, start, y, p, gradient)
+    close = CLOSE * ridge**0.5
+    for _ in range(MOST_STEPS):
+        if max(abs(gradient[0]), abs(gradient[1]), abs(gradient[2])) < close:
+            return
+        _newton_step(B, ridge, start, y, gradient, step)
+        slope = gradient[0] * step[0] + gradient[1] * step[1] + gradient[2] * step[2]
+        if not slope < 0:
+            return
+        length = 1.0
+        for _ in range(MOST_HALVINGS):
+            ahead = y + length * step
+            _dual(B, light, ridge, start, ahead, p, gradient)
+            if gradient[0] * step[0] + gradient[1] * step[1] + gradient[2] * step[2] <= -LEVEL * slope:
+                break
+            length /= 2
+        y[:] = ahead
+
+
+@compiled()
+def _dual(B: Float64, light: Float64, ridge: float, start: Float64, y: Float64, p: Float64, gradient: Float64) -> None:
+    """Write start - B' y in the unit box to ``p``, and ridge y + light - B p to ``gradient``."""
+    for c in range(3):
+        gradient[c] = ridge * y[c] + light[c]
+    for k in range(p.size):
+        p[k] = min(max(start[k] - B[0, k] * y[0] - B[1, k] * y[1] - B[2, k] * y[2], 0.0), 1.0)
+        for c in range(3):
+            gradient[c] -= B[c, k] * p[k]
+
+
+@compiled()
+def _newton_step(B: Float64, ridge: float, start: Float64, y: Float64, gradient: Float64, step: Float64) -> None:
+    """Write -(ridge I + B_f B_f')^-1 gradient, f the numbers that are off their bounds, to ``step``."""
+    a, b, c, d, e, f = ridge, 0.0, 0.0, ridge, 0.0, ridge
+    for k in range(start.size):
+        u, v, w = B[0, k], B[1, k], B[2, k]
+        if 0 < start[k] - u * y[0] - v * y[1] - w * y[2] < 1:
+            a, b, c, d, e, f = a + u * u, b + u * v, c + u * w, d + v * v, e + v * w, f + w * w
+    # Cholesky's factors: the matrix is positive definite
+    g = a**0.5
+    h, i = b / g, c / g
+    j = (d - h * h) ** 0.5
+    k1 = (e - h * i) / j
+    m = (f - i * i - k1 * k1) ** 0.5
+    r = -gradient[0] / g
+    s = (-gradient[1] - h * r) / j
+    t = (-gradient[2] - i * r - k1 * s) / m
+    step[2] = t / m
+    step[1] = (s - k1 * step[2]) / j
+    step[0] = (r - h * step[1] - i * step[2]) / g

@@ -1,0 +1,328 @@
+"""Bends targets so that the object's own pattern doesn't show where light is lacking.
+
+Cutting a target off at each pixel shows the object's paint: a dark patch stays dark, and where light of other surfaces
+falls on a pale one it stays pale. What is not seen is a limit that varies slowly. So what single pixels can't make
+becomes smooth limits (``smooth_limits``), and the target is bent towards them as a film bends highlights: what keeps
+well away from a limit stays as it is, differences beyond it shrink.
+
+1. Dark: no darker than a smooth floor, in grey, so that shadows don't take on the colour of the light in them. Paint on
+   which no grey outshines that colour keeps it, and does not lift what is around.
+2. Chroma: no more saturated than can be shown around; the hue and the lightness stay.
+3. Light: no brighter than a smooth ceiling. Mostly all channels together, so that highlights keep their colour.
+
+Chroma comes before lightness: a pixel whose channels lack light alone is not dimmed. Arrays in, arrays out
+(docs/decisions/0048).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numba import prange
+
+from controller.core.arrays import FloatImage, Mask
+from controller.core.errors import UsageError
+from controller.core.jit import compiled
+from controller.optics.solve.bounded.solver import check_target
+from controller.optics.solve.reach.drive_levels import Colour, DriveLevels, levels_at, light_at
+from controller.optics.solve.reach.smooth_limits import SmoothLimits
+from controller.optics.transport import LightTransport
+
+KNEE: Final = 0.8
+"""Of the ceiling: light below this part of it stays as it is."""
+TOGETHER: Final = 0.8
+"""How far channels are dimmed together, from 0 (each by itself, which colours highlights) to 1."""
+DEEPEST: Final = 2.5
+"""Largest logarithm of the brightest target's light over a ceiling: what hardly any light reaches is given up."""
+CLEAR: Final = 1.0
+"""Chroma counts in full where a target is brighter than its floor by this part of it; in the dark it hardly shows."""
+FORGIVEN: Final = 1e-3
+"""Drive beyond [0, 1] that is no lack of light."""
+LEAST: Final = np.float32(1e-12)
+NOT_DIMMED: Final = np.zeros((3, 0, 0), np.float32)
+
+
+def adapted_target(
+    transport: LightTransport,
+    wanted: FloatImage,
+    floor: FloatImage,
+    *,
+    strength: float = 1.0,
+    drive: DriveLevels | None = None,
+) -> FloatImage:
+    """``wanted`` (rows, columns, 3) radiance, bent into what the stage can make without showing its own pattern.
+
+    Parameters
+    ----------
+    wanted, floor : (rows, columns, 3) radiance. ``floor`` is what is there without any projector's direct light: the
+        black image, and what other surfaces throw back
+    strength : from 0 (leave it, to be cut off) to 1
+    drive : of this transport, where already known
+
+    Returns the target, float32; what lies beside the object stays as it is. Where nothing is lacking, it is ``wanted``.
+    Raises UsageError "image-wrong-size", "target-not-finite" or "adapt-strength".
+    """
+    if not 0 <= strength <= 1:
+        raise UsageError(
+            "adapt-strength",
+            what=f"A target can't be adapted with strength {strength}.",
+            remedy="Give a strength from 0 (too bright or too dark parts are cut off) to 1.",
+        )
+    check_target(transport, wanted)
+    check_target(transport, floor)
+    drive = DriveLevels(transport) if drive is None else drive
+    if strength == 0 or not drive.mask.any():
+        return np.asarray(wanted, np.float32)
+    target = _Bent(np.asarray(wanted, np.float32), np.asarray(floor, np.float32), drive, SmoothLimits.on(drive.mask))
+    target.lift()
+    target.pale()
+    return target.dimmed(strength)
+
+
+class _Bent:
+    """A target on its way, ``wanted`` and its ``floor`` (rows, columns, 3).
+
+    ``lowest``, ``level`` (rows, columns): the darkest grey of each pixel, and what the smooth floor makes of it;
+    ``chroma`` (rows, columns): what is left of the saturation, from 0 to 1
+    """
+
+    def __init__(self, wanted: FloatImage, floor: FloatImage, drive: DriveLevels, limits: SmoothLimits) -> None:
+        self._wanted, self._floor = np.ascontiguousarray(wanted), np.ascontiguousarray(floor)
+        self._stage = drive.matrices, drive.segment_share, drive.mask
+        self._limits = limits
+        self._lowest = self._level = np.zeros(drive.mask.shape, np.float32)
+        self._chroma: FloatImage = np.ones(drive.mask.shape, np.float32)
+
+    def lift(self) -> None:
+        """Raise the darkest parts by grey light, where the stage can make a grey that bright at all."""
+        need = np.zeros_like(self._lowest)
+        _lift_needs(*self._stage, self._wanted, self._floor, self._lowest, need)
+        self._level = self._limits.above(need)
+        np.maximum(self._lowest, self._level, out=self._lowest)
+
+    def pale(self) -> None:
+        """Take chroma away where a channel would have to be darker than dark.
+
+        A channel's share of grey light says how saturated a colour is; the limit is on the smallest of these shares.
+        """
+        needs = np.zeros((3, *self._chroma.shape), np.float32)
+        _chroma_needs(*self._stage, self._wanted, self._floor, self._level, self._lowest, needs)
+        if needs.any():
+            for channel in range(3):
+                needs[channel] = self._limits.above(needs[channel])
+            _chroma_left(self._stage[-1], self._wanted, self._level, needs, self._chroma)
+
+    def dimmed(self, strength: float) -> FloatImage:
+        """Bend the brightest parts below a smooth ceiling; all steps together, as strong as ``strength``."""
+        mask = self._stage[-1]
+        brightest = _brightest(mask, self._wanted, self._level, self._chroma)
+        top = np.float32(brightest.max(initial=0) / KNEE)
+        depths = np.zeros((3, *mask.shape), np.float32)
+        _depths(*self._stage, self._wanted, self._floor, self._level, self._chroma, top, depths)
+        if depths.any():
+            for channel in range(3):
+                depths[channel] = self._limits.above(depths[channel])
+        else:
+            depths = NOT_DIMMED
+        changed = self._wanted.copy()
+        _bend(mask, self._wanted, self._level, self._chroma, depths, top, np.float32(strength), changed)
+        return changed
+
+
+@compiled(parallel=True)
+def _lift_needs(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    lowest: FloatImage, need: FloatImage,
+) -> None:  # fmt: skip
+    """The darkest grey at each pixel, and where a target is darker and that grey can be made."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            of_floor = levels_at(matrices, segment_share, y, x, floor[y, x, 0], floor[y, x, 1], floor[y, x, 2])
+            of_grey = levels_at(matrices, segment_share, y, x, one, one, one)
+            darkest, brightest = np.float32(0), np.float32(np.inf)
+            for c in range(3):
+                darkest = max(darkest, _quotient(of_floor[c], of_grey[c], np.float32(0)))
+                brightest = min(brightest, _quotient(of_floor[c] + one, of_grey[c], np.float32(np.inf)))
+            lowest[y, x] = darkest
+            if darkest <= brightest and _grey(wanted, y, x) < darkest:
+                need[y, x] = darkest
+
+
+@compiled(parallel=True)
+def _chroma_needs(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    level: FloatImage, lowest: FloatImage, needs: FloatImage,
+) -> None:  # fmt: skip
+    """The least share of grey light (3, rows, columns) that a channel can show, where it can't show its own."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t, grey = _lifted(wanted, level, y, x)
+            dark = floor[y, x, 0], floor[y, x, 1], floor[y, x, 2]
+            of_grey = levels_at(matrices, segment_share, y, x, grey - dark[0], grey - dark[1], grey - dark[2])
+            of_colour = levels_at(matrices, segment_share, y, x, r - dark[0], s - dark[1], t - dark[2])
+            over = (grey / max(lowest[y, x], LEAST) - one) / np.float32(CLEAR)
+            clear = min(max(over, np.float32(0)), one)
+            lifted = r, s, t
+            for c in range(3):
+                own = lifted[c] / grey
+                if of_colour[c] < -FORGIVEN and own < one:
+                    most = max(of_grey[c], np.float32(0))
+                    # both are infinite where a colour of light is none
+                    kept = _quotient(most, most - of_colour[c], one)
+                    needs[c, y, x] = own + clear * (one - kept) * (one - own)
+
+
+@compiled(parallel=True)
+def _chroma_left(mask: Mask, wanted: FloatImage, level: FloatImage, limits: FloatImage, chroma: FloatImage) -> None:
+    """What is left of each pixel's saturation by the ``limits`` (3, rows, columns) of its channels' shares of grey."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t, grey = _lifted(wanted, level, y, x)
+            lifted = r, s, t
+            left = one
+            for c in range(3):
+                own = lifted[c] / grey
+                if own < one:
+                    raised = min(_soft_maximum(own, limits[c, y, x]), one)
+                    left = min(left, _quotient(one - raised, one - own, one))
+            chroma[y, x] = max(left, np.float32(0))
+
+
+@compiled(parallel=True)
+def _brightest(mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage) -> FloatImage:
+    """(rows,): the brightest channel of the paler target in each row."""
+    rows, columns = mask.shape
+    out = np.zeros(rows, np.float32)
+    for y in prange(rows):
+        most = np.float32(0)
+        for x in range(columns):
+            if mask[y, x]:
+                r, s, t = _paler(wanted, level, chroma, y, x)
+                most = max(most, r, s, t)
+        out[y] = most
+    return out
+
+
+@compiled(parallel=True)
+def _depths(
+    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
+    level: FloatImage, chroma: FloatImage, top: np.float32, depths: FloatImage,
+) -> None:  # fmt: skip
+    """How far the ceiling (3, rows, columns) is below ``top``, where light is lacking."""
+    rows, columns = mask.shape
+    none, one = np.float32(0), np.float32(1)
+    for y in prange(rows):
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            r, s, t = _paler(wanted, level, chroma, y, x)
+            dark = floor[y, x, 0], floor[y, x, 1], floor[y, x, 2]
+            levels = levels_at(matrices, segment_share, y, x, r - dark[0], s - dark[1], t - dark[2])
+            if max(levels[0], levels[1], levels[2]) > 1 + FORGIVEN:
+                first, second, third = levels
+                most = light_at(
+                    matrices, segment_share, y, x, min(max(first, none), one), min(max(second, none), one),
+                    min(max(third, none), one),
+                )  # fmt: skip
+                for c in range(3):
+                    if levels[c] > 1 + FORGIVEN:
+                        depth = np.log(top / max(dark[c] + most[c], LEAST))
+                        depths[c, y, x] = min(max(depth, none), np.float32(DEEPEST))
+
+
+@compiled(parallel=True)
+def _bend(
+    mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage, depths: FloatImage, top: np.float32,
+    strength: np.float32, out: FloatImage,
+) -> None:  # fmt: skip
+    """The target (rows, columns, 3) on the object, paler and below its ceiling; none with ``depths`` of 0 rows."""
+    rows, columns = mask.shape
+    one = np.float32(1)
+    for y in prange(rows):
+        gain = np.ones(3, np.float32)
+        for x in range(columns):
+            if not mask[y, x]:
+                continue
+            paler = _paler(wanted, level, chroma, y, x)
+            together = one
+            for c in range(3 if depths.shape[1] else 0):
+                of_ceiling = paler[c] / (top * np.exp(-depths[c, y, x]))
+                gain[c] = _quotient(_shoulder(of_ceiling), of_ceiling, one)
+                together = min(together, gain[c])
+            for c in range(3):
+                bent = paler[c]
+                if together < one:
+                    bent *= gain[c] ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER)
+                out[y, x, c] += strength * (bent - out[y, x, c])
+
+
+@compiled()
+def _grey(wanted: FloatImage, y: int, x: int) -> np.float32:
+    """Lightness from the camera's channels, of which green is that of the eye."""
+    none = np.float32(0)
+    return _grey_of(max(wanted[y, x, 0], none), max(wanted[y, x, 1], none), max(wanted[y, x, 2], none))
+
+
+@compiled()
+def _grey_of(r: np.float32, s: np.float32, t: np.float32) -> np.float32:
+    return np.float32(0.25) * r + np.float32(0.5) * s + np.float32(0.25) * t
+
+
+@compiled()
+def _lifted(
+    wanted: FloatImage, level: FloatImage, y: int, x: int
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """A pixel of the target after ``lift``, and its grey."""
+    none = np.float32(0)
+    r, s, t = max(wanted[y, x, 0], none), max(wanted[y, x, 1], none), max(wanted[y, x, 2], none)
+    grey = _grey_of(r, s, t)
+    more = _soft_maximum(grey, level[y, x]) - grey
+    r, s, t = r + more, s + more, t + more
+    return r, s, t, max(_grey_of(r, s, t), LEAST)
+
+
+@compiled()
+def _paler(wanted: FloatImage, level: FloatImage, chroma: FloatImage, y: int, x: int) -> Colour:
+    """A pixel of the target after ``pale``. Full chroma leaves every bit as it is."""
+    r, s, t, grey = _lifted(wanted, level, y, x)
+    lost = np.float32(1) - chroma[y, x]
+    return r + lost * (grey - r), s + lost * (grey - s), t + lost * (grey - t)
+
+
+@compiled()
+def _shoulder(value: np.float32) -> np.float32:
+    """The identity up to ``KNEE``, then towards 1 with the same slope at the knee."""
+    knee, room = np.float32(KNEE), np.float32(1 - KNEE)
+    above = max(value - knee, np.float32(0)) / room
+    bent: np.float32 = min(value, knee) + room * (np.float32(1) - np.exp(-above))
+    return bent
+
+
+@compiled()
+def _soft_maximum(value: np.float32, level: np.float32) -> np.float32:
+    """At least the larger of both; ``value`` itself where ``level`` is 0."""
+    found = max(value, np.float32(0))
+    # elsewhere a root of a power is not the number itself, by a bit or two that differ from processor to processor
+    if level > 0:
+        one, other = found * found, level * level
+        found = np.sqrt(np.sqrt(one * one + other * other))
+    return found
+
+
+@compiled()
+def _quotient(above: np.float32, below: np.float32, otherwise: np.float32) -> np.float32:
+    """``above`` / ``below`` where that is positive, else ``otherwise``."""
+    return above / below if below > 1e-9 and np.isfinite(above) and np.isfinite(below) else otherwise

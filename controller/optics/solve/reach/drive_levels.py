@@ -1,0 +1,141 @@
+"""How hard the projectors must be driven for a light: brightness and colour in reach at each camera pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numba import prange
+
+from controller.core.arrays import FloatImage, Mask, array_in_file
+from controller.core.jit import compiled
+from controller.optics.transport import LightTransport
+
+ALL: Final = slice(None)
+Colour = tuple[np.float32, np.float32, np.float32]
+NO_SEGMENTS: Final = np.zeros((0, 0), np.float32)
+
+
+class DriveLevels:
+    """Turns light at a camera pixel into the colour that all projectors would show alike to make it.
+
+    At a pixel, B = sum over n of diag(W_n) M_n is the light of the three channels, all projectors together. A light is
+    surely within reach where B^-1 light lies in [0, 1]: brightness and the crosstalk of the colours in one. (Where the
+    primaries of the projectors differ, a little more can be reached by unequal frames.) White segments make part of
+    what the three colours have in common: levels are those of the colours' own light.
+
+    ``matrices`` (3, 3, rows, columns): B; ``segment_share`` (rows, columns): what white segments are of all light,
+    0 x 0 where no projector has one
+    """
+
+    def __init__(self, transport: LightTransport, folder: Path | None = None) -> None:
+        """``folder``: for a nameless file of what need not stay in memory; None: it stays there."""
+        self.mask: Mask = transport.object_mask
+        pixels = sum(rows * columns for rows, columns in transport.sizes)
+        ones = np.ones((3, pixels), np.float32)
+        shape = (3, 3, *transport.camera_shape)
+        self.matrices = array_in_file(folder, shape)
+        self.matrices[:] = 0
+        segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
+        for n, mixing in enumerate(transport.mixing):
+            white = transport.forward_planes(ones, projectors=(n, n + 1))
+            for channel in range(3):
+                for colour in range(3):
+                    self.matrices[channel, colour] += mixing[channel, colour] * white[channel]
+            if transport.segments:
+                segment += np.float32(transport.segment(n)) * white.sum(axis=0)
+                total += white.sum(axis=0)
+        # projectors of one kind stand together: where they differ, the mean by their light
+        share = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else NO_SEGMENTS
+        self.segment_share: FloatImage = share
+
+    def of(self, light: FloatImage, rows: slice = ALL) -> FloatImage:
+        """(rows, columns, 3) float32 for a light of that shape, without the black image; 0 outside the object.
+
+        Infinite where the projectors' colours are not independent. ``rows``: those of the picture that ``light`` has.
+        """
+        out = np.zeros(light.shape, np.float32)
+        first = rows.indices(len(self.mask))[0]
+        light = np.ascontiguousarray(light, np.float32)
+        _levels(self.matrices, self.segment_share, light, self.mask, first, out)
+        return out
+
+    def light(self, levels: FloatImage, rows: slice = ALL) -> FloatImage:
+        """The light (rows, columns, 3) float32 of such a colour (rows, columns, 3): the inverse of ``of``."""
+        out = np.empty(levels.shape, np.float32)
+        first = rows.indices(len(self.mask))[0]
+        _lights(self.matrices, self.segment_share, np.ascontiguousarray(levels, np.float32), first, out)
+        return out
+
+
+@compiled(parallel=True)
+def _levels(
+    matrices: FloatImage, segment_share: FloatImage, light: FloatImage, mask: Mask, first: int, out: FloatImage
+) -> None:
+    """``levels_at`` each pixel of ``mask``; ``light`` and ``out`` begin at its row ``first``."""
+    rows, columns = light.shape[:2]
+    for y in prange(rows):
+        for x in range(columns):
+            if mask[first + y, x]:
+                found = levels_at(matrices, segment_share, first + y, x, light[y, x, 0], light[y, x, 1], light[y, x, 2])
+                for c in range(3):
+                    out[y, x, c] = found[c]
+
+
+@compiled(parallel=True)
+def _lights(matrices: FloatImage, segment_share: FloatImage, levels: FloatImage, first: int, out: FloatImage) -> None:
+    """``light_at`` each pixel; ``levels`` and ``out`` begin at row ``first``."""
+    rows, columns = levels.shape[:2]
+    for y in prange(rows):
+        for x in range(columns):
+            one, two, three = levels[y, x, 0], levels[y, x, 1], levels[y, x, 2]
+            found = light_at(matrices, segment_share, first + y, x, one, two, three)
+            for c in range(3):
+                out[y, x, c] = found[c]
+
+
+@compiled()
+def levels_at(
+    matrices: FloatImage, segment_share: FloatImage, y: int, x: int, r: np.float32, s: np.float32, t: np.float32
+) -> Colour:
+    """The colour that all projectors would show alike to make the light (r, s, t) at a pixel, by Cramer's rule.
+
+    Infinite where the projectors' colours are not independent. ``matrices``, ``segment_share``: of ``DriveLevels``
+    """
+    B = matrices[:, :, y, x]
+    a, b, c = B[0, 0], B[0, 1], B[0, 2]
+    d, e, f = B[1, 0], B[1, 1], B[1, 2]
+    g, h, i = B[2, 0], B[2, 1], B[2, 2]
+    det = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if det == 0:
+        infinite = np.float32(np.inf)
+        return infinite, infinite, infinite
+    one = (r * (e * i - f * h) - b * (s * i - f * t) + c * (s * h - e * t)) / det
+    two = (a * (s * i - f * t) - r * (d * i - f * g) + c * (d * t - s * g)) / det
+    three = (a * (e * t - s * h) - b * (d * t - s * g) + r * (d * h - e * g)) / det
+    if segment_share.shape[0]:
+        # what is below none has no white in it
+        share = segment_share[y, x]
+        white = share * max(min(one, two, three), np.float32(0))
+        own = np.float32(1) - share
+        return (one - white) / own, (two - white) / own, (three - white) / own
+    return one, two, three
+
+
+@compiled()
+def light_at(
+    matrices: FloatImage, segment_share: FloatImage, y: int, x: int, one: np.float32, two: np.float32, three: np.float32
+) -> Colour:
+    """The light of such a colour at a pixel: the inverse of ``levels_at``."""
+    if segment_share.shape[0]:
+        share = segment_share[y, x]
+        white = share * max(min(one, two, three), np.float32(0))
+        own = np.float32(1) - share
+        one, two, three = own * one + white, own * two + white, own * three + white
+    B = matrices[:, :, y, x]
+    return (
+        B[0, 0] * one + B[0, 1] * two + B[0, 2] * three,
+        B[1, 0] * one + B[1, 1] * two + B[1, 2] * three,
+        B[2, 0] * one + B[2, 1] * two + B[2, 2] * three,
+    )

@@ -1,0 +1,125 @@
+"""What light a stage can make at each camera pixel, and the exposure of a target that fits into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.channels import finite, largest, smallest
+from controller.core.errors import UsageError, WorkError
+from controller.optics.solve.bounded.solver import check_target
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.transport import LightTransport
+
+FORGIVEN_DRIVE: Final = 2e-3
+"""So much drive beyond black and white still counts as in reach."""
+MOST_BEYOND: Final = 6e4
+"""float16 ends at 65504."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feasibility:
+    """Which part of a target radiance the projectors can make.
+
+    ``beyond`` (rows, columns, 3) float16: by how much the channels of the projectors would have to be driven above
+    white, negative: below black; 1 is all of a channel's light
+    ``reachable`` (rows, columns) bool: on the object, and neither too bright, too dark nor too saturated
+    ``share``: the part of the object's pixels that is reachable
+    """
+
+    beyond: npt.NDArray[np.float16]
+    reachable: Mask
+    share: float
+
+    @property
+    def too_bright(self) -> npt.NDArray[np.float16]:
+        """(rows, columns, 3), >= 0."""
+        return np.maximum(self.beyond, np.float16(0))
+
+    @property
+    def too_dark(self) -> npt.NDArray[np.float16]:
+        """(rows, columns, 3), >= 0."""
+        return np.maximum(-self.beyond, np.float16(0))
+
+
+def feasibility(
+    transport: LightTransport,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    margin: float = FORGIVEN_DRIVE,
+    drive: DriveLevels | None = None,
+) -> Feasibility:
+    """Compare ``target`` (rows, columns, 3), linear radiance, with the light that the projectors can make.
+
+    ``margin``: so much drive beyond [0, 1] is forgiven; ``drive`` of this transport, where already known.
+    """
+    check_target(transport, target)
+    drive = DriveLevels(transport) if drive is None else drive
+    mask = drive.mask
+    beyond, reachable = np.empty(target.shape, np.float16), np.empty(mask.shape, np.bool_)
+    for rows in strips(len(target)):
+        needed = drive.of(target[rows] - black[rows], rows)
+        off = needed - np.clip(needed, 0, 1)
+        reachable[rows] = mask[rows] & (largest(np.abs(off)) <= margin)
+        beyond[rows] = np.clip(off, -MOST_BEYOND, MOST_BEYOND)
+    share = float(reachable[mask].mean()) if mask.any() else 0.0
+    return Feasibility(beyond, reachable, share)
+
+
+def choose_exposure(
+    transport: LightTransport,
+    target: FloatImage,
+    black: FloatImage,
+    *,
+    share: float = 0.95,
+    drive: DriveLevels | None = None,
+) -> float:
+    """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x target.
+
+    ``target`` (rows, columns, 3): reflectance-like, 0 to 1. No channel of a pixel may need more than all its light;
+    pixels too dark or too saturated for the stage do not affect the exposure: another one would not help them.
+
+    Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the target is black.
+    """
+    check_target(transport, target)
+    if not 0 < share <= 1:
+        raise UsageError(
+            "share-out-of-range",
+            what=f"A share of {share} reachable pixels is not possible.",
+            remedy="Give a share above 0 and up to 1, for example 0.95.",
+        )
+    drive = DriveLevels(transport) if drive is None else drive
+    most = np.concatenate([_most(drive, target[rows], black[rows], rows) for rows in strips(len(target))])
+    most.sort()
+    # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
+    bound = int(np.floor((1 - share) * most.size))
+    exposure = float(most[min(bound, most.size - 1)]) if most.size else 0.0
+    if not 0 < exposure < np.inf:
+        raise WorkError(
+            "no-light",
+            what="No exposure fits this target: it is black, or no projector lights the object.",
+            remedy="Check the target. Check that the projectors lit the object during the calibration.",
+        )
+    return exposure
+
+
+def _most(drive: DriveLevels, target: FloatImage, black: FloatImage, rows: slice) -> Float64:
+    """(pixels,): the largest exposure of each pixel of the object in some rows of the picture."""
+    mask = drive.mask[rows]
+    per_exposure, at_none = (drive.of(light, rows)[mask].astype(np.float64) for light in (target, -black))
+    possible = finite(per_exposure) & finite(at_none)
+    per_exposure, at_none = per_exposure[possible], at_none[possible]
+    room = np.full_like(per_exposure, np.inf)
+    # less than this needs no light worth counting, and its quotient would only overflow
+    return smallest(np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12))
+
+
+def target_radiance(target: FloatImage, black: FloatImage, exposure: float) -> FloatImage:
+    """The camera image to aim at: exposure x target, raised to the black image where it is darker."""
+    radiance: FloatImage = np.maximum(np.float32(exposure) * target, black).astype(np.float32, copy=False)
+    return radiance

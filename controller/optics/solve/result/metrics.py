@@ -1,0 +1,192 @@
+"""How near a photographed result is to its target: colour difference, error, sharpness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.channels import mean
+from controller.core.errors import UsageError
+from controller.optics.solve.result.ciede2000 import ciede2000
+
+BAND_PIXELS: Final = 1 << 18
+"""Pixels compared at a time, so that memory stays bounded at any size."""
+SHARE_OF_MEDIAN: Final = 0.5
+"""Canny's high threshold is this share of the median gradient along the target's own edges, so that a result with less
+contrast still has them (docs/decisions/0058). The low threshold is ``WEAK`` of the high one."""
+WEAK: Final = 0.4
+EDGE_SIGMA_PX: Final = 1.4
+GRADIENT_SCALE: Final = 2000.0
+"""Gradients as 16-bit integers: a step from black to white stays in range, and a thousandth of it is seen."""
+FAINTEST_EDGE: Final = 40.0
+"""No threshold below this: two hundredths of the way from black to white, as a step."""
+SSIM_SIGMA_PX: Final = 1.5
+SSIM_RADIUS_PX: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Figures over the pixels of a mask; ``error_map`` (rows, columns) float32 CIEDE2000, 0 outside the mask."""
+
+    delta_e00_median: float
+    delta_e00_p95: float
+    rmse: float
+    sharpness_lambda: float
+    error_map: FloatImage
+
+
+def lab_of(rgb: FloatImage, camera_to_xyz: Float64, white: float) -> Float64:
+    """CIE L*a*b* of linear camera values (..., 3); camera RGB (white, white, white) is L* = 100 and neutral."""
+    reference = camera_to_xyz @ np.full(3, white)
+    t = np.maximum(rgb.astype(np.float64) @ camera_to_xyz.T / reference, 0)
+    delta = 6 / 29
+    f = np.where(t > delta**3, np.cbrt(t), t / (3 * delta**2) + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1)
+
+
+def colour_difference(
+    achieved: FloatImage, target: FloatImage, camera_to_xyz: Float64, white: float, mask: Mask
+) -> FloatImage:
+    """CIEDE2000 at each pixel of ``mask``, 0 elsewhere; images (rows, columns, 3) in linear camera units.
+
+    ``white`` is the camera value of a perfect white at the target's exposure.
+    """
+    difference = np.zeros(mask.shape, np.float32)
+    ys, xs = np.nonzero(mask)
+    to_relative = np.ascontiguousarray(camera_to_xyz / (camera_to_xyz @ np.full(3, white))[:, None], np.float64)
+    for first in range(0, ys.size, BAND_PIXELS):
+        at = ys[first : first + BAND_PIXELS], xs[first : first + BAND_PIXELS]
+        a, b = (image[at].astype(np.float64) for image in (achieved, target))
+        found = np.empty(len(a))
+        ciede2000(a, b, to_relative, found)
+        difference[at] = found
+    return difference
+
+
+def compare(achieved: FloatImage, target: FloatImage, camera_to_xyz: Float64, white: float, mask: Mask) -> Comparison:
+    """All figures of one appearance. ``rmse`` is relative to ``white``.
+
+    Raises UsageError("nothing-to-compare") when the mask is empty or the images are not finite or of different sizes.
+    """
+    if achieved.shape != target.shape or target.shape[:2] != mask.shape or not mask.any() or not white > 0:
+        raise _incomparable("they differ in size, or the mask is empty")
+    if not (np.isfinite(achieved[mask]).all() and np.isfinite(target[mask]).all()):
+        raise _incomparable("some pixels are not finite")
+    difference = colour_difference(achieved, target, camera_to_xyz, white, mask)
+    inside = difference[mask]
+    error = (achieved[mask].astype(np.float64) - target[mask]) / white
+    return Comparison(
+        delta_e00_median=float(np.median(inside)),
+        delta_e00_p95=float(np.percentile(inside, 95)),
+        rmse=float(np.sqrt((error**2).mean())),
+        sharpness_lambda=sharpness(achieved, target, white, mask),
+        error_map=difference,
+    )
+
+
+def structural_similarity(one: FloatImage, other: FloatImage) -> FloatImage:
+    """SSIM at each pixel of two pictures (rows, columns, channels) float32 in [0, 1], each channel by itself.
+
+    Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error visibility to structural similarity",
+    IEEE Transactions on Image Processing 13(4), 2004: a Gaussian window of 1.5 px, 11 px wide; K1 = 0.01, K2 = 0.03.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    def local_mean(picture: FloatImage) -> FloatImage:
+        return np.asarray(gaussian_filter(picture, SSIM_SIGMA_PX, radius=SSIM_RADIUS_PX, axes=(0, 1)), np.float32)
+
+    c1, c2 = np.float32(0.01**2), np.float32(0.03**2)
+    mean_one, mean_other = local_mean(one), local_mean(other)
+    variances = local_mean(one * one) - mean_one**2 + local_mean(other * other) - mean_other**2
+    covariance = local_mean(one * other) - mean_one * mean_other
+    likeness = (2 * mean_one * mean_other + c1) * (2 * covariance + c2)
+    return np.asarray(likeness / ((mean_one**2 + mean_other**2 + c1) * (variances + c2)), np.float32)
+
+
+def sharpness(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> float:
+    """Local sharpness lambda: edges in common over the larger number of edges (paper 6, eq. 9); 1 without edges.
+
+    Both edge images are cut at the target's own threshold, so a flat result does not find edges in its noise.
+    """
+    return _lambda(*_both_edges(achieved, target, white, mask))
+
+
+def sharpness_windows(
+    achieved: FloatImage, target: FloatImage, white: float, mask: Mask, size_px: int, *, least_edges: int = 12
+) -> tuple[FloatImage, float]:
+    """lambda (paper 6, eq. 9) in each square window of ``size_px`` camera pixels, and over all of them.
+
+    (window rows, window columns) float32, NaN where the target has fewer than ``least_edges`` edge pixels.
+    """
+    ours, theirs = _both_edges(achieved, target, white, mask)
+
+    def counted(picture: Mask) -> Float64:
+        rows, columns = (-(-side // size_px) * size_px for side in mask.shape)
+        whole = np.zeros((rows, columns))
+        whole[: mask.shape[0], : mask.shape[1]] = picture
+        return np.asarray(whole.reshape(rows // size_px, size_px, columns // size_px, size_px).sum(axis=(1, 3)))
+
+    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
+    enough = (counted(theirs) >= least_edges) & (most > 0)
+    local = np.divide(common, most, out=np.full(most.shape, np.nan), where=enough)
+    return local.astype(np.float32), _lambda(ours, theirs)
+
+
+def sharpness_around(
+    achieved: FloatImage, target: FloatImage, white: float, mask: Mask, size_px: int, *, least_edges: int = 12
+) -> tuple[FloatImage, float]:
+    """lambda (paper 6, eq. 9) in the square neighbourhood of ``size_px`` camera pixels of each pixel, and over all.
+
+    (rows, columns) float32, NaN outside the mask and where the target has fewer than ``least_edges`` edge pixels near.
+    """
+    ours, theirs = _both_edges(achieved, target, white, mask)
+
+    def counted(picture: Mask) -> FloatImage:
+        flat = cv2.boxFilter(picture.astype(np.float32), -1, (size_px, size_px), normalize=False,
+                             borderType=cv2.BORDER_CONSTANT)  # fmt: skip
+        return np.asarray(np.round(flat), np.float32)
+
+    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
+    enough = mask & (counted(theirs) >= least_edges)
+    return np.divide(common, most, out=np.full(mask.shape, np.nan, np.float32), where=enough), _lambda(ours, theirs)
+
+
+def _lambda(ours: Mask, theirs: Mask) -> float:
+    most = max(int(ours.sum()), int(theirs.sum()))
+    return float((ours & theirs).sum() / most) if most else 1.0
+
+
+def _both_edges(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> tuple[Mask, Mask]:
+    """Edges (rows, columns) of both pictures inside the mask, by Canny."""
+    gradients = [_gradient(image, white) for image in (achieved, target)]
+    of_target = _canny(gradients[1], FAINTEST_EDGE) & mask
+    strength = np.hypot(*(part[of_target].astype(np.float32) for part in gradients[1]))
+    median = float(np.median(strength)) if strength.size else 0.0
+    threshold = max(SHARE_OF_MEDIAN * median, FAINTEST_EDGE)
+    ours, theirs = (_canny(gradient, threshold) & mask for gradient in gradients)
+    return ours, theirs
+
+
+def _canny(gradient: tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]], threshold: float) -> Mask:
+    return np.asarray(cv2.Canny(*gradient, WEAK * threshold, threshold, L2gradient=True) > 0)
+
+
+def _gradient(image: FloatImage, white: float) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.int16]]:
+    """Gradient of a picture's brightness after a display's gamma, so that edges in the dark count as they are seen."""
+    grey = np.clip(mean(image) / white, 0, 1) ** np.float32(1 / 2.2)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
+    dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, 1 - i, i) * GRADIENT_SCALE for i in range(2))
+    return np.round(dx).astype(np.int16), np.round(dy).astype(np.int16)
+
+
+def _incomparable(why: str) -> UsageError:
+    return UsageError(
+        "nothing-to-compare",
+        what=f"The result can't be compared with its target: {why}.",
+        remedy="Compare camera images of one stage, on pixels of the object.",
+    )

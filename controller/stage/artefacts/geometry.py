@@ -1,0 +1,107 @@
+"""The reconstructed stage of a run: ``geometry.npz`` and ``geometry.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.core.arrays import FloatImage, load_arrays, save_arrays
+from controller.optics.calibrate.geometry.values import Reconstruction
+from controller.optics.calibrate.values import Geometry, Pinhole
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import json_path, npz_path, read_json, write_json
+
+
+def write_geometry(run: Path, projectors: Sequence[str], found: Reconstruction) -> list[Path]:
+    """Points and normals in the camera's frame, metres; poses and their uncertainty (docs/reference/report.md)."""
+    geometry = found.geometry
+    arrays = npz_path(run, StepKind.GEOMETRY)
+    save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals, "sigma_m": found.sigma_m})
+    poses = {
+        "camera": _pinhole(geometry.camera),
+        "projectors": {name: _pinhole(pose) for name, pose in zip(projectors, geometry.projectors, strict=True)},
+        "reprojection_rms_px": geometry.reprojection_rms_px,
+        "scale_known": geometry.scale_known,
+        "noise_px": found.noise_px,
+        "shape_rel_sigma": found.shape_rel_sigma,
+        "inlier_share": found.inlier_share,
+        "scale_rel_sigma": found.scale_rel_sigma if geometry.scale_known else None,
+        "parameters": list(found.parameter_names),
+        "covariance": found.covariance.tolist(),
+    }
+    return [arrays, write_json(json_path(run, StepKind.GEOMETRY), poses)]
+
+
+def has_geometry(run: Path) -> bool:
+    """Whether ``read_geometry`` finds both files."""
+    return npz_path(run, StepKind.GEOMETRY).is_file() and json_path(run, StepKind.GEOMETRY).is_file()
+
+
+def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometry:
+    """The geometry of a finished run; ``projectors``: in this order, else as in the run."""
+    arrays = load_arrays(npz_path(run, StepKind.GEOMETRY))
+    poses = read_geometry_figures(run)
+    geometry = Geometry(
+        camera=_read_pinhole(poses["camera"]),
+        projectors=tuple(_read_pinhole(row) for row in poses["projectors"].values()),
+        points_m=arrays["points_m"],
+        normals=arrays["normals"],
+        reprojection_rms_px=float(poses["reprojection_rms_px"]),
+        scale_known=bool(poses["scale_known"]),
+    )
+    if projectors is None:
+        return geometry
+    by_name = dict(zip(poses["projectors"], geometry.projectors, strict=True))
+    return replace(geometry, projectors=tuple(by_name[name] for name in projectors))
+
+
+def read_points_m(run: Path) -> FloatImage:
+    """(camera rows, columns, 3) float32: the object's points in the camera's frame, metres, NaN where unknown."""
+    points: FloatImage = load_arrays(npz_path(run, StepKind.GEOMETRY))["points_m"]
+    return points
+
+
+def known_points_m(run: Path) -> FloatImage | None:
+    """As ``read_points_m``; None before the geometry is known."""
+    return read_points_m(run) if npz_path(run, StepKind.GEOMETRY).exists() else None
+
+
+def read_geometry_figures(run: Path) -> Any:
+    """The content of ``geometry.json``; {} if it is missing."""
+    path = json_path(run, StepKind.GEOMETRY)
+    return read_json(path) if path.exists() else {}
+
+
+def projectors_of(run: Path) -> list[str]:
+    """The run's projectors, in its order. Raises KeyError for a run without geometry."""
+    return list(read_geometry_figures(run)["projectors"])
+
+
+def camera_px(run: Path) -> tuple[int, int] | None:
+    """(width, height) of the camera's picture; None before the geometry is known."""
+    figures = read_geometry_figures(run)
+    if not figures:
+        return None
+    width, height = figures["camera"]["size_px"]
+    return int(width), int(height)
+
+
+def _pinhole(pinhole: Pinhole) -> dict[str, object]:
+    return {
+        "matrix": pinhole.matrix.tolist(),
+        "distortion": pinhole.distortion.tolist(),
+        "rotation": pinhole.rotation.tolist(),
+        "translation_m": pinhole.translation_m.tolist(),
+        "size_px": list(pinhole.size_px),
+    }
+
+
+def _read_pinhole(row: dict[str, Any]) -> Pinhole:
+    keys = ("matrix", "distortion", "rotation", "translation_m")
+    matrix, distortion, rotation, translation_m = (np.array(row[key], np.float64) for key in keys)
+    width, height = row["size_px"]
+    return Pinhole(matrix, distortion, rotation, translation_m, (int(width), int(height)))

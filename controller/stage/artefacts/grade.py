@@ -1,0 +1,129 @@
+"""The grade files of a run, and what else its steps found; ``steps.calibrate.grade`` computes the grade."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.arrays import ByteImage, load_arrays, save_arrays
+from controller.core.storage import write_atomically
+from controller.core.troubles import Trouble
+from controller.run.step_id import StepId
+from controller.stage.artefacts.names import json_path, read_json, write_json
+
+PICTURE: Final = "verification.png"
+"""The map of errors and their reasons, the projectors in rows of ``ACROSS``."""
+ACROSS: Final = 3
+"""A screen is wider than high."""
+FIGURES: Final = "verification.json"
+BEFORE, RESOLUTION = "before.png", "resolution.png"
+"""Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
+_MAPS: Final = "verification.npz"
+_ACCEPTED: Final = "accepted.json"
+_TROUBLES: Final = "troubles"
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorMaps:
+    """Of one projector, (camera rows, columns).
+
+    ``error`` float32: difference of photograph and prediction over the local light, NaN where not compared
+    ``reasons``: the reason for the error (``calibrate.verify.error_attribution``)
+    """
+
+    error: npt.NDArray[Any]
+    reasons: npt.NDArray[Any]
+
+
+def in_rows(pictures: Sequence[ByteImage]) -> ByteImage:
+    """Pictures of one size (rows, columns, 3) beside and below each other, the rest of the last row black."""
+    across = min(ACROSS, len(pictures))
+    missing = -len(pictures) % across
+    filled = [*pictures, *[np.zeros_like(pictures[0])] * missing]
+    rows = [np.concatenate(filled[n : n + across], axis=1) for n in range(0, len(filled), across)]
+    return np.concatenate(rows, axis=0)
+
+
+def parts_of(picture: ByteImage, count: int) -> list[ByteImage]:
+    """The ``count`` pictures that ``in_rows`` has put together."""
+    across = min(ACROSS, count)
+    rows = np.split(picture, -(-count // across), axis=0)
+    return [np.ascontiguousarray(one) for row in rows for one in np.split(row, across, axis=1)][:count]
+
+
+def write_grade(
+    run: Path, figures: Mapping[str, Mapping[str, Any]], maps: Mapping[str, ErrorMaps], picture: bytes
+) -> list[Path]:
+    """``verification.json``, ``.npz`` and ``.png``; ``figures`` and ``maps`` by projector name, ``picture`` a PNG.
+
+    ``relative_rms`` among a projector's figures is a share, not per cent.
+    """
+    arrays = {f"error-{name}": one.error for name, one in maps.items()}
+    arrays |= {f"reasons-{name}": one.reasons for name, one in maps.items()}
+    save_arrays(run / _MAPS, arrays)
+    write_atomically(run / PICTURE, picture)
+    return [write_json(run / FIGURES, figures), run / _MAPS, run / PICTURE]
+
+
+def is_graded(run: Path) -> bool:
+    """Whether the run was graded; its file may still be damaged."""
+    return (run / FIGURES).exists()
+
+
+def read_grade_figures(run: Path) -> Any:
+    """The content of ``verification.json``, by projector name; {} for a run that was not graded."""
+    return read_json(run / FIGURES) if is_graded(run) else {}
+
+
+def read_error_maps(run: Path) -> dict[str, ErrorMaps]:
+    """By projector name, of a graded run."""
+    arrays, names = load_arrays(run / _MAPS), list(read_grade_figures(run))
+    if all(f"error-{name}" in arrays and f"reasons-{name}" in arrays for name in names):
+        return {name: ErrorMaps(arrays[f"error-{name}"], arrays[f"reasons-{name}"]) for name in names}
+    # As runs from before journal format 2 have them.
+    return {name: ErrorMaps(arrays[name], arrays[f"{name}-reasons"]) for name in names}
+
+
+def graded(run: Path) -> dict[str, float] | None:
+    """Per cent of relative error by projector; None for a run that was not graded."""
+    if not is_graded(run):
+        return None
+    return {name: 100 * float(row["relative_rms"]) for name, row in read_grade_figures(run).items()}
+
+
+def worst_letter(run: Path) -> str:
+    """The grade of the worst projector, "A" being the best."""
+    return max(str(row["grade"]) for row in read_grade_figures(run).values())
+
+
+def worst_of(run: Path) -> tuple[str, float] | None:
+    """The projector with the largest error, in per cent; None for a run that was not graded."""
+    figures = graded(run)
+    return max(figures.items(), key=lambda item: math.inf if math.isnan(item[1]) else item[1]) if figures else None
+
+
+def write_accepted(run: Path, projector: str, percent: float) -> Path:
+    """``accepted.json``: a person accepted the run with this projector's error, in per cent."""
+    return write_json(run / _ACCEPTED, {"projector": projector, "percent": percent})
+
+
+def passes(run: Path, worst_grade: float) -> bool:
+    """Whether a run's calibration may be used: good enough, accepted by a person, or not graded yet."""
+    worst = worst_of(run)
+    return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()
+
+
+def write_troubles(run: Path, step: StepId, found: Iterable[Trouble]) -> Path:
+    """``troubles-STEP.json``; written without any, too, because an earlier try may have found some."""
+    return write_json(json_path(run, _TROUBLES, str(step)), [asdict(trouble) for trouble in found])
+
+
+def read_troubles(run: Path) -> list[Trouble]:
+    """Of all steps of a run, by the names of their files; none of a run of an earlier version."""
+    return [Trouble(**row) for path in sorted(run.glob(f"{_TROUBLES}-*.json")) for row in read_json(path)]

@@ -1,0 +1,122 @@
+"""Renders one job. Runs inside Blender's own Python (``python worker.py JOB`` with the bpy module, or
+``blender --background --python worker.py -- JOB``), which is why it imports nothing of ours.
+
+JOB is a folder with ``job.json`` and ``mesh.npz`` (``controller.stage.blender.job`` writes both); the picture becomes
+``picture.exr`` there: 32-bit floats, linear.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scenes import BUILTIN, COLOURS  # type: ignore[import-not-found]
+
+PLACEHOLDER = "velatura"
+"""An object of this name in a user's scene gets the reconstructed shape and keeps its material."""
+SENSOR_MM = 36.0
+
+
+def main(folder: Path) -> None:
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    scene_file = job["scene_file"]
+    if scene_file is None:
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+    else:
+        # Scripts inside a scene do not run: a scene may come from anybody.
+        bpy.ops.wm.open_mainfile(filepath=scene_file, use_scripts=False)
+    with np.load(folder / "mesh.npz", allow_pickle=False) as arrays:
+        mesh = _mesh({name: arrays[name] for name in arrays.files})
+    body = _body(mesh)
+    if scene_file is None:
+        BUILTIN[job["builtin"]](body)
+    _camera(job["camera"])
+    _settings(job, folder)
+    bpy.ops.render.render(write_still=True)
+
+
+def _mesh(arrays: dict[str, Any]) -> Any:
+    mesh = bpy.data.meshes.new(PLACEHOLDER)
+    vertices, triangles = arrays["vertices_m"], arrays["triangles"]
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
+    mesh.loops.add(triangles.size)
+    mesh.loops.foreach_set("vertex_index", triangles.astype(np.int32).ravel())
+    mesh.polygons.add(len(triangles))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, triangles.size, 3, dtype=np.int32))
+    uv = mesh.uv_layers.new(name="camera")
+    uv.data.foreach_set("uv", arrays["uv"].astype(np.float32)[triangles.ravel()].ravel())
+    mesh.update(calc_edges=True)
+    mesh.validate()
+    colours = mesh.color_attributes.new(COLOURS, "FLOAT_COLOR", "POINT")
+    rgba = np.concatenate([arrays["reflectance"], np.ones((len(vertices), 1))], axis=1).astype(np.float32)
+    colours.data.foreach_set("color", rgba.ravel())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
+    mesh.normals_split_custom_set_from_vertices(arrays["normals"].astype(np.float32))
+    return mesh
+
+
+def _body(mesh: Any) -> Any:
+    body = bpy.data.objects.get(PLACEHOLDER)
+    if body is not None and body.type == "MESH":
+        for material in body.data.materials:
+            mesh.materials.append(material)
+        body.data = mesh
+        body.matrix_world = Matrix.Identity(4)
+        return body
+    body = bpy.data.objects.new(PLACEHOLDER, mesh)
+    bpy.context.scene.collection.objects.link(body)
+    return body
+
+
+def _camera(camera: dict[str, Any]) -> None:
+    """The calibrated camera at the origin, looking along +y, z up. Pixel centres of ours lie at whole numbers."""
+    width, height = camera["size_px"]
+    fx, fy, cx, cy = (camera[key] for key in ("fx", "fy", "cx", "cy"))
+    data = bpy.data.cameras.new("calibrated")
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_MM
+    data.lens = fx * SENSOR_MM / width
+    data.shift_x = (width / 2 - (cx + 0.5)) / width
+    data.shift_y = ((cy + 0.5) - height / 2) * (fx / fy) / width
+    data.clip_start, data.clip_end = camera["near_m"], camera["far_m"]
+    place = bpy.data.objects.new("calibrated", data)
+    place.rotation_euler = (np.pi / 2, 0, 0)
+    scene = bpy.context.scene
+    scene.collection.objects.link(place)
+    scene.camera = place
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
+    # A pixel is fx/fy times as high as it is wide; Blender wants ratios of at least 1.
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
+
+
+def _settings(job: dict[str, Any], folder: Path) -> None:
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples, cycles.seed = job["samples"], job["seed"]
+    cycles.use_adaptive_sampling, cycles.adaptive_threshold = True, 0.02
+    cycles.use_denoising = job["denoise"]
+    cycles.sample_clamp_indirect = 10.0
+    render = scene.render
+    render.film_transparent = True
+    render.use_border = False
+    render.threads_mode = "FIXED" if job["threads"] else "AUTO"
+    if job["threads"]:
+        render.threads = job["threads"]
+    render.image_settings.file_format = "OPEN_EXR"
+    render.image_settings.color_mode, render.image_settings.color_depth = "RGBA", "32"
+    render.image_settings.exr_codec = "ZIP"
+    render.filepath = str(folder / "picture.exr")
+    render.use_compositing = render.use_sequencer = False
+    scene.view_settings.view_transform = "Raw"
+
+
+if __name__ == "__main__":
+    given = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    main(Path(given[0]))

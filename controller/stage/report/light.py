@@ -1,0 +1,61 @@
+"""Direct and indirect light of a stage as pictures: what projectors make, and what surfaces throw back."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from controller.core import channels
+from controller.core.arrays import ByteImage, FloatImage
+from controller.optics.calibrate.values import Calibration
+from controller.stage.report import plots
+from controller.stage.report.page import ReportPicture
+from controller.stage.report.pictures import Crop, to_screen
+
+BRIGHTER: Final = 4.0
+"""Indirect light is shown so many times brighter than direct light, or it would be black on most screens."""
+MOST_PERCENT: Final = 50.0
+FAINT: Final = 0.01
+"""Of the usual light: a share of less says nothing."""
+
+Gallery = tuple[str, str, tuple[ReportPicture, ...]]
+
+
+def whites(calibration: Calibration) -> tuple[FloatImage, FloatImage]:
+    """(rows, columns, 3) direct and indirect light of all projectors at white, without the black image."""
+    nothing = np.zeros_like(calibration.black)
+    direct = sum((part.white for part in calibration.projectors), start=nothing)
+    parts = [part.indirect for part in calibration.projectors if part.indirect is not None]
+    return direct, np.asarray(sum(parts, start=nothing), np.float32)
+
+
+def light_gallery(calibration: Calibration, crop: Crop) -> tuple[Gallery, ...]:
+    """The gallery; none where no indirect light was found that counts."""
+    if all(part.indirect is None for part in calibration.projectors):
+        return ()
+    direct, indirect = whites(calibration)
+    mask = calibration.object_mask
+    whole = direct + indirect
+    usual = float(np.percentile(whole[mask], 99)) if mask.any() else 1.0
+
+    def screen(light: FloatImage) -> ByteImage:
+        cut = np.ascontiguousarray(light[crop.rows, crop.columns])
+        return to_screen(cut, calibration.camera_to_xyz, white=max(usual, 1e-12))
+
+    seen, thrown = channels.total(whole), channels.total(indirect)
+    known = mask & (seen > FAINT * float(np.median(seen[mask]) if mask.any() else 0))
+    share = np.where(known, 100 * thrown / np.maximum(seen, 1e-12), np.nan).astype(np.float32)
+    middle, high = (float(np.nanpercentile(share, q)) for q in (50, 95)) if known.any() else (0.0, 0.0)
+    field = plots.field(share[crop.rows, crop.columns], "% of the light seen", least=0, most=MOST_PERCENT)
+    text = (
+        "All projectors at white. Light that other surfaces throw back has no contrast under fine patterns. So the "
+        "calibration's photographs distinguish it. "
+        f"It is {middle:.0f} % of the object's light at the median, {high:.0f} % at the 95th percentile."
+    )
+    pictures = (
+        ReportPicture("Direct light", screen(direct), "what the projectors make"),
+        ReportPicture("Indirect light", screen(np.float32(BRIGHTER) * indirect), f"{BRIGHTER:g} times as bright"),
+        ReportPicture("Share of indirect light", field),
+    )
+    return (("Direct and indirect light", text, pictures),)

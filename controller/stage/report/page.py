@@ -1,0 +1,146 @@
+"""report.html and report.json from what a run measured."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from controller.core.arrays import ByteImage
+from controller.core.lettering import font_file
+from controller.core.storage import write_atomically
+from controller.optics.solve.result.evaluation import as_rows
+from controller.stage.artefacts.names import REPORT_FIGURES, REPORT_PAGE
+from controller.stage.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
+
+
+@dataclass(frozen=True, slots=True)
+class ReportPicture:
+    """``large``: it holds small text, and wants more than a column of a strip. ``points``: a list below it."""
+
+    caption: str
+    image: ByteImage
+    note: str = ""
+    large: bool = False
+    points: tuple[str, ...] = ()
+
+
+Gallery = tuple[str, str, tuple[ReportPicture, ...]]
+"""A title, a text, and pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRow:
+    """One appearance on the page: a title, its figures in words, and its pictures from left to right."""
+
+    title: str
+    figures: tuple[tuple[str, str], ...]
+    pictures: tuple[ReportPicture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A figure with what was asked for; ``holds`` None where nothing was asked. ``note`` stands in small below it."""
+
+    name: str
+    value: str
+    goal: str = ""
+    holds: bool | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PageTable:
+    """Figures side by side: ``header`` and every row have one more column than what is compared."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    title: str
+    summary: str
+    goals: tuple[Goal, ...]
+    rows: tuple[PictureRow, ...]
+    galleries: tuple[Gallery, ...] = ()
+    steps: tuple[tuple[str, float], ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+    tables: tuple[PageTable, ...] = ()
+    troubles: tuple[str, ...] = ()
+
+
+def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
+    """What refining an appearance achieved, as a row of its figures; none where it was not refined."""
+    if figures is None or figures["before"] is None:
+        return ()
+    expected = " (expected)" if figures["expected"] else ""
+    count = len(figures["photographs"])
+    text = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}, {count} photograph{'s' * (count != 1)}"
+    return (("refined", text),)
+
+
+def judged_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """An appearance's error by sets of pixels, its ghosting, and the error of its adapted target, where known."""
+    rows = as_rows(figures["pixels"]) if figures["pixels"] is not None else []
+    if (ghost := figures["ghosting"]) is not None:
+        both = ghost["both"]
+        rows.append(("ghosting", f"correlation {both['correlation']:.2f}, {100 * both['share']:.1f} % of the pattern"))
+    if (adapted := figures["adapted"]) is not None:
+        rows.append(("adapted target, median / 95 %", f"{adapted['delta_e00_median']:.2f} / "
+                     f"{adapted['delta_e00_p95']:.2f}; {100 * adapted['reachable_share']:.1f} % in reach"))  # fmt: skip
+    return tuple(rows)
+
+
+def render(page: Page) -> str:
+    """The page as one self-contained HTML file; every text is escaped, since device names are hostile input."""
+    source = resources.files("controller.stage.report").joinpath("report.html").read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["uri"] = data_uri
+    environment.filters["commands"] = _commands
+    return environment.from_string(source).render(
+        page=page,
+        scale=scale_bar(),
+        typeface=_typeface(),
+        scale_top=ERROR_SCALE_DELTA_E,
+        slowest=max((s for _, s in page.steps), default=1.0),
+    )
+
+
+def _commands(text: str) -> list[tuple[str, bool]]:
+    """The parts of ``text``, and whether each is a command, which stands in backticks."""
+    parts = text.split("`")
+    return [(part, n % 2 == 1) for n, part in enumerate(parts)] if len(parts) % 2 else [(text, False)]
+
+
+def _typeface() -> str:
+    """The letters of the plots for the page, too; inside it, because a report is one file."""
+    font = font_file().read_bytes()
+    return f"data:font/ttf;base64,{base64.b64encode(font).decode()}"
+
+
+def write_report(folder: Path, page: Page, figures: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Write ``report.html`` and ``report.json`` (keys: docs/reference/report.md) into ``folder``; return both paths.
+
+    A figure that is no finite number becomes null: what could not be measured must not cost what could.
+    """
+    html, machine = folder / REPORT_PAGE, folder / REPORT_FIGURES
+    write_atomically(machine, (json.dumps(_finite(figures), indent=2, allow_nan=False) + "\n").encode())
+    write_atomically(html, render(page).encode())
+    return html, machine
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,205 @@
+"""Calibrate a stage and solve appearances, each as a run; for the command line and the kiosk."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from controller.bundle.install import current
+from controller.config.models import SolveTable
+from controller.optics.solve.appearance import BaseChoice
+from controller.optics.solve.engines.choice import choose_engine
+from controller.optics.solve.request import SolveOptions
+from controller.run.compiling import kernels_compiled
+from controller.run.journal import Journal
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Runner, Step
+from controller.run.state_machine import Event
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.grade import is_graded, passes
+from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
+from controller.stage.rig.ambient_light import dark_after
+from controller.stage.rig.rig import Rig
+from controller.stage.services.refine import Refinement, refine
+from controller.stage.sessions.calibrations import (
+    finished_calibrations,
+    output_sizes,
+    signing_key,
+    usable_calibration,
+    worst_grade,
+)
+from controller.stage.sessions.check import Checked, check_stage
+from controller.stage.sessions.run import LONGEST_RUN_S, marker
+from controller.stage.sessions.session import StageSession
+from controller.stage.steps import costs
+from controller.stage.steps.appearance.cluster_solve import answering_on
+from controller.stage.steps.appearance.publishing import publish_step
+from controller.stage.steps.appearance.rendering import scene_request
+from controller.stage.steps.appearance.requests import requests_of
+from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
+from controller.stage.steps.calibrate.dots import dot_steps
+from controller.stage.steps.calibrate.full import calibration_steps
+from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
+from controller.stage.steps.calibrate.grade import verify_step
+from controller.stage.steps.capture.device_checks import device_checks
+from controller.stage.steps.modes import DotOptions, dot_options
+from hal.deadline import in_seconds
+
+
+def calibrate(
+    *,
+    session: StageSession,
+    reporter: Reporter,
+    cancel: threading.Event,
+    mode: str = "fast",
+    dot_spacing: str | None = None,
+    photographs: str | None = None,
+    accept_grade: bool = False,
+) -> Mapping[str, Any]:
+    """Calibrate the stage, or continue an unfinished calibration; returns where the results are.
+
+    ``mode``, ``dot_spacing`` and their errors: see ``steps.modes.dot_options``. ``photographs``: which set, instead
+    of stage.toml's; its error: see ``photographs_named``.
+    """
+    options = dot_options(mode, dot_spacing)
+    chosen = None if photographs is None else photographs_named(photographs)
+    checked = check_stage(session.stage)
+    prior = checked.prior
+    last = next(iter(finished_calibrations(checked.stage.folder)), None)
+    taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
+    run = session.run(
+        checked,
+        lambda rig, run: calibrating(rig, run, checked=checked, options=options, photographs=taking),
+        name="calibrate",
+        reporter=reporter,
+        cancel=cancel,
+        dark=True,
+        before=lambda rig: device_checks(rig, prior),
+    )
+    report_grade(checked, run, last, reporter, accept_grade=accept_grade)
+    return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
+
+
+def calibrating(
+    rig: Rig,
+    run: Path,
+    *,
+    checked: Checked,
+    options: DotOptions | None = None,
+    photographs: PhotographOptions | None = None,
+    calibrated: Calibrated | None = None,
+) -> Sequence[Step]:
+    """The calibration's steps between their state markers; grading is the last.
+
+    ``photographs``: stage.toml's if omitted, without a calibration from before
+    ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
+    """
+    longest_s = checked.stage.tables.capture.longest_exposure_s
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    taking = photographs or PhotographOptions(checked.stage.tables.calibration.photographs)
+    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
+             *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
+    return [
+        marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
+        *steps,
+        verify_step(calibrated or Calibrated(run, checked.names), [step.id for step in steps], scale),
+        *dark_after(rig.ambient_limit, rig.display),
+        marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
+    ]
+
+
+def make_appearances(
+    *,
+    session: StageSession,
+    names: Sequence[str],
+    scenes: Sequence[str] = (),
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
+    base: str | None = None,
+    scheduler: str | None = None,
+    quick: bool = False,
+    refinement: Refinement | None = None,
+    device: str | None = None,
+) -> Mapping[str, Any]:
+    """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
+
+    ``scenes``: Blender scenes to render in addition to ``names``, or only these if no names are given.
+    ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
+    ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
+    the next run without it solves them as stage.toml says. ``refinement``: how photographs then correct them; None
+    keeps refined frames. ``device``: what solves, instead of stage.toml's.
+
+    Without a refinement it uses no device: the projectors may be off, or playing.
+    Raises what ``choose_engine``, ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
+    """
+    chosen = None if base is None else base_choice(base)
+    checked = check_stage(session.stage)
+    folder = checked.stage.folder
+    engine = choose_engine(checked.stage.tables.solve.device if device is None else device, reporter.say)
+    with session.locked():
+        run = usable_calibration(checked, reporter, accept_grade=accept_grade)
+        calibrated = Calibrated(run, checked.names, engine)
+        requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
+        requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
+        options = _options(checked.stage.tables.solve, chosen, quick=quick)
+        scale = costs.scale(size for _, size in output_sizes(checked).values())
+        with (
+            kernels_compiled(reporter) as compiled,
+            answering_on(scheduler, calibrated, requests) as answering,
+            Journal(run) as journal,
+        ):
+            steps = [
+                *compiled,
+                *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
+                gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
+                *solve_steps(calibrated, requests, options, (), scale, answering=answering),
+            ]
+            names = [request.name for request in requests]
+            publish = publishing(checked, calibrated, names)
+            whole = [*steps, publish] if refinement is None else steps
+            Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    refined: Mapping[str, Any] = {}
+    if refinement is not None:
+        titles = {request.name: request.title for request in requests}
+        refined = refine(session, checked, calibrated, titles, refinement, reporter=reporter, cancel=cancel)
+        with session.locked(), Journal(run) as journal:
+            Runner([publish], journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
+    return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
+
+
+def publishing(checked: Checked, calibrated: Calibrated, names: Sequence[str]) -> Step:
+    """The step that makes these appearances of the run of ``calibrated`` the stage's signed bundle."""
+    stage = checked.stage
+    return publish_step(
+        stage.folder,
+        output_sizes(checked),
+        names,
+        stage=stage.tables.stage.name,
+        calibration=calibrated.folder.name,
+        key=signing_key(checked),
+        calibrated=calibrated,
+    )
+
+
+def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> SolveOptions:
+    """``chosen``: the base image instead of the table's; ``quick``: base times scale alone."""
+    kept = base_choice(table.base)
+    if quick:
+        # a high-pass base would be solved again for each
+        return replace(options_of(table), mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
+    return replace(options_of(table), base=chosen or kept)
+
+
+def report_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:
+    """After a calibration: warn if it is worse than the previous one, or not good enough to publish."""
+    worst = worst_grade(checked)
+    compare_with_last(run, last, reporter)
+    if accept_grade:
+        accept(run, reporter, worst)
+    if not passes(run, worst):
+        error = below_grade(run, worst)
+        reporter.say(f"{error.what} {error.remedy}", Level.WARNING)

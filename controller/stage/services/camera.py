@@ -1,0 +1,106 @@
+"""``velatura camera``: the printed board, and the lens calibration from photographs of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from controller.core.arrays import ByteImage
+from controller.core.errors import CalibrationError, UsageError, WorkError
+from controller.core.files import read_picture_bytes
+from controller.core.storage import write_atomically
+from controller.optics.calibrate.camera.charuco import board_picture, calibrate_views, find_corners
+from controller.optics.calibrate.camera.exif import intrinsics_from_exif
+from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics, write_intrinsics
+from controller.optics.capture.raw import read_photograph
+from controller.run.progress import Level, Reporter
+
+PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+
+
+def board(*, out: Path) -> dict[str, Any]:
+    """Write the board as a PNG to print. Raises WorkError("no-space", "cannot-write")."""
+    picture = board_picture()
+    write_atomically(out, cv2.imencode(".png", picture)[1].tobytes())
+    return {"file": out, "width_px": picture.shape[1], "height_px": picture.shape[0]}
+
+
+def calibrate(*, photographs: Sequence[Path], out: Path, reporter: Reporter, cancel: threading.Event) -> dict[str, Any]:
+    """Compute the lens from board photographs; write it to ``out``; raises as ``calibrate_views``, ``read_grey``."""
+    views, size = [], None
+    for path in photographs:
+        if cancel.is_set():
+            raise WorkError("cancelled", what="The camera calibration was stopped.", remedy="Start it again.")
+        grey = read_grey(path)
+        if size is not None and size != grey.shape:
+            raise UsageError(
+                "camera-photographs-differ",
+                what=f"{path.name} has {grey.shape[1]} x {grey.shape[0]} pixels, the others {size[1]} x {size[0]}.",
+                remedy="Take all photographs with the same camera, orientation and format.",
+            )
+        size = grey.shape
+        view = find_corners(grey)
+        if view is None:
+            reporter.say(f"{path.name} does not show the board well enough. It is not used.", Level.WARNING)
+        else:
+            reporter.say(f"{path.name}: {len(view.board)} corners")
+            views.append(view)
+    if size is None or not views:
+        raise CalibrationError(
+            "camera-board-not-found",
+            what=f"The board was found in none of {len(photographs)} photographs.",
+            remedy="Print the board from `velatura camera board`, fill half of the picture with it, light it evenly.",
+        )
+    return _kept(calibrate_views(views, (size[1], size[0])), out)
+
+
+def from_exif(*, photograph: Path, out: Path) -> dict[str, Any]:
+    """Read the lens from a photograph's EXIF data and write it to ``out``. Raises as ``intrinsics_from_exif``."""
+    return _kept(intrinsics_from_exif(photograph), out)
+
+
+def read_grey(path: Path) -> ByteImage:
+    """A photograph with display gamma, (rows, columns) uint8. Raises WorkError("photograph-unreadable")."""
+    if path.suffix.lower() in PICTURES:
+        try:
+            data = np.frombuffer(read_picture_bytes(path), np.uint8)
+        except OSError as error:
+            raise _unreadable(path, error.strerror) from error
+        # the sensor's orientation, not EXIF's: the stage's pictures are not rotated either
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            grey = cv2.imdecode(data, flags) if data.size else None
+        except cv2.error:
+            grey = None
+        if grey is None:
+            raise _unreadable(path, "it could not be decoded")
+        return np.asarray(grey, dtype=np.uint8)
+    light = read_photograph(path).image.mean(axis=2)
+    bright = max(float(np.quantile(light, 0.98)), 1e-6)
+    return np.asarray(np.clip(255.0 * np.sqrt(np.clip(light / bright, 0, 1)), 0, 255), dtype=np.uint8)
+
+
+def _unreadable(path: Path, why: str | None) -> WorkError:
+    return WorkError(
+        "photograph-unreadable",
+        what=f"The photograph {path} can't be read: {why}.",
+        remedy="Give unedited JPEG, PNG, TIFF or RAW files from the camera.",
+    )
+
+
+def _kept(found: CameraIntrinsics, out: Path) -> dict[str, Any]:
+    write_intrinsics(out, found)
+    focal, cx, cy, k1 = found.sigmas
+    return {
+        "file": out,
+        "focal_length_px": f"{found.focal_px:.1f} +- {100 * focal:.2g} %",
+        "principal_point_px": f"{found.centre_px[0]:.1f} +- {cx:.1f}, {found.centre_px[1]:.1f} +- {cy:.1f}",
+        "distortion_k1": f"{found.k1:.4f} +- {k1:.2g}",
+        "rms_px": round(found.rms_px, 3),
+        "views": found.views,
+    }

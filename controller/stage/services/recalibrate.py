@@ -1,0 +1,141 @@
+"""Keeps a calibration up to date: the drift check, and recalibration of only what has changed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from controller.core.errors import UsageError
+from controller.run.journal import Journal
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.state_machine import Event
+from controller.run.step_id import StepId
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.drift import read_drift_figures
+from controller.stage.artefacts.grade import passes
+from controller.stage.artefacts.kinds import CALIBRATED, StepKind
+from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named
+from controller.stage.artefacts.projectors import mode_of
+from controller.stage.rig.ambient_light import dark_after
+from controller.stage.rig.rig import Rig
+from controller.stage.sessions.calibrations import finished_calibration, worst_grade
+from controller.stage.sessions.check import Checked, check_stage
+from controller.stage.sessions.run import marker
+from controller.stage.sessions.session import StageSession
+from controller.stage.steps.calibrate.dots import dot_steps
+from controller.stage.steps.calibrate.drift import drift_steps
+from controller.stage.steps.calibrate.full import calibration_steps
+from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
+from controller.stage.steps.calibrate.quick import quick_steps
+from controller.stage.steps.calibrate.single_projector import one_projector_steps
+from controller.stage.steps.modes import MODES, CalibrationMode, DotOptions
+
+CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
+"""The photographs of the previous check and of the grade."""
+
+
+def check_drift(
+    *, session: StageSession, details: bool, reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Photograph the stage N + 2 times and find what has changed since its calibration; ``details``: all figures.
+
+    Raises UsageError("not-calibrated"), and what the devices raise.
+    """
+    checked = check_stage(session.stage)
+    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
+
+    def steps(rig: Rig, _: Path) -> Sequence[Step]:
+        return drift_steps(rig, calibrated, longest_exposure_s=_longest_s(checked))
+
+    run = session.run(checked, steps, name="drift", reporter=reporter, cancel=cancel)
+    content = read_drift_figures(run)
+    for sentence in content["sentences"]:
+        reporter.say(sentence, Level.INFO if content["advice"] == "nothing" else Level.WARNING)
+    with Journal(run) as journal:
+        content["seconds"] = journal.steps()[StepId(StepKind.DRIFT_PHOTOGRAPHS)]
+    return {"run": str(run), **(content if details else {"advice": content["advice"]})}
+
+
+def recalibrate(
+    *,
+    session: StageSession,
+    reporter: Reporter,
+    cancel: threading.Event,
+    accept_grade: bool = False,
+    projector: str | None = None,
+    photographs: str | None = None,
+) -> Mapping[str, Any]:
+    """Bring the last calibration up to date, repeating only what has changed; continues an unfinished run.
+
+    ``photographs``: which set of what is photographed again, instead of stage.toml's; its error: ``photographs_named``.
+    ``projector``: measure only this one again, completely. The others get one photograph each, for the grade.
+    Raises UsageError("not-calibrated", "projector-unknown"), CalibrationError("projector-dark"),
+    CalibrationError("calibration-below-grade") for a result that may not replace the last calibration, and what the
+    devices raise.
+    """
+    chosen = None if photographs is None else photographs_named(photographs)
+    checked = check_stage(session.stage)
+    check_name(checked, projector)
+    last = finished_calibration(checked.stage.folder)
+    calibrated = Calibrated(last, checked.names)
+
+    def steps(rig: Rig, run: Path) -> Sequence[Step]:
+        longest_s = _longest_s(checked)
+        mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
+        taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
+        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
+                *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
+        if projector is None:
+            repeated = quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)
+        else:
+            repeated = one_projector_steps(rig, run, calibrated, full, projector, longest_exposure_s=longest_s)
+        return [
+            marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
+            *repeated,
+            *dark_after(rig.ambient_limit, rig.display),
+            _take_over_step(worst_grade(checked), reporter, accept_grade=accept_grade),
+            marker("recalibrated", "Recalibrated", leave=Event.CALIBRATED),
+        ]
+
+    name = "recalibrate" if projector is None else "projector"
+    run = session.run(checked, steps, name=name, reporter=reporter, cancel=cancel, dark=True)
+    compare_with_last(run, last, reporter)
+    if not passes(run, worst_grade(checked)):
+        raise below_grade(run, worst_grade(checked))
+    advice = "projector" if projector is not None else read_drift_figures(run)["advice"]
+    return {"run": str(run), **grade_figures(run), "advice": advice, **_effort(run)}
+
+
+def _effort(run: Path) -> dict[str, float]:
+    """How many photographs were taken, and the seconds of the check and of the grade."""
+    with Journal(run) as journal:
+        seconds = sum(value for step, value in journal.steps().items() if step.kind in CHECKS)
+        return {"photographs": journal.shot_count(), "check_and_grade_seconds": seconds}
+
+
+def check_name(checked: Checked, projector: str | None) -> None:
+    """Raises UsageError("projector-unknown"), before a lamp is struck."""
+    if projector is not None and projector not in checked.names:
+        raise UsageError("projector-unknown", what=f"The stage has no projector {projector[:64]!r}.",
+                         remedy=f"Choose one of {', '.join(checked.names)}.")  # fmt: skip
+
+
+def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> Step:
+    """Only a result with a sufficient grade counts as finished and replaces the last calibration."""
+
+    def run(context: Context) -> Sequence[Path]:
+        if accept_grade:
+            accept(context.folder, reporter, worst)
+        if passes(context.folder, worst):
+            context.journal.complete(CALIBRATED, {}, (), began_at_s=time.time())
+        return ()
+
+    return Step(StepId("take-over"), run, title="Comparing the grade with the limit", weight=0.01, always=True)
+
+
+def _longest_s(checked: Checked) -> float:
+    return checked.stage.tables.capture.longest_exposure_s

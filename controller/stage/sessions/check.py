@@ -1,0 +1,133 @@
+"""Checks every key of stage.toml, including the drivers' keys, before a device is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from controller.config import Stage, check_driver_settings, load_stage
+from controller.config.models import CameraTable, OpenConfigTable
+from controller.core.errors import UsageError
+from controller.core.extras import extra_missing
+from hal.errors import DeviceError, DriverFault, PluginError
+from hal.registry import Driver, Drivers, OpenContext, check_device, load_drivers
+
+if TYPE_CHECKING:
+    from controller.optics.calibrate.geometry.values import CameraPrior
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A completely checked stage; no device is opened yet.
+
+    ``faults``: drivers that failed to check their settings. Their devices may still open. ``dousers``: of each
+    projector.
+    """
+
+    stage: Stage
+    drivers: Drivers
+    projectors: tuple[tuple[Driver, dict[str, Any]], ...]
+    camera: tuple[Driver, dict[str, Any]]
+    display: tuple[Driver, dict[str, Any]]
+    relays: tuple[tuple[Driver, dict[str, Any]], ...] = ()
+    light_sensor: tuple[Driver, dict[str, Any]] | None = None
+    key_panel: tuple[Driver, dict[str, Any]] | None = None
+    faults: tuple[DriverFault, ...] = ()
+    dousers: tuple[tuple[Driver, dict[str, Any]] | None, ...] = ()
+
+    @property
+    def prior(self) -> CameraPrior:
+        """The camera's values from stage.toml and from measurements on the stage.
+
+        Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
+        """
+        from controller.optics.calibrate.camera.intrinsics import read_intrinsics
+        from controller.optics.calibrate.geometry.metric_scale import MeasuredDistance
+        from controller.optics.calibrate.geometry.values import CameraPrior
+
+        table: CameraTable = self.stage.tables.camera
+        measured = self.stage.tables.object.distances
+        distances = tuple(MeasuredDistance(d.from_px, d.to_px, d.distance_m, d.sigma_m) for d in measured)
+        if table.intrinsics is not None:
+            return read_intrinsics(self.stage.path(table.intrinsics)).prior(
+                distance_m=table.distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
+            )
+        if table.focal_length_px is None:
+            allowed = "a number above 0, or intrinsics with a file from `velatura camera calibrate`"
+            raise table.place.missing("focal_length_px", allowed, written=[])
+        return CameraPrior(
+            focal_length_px=table.focal_length_px,
+            focal_length_rel_sigma=table.focal_length_rel_sigma,
+            distance_m=table.distance_m,
+            distance_rel_sigma=table.distance_rel_sigma,
+            distances=distances,
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The projectors' names in stage order."""
+        return tuple(table.name for table in self.stage.tables.projectors)
+
+
+def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path | None = None) -> Checked:
+    """Read stage.toml and check every key, including the drivers' keys; opens no device.
+
+    ``instead``: the file that is read in the place of stage.toml.
+
+    Raises UsageError (see ``controller.config.load_stage``) and PluginError("driver-unknown").
+    """
+    stage = load_stage(folder, instead=instead)
+    drivers = drivers or load_drivers(benches=False)
+    tables = stage.tables
+
+    faults: list[DriverFault] = []
+
+    def checked(kind: str, table: OpenConfigTable, name: str) -> tuple[Driver, dict[str, Any]]:
+        try:
+            driver = drivers.get(kind, name)
+        except PluginError as error:
+            missing = extra_missing(drivers.missing_for(name))
+            if missing is not None:
+                raise missing from error
+            names = ", ".join(driver.name for driver in drivers.list if driver.kind == kind) or "none is installed"
+            raise table.place.wrong_value("driver", name, f"is not a {kind} driver", f"one of {names}") from error
+        settings = check_driver_settings(table, driver)
+        try:
+            name = str(getattr(table, "name", ""))
+            check_device(driver, settings, OpenContext(stage=stage.folder), name=name)
+        except DriverFault as error:
+            faults.append(error)
+        except DeviceError as error:
+            raise mistake_in(table, settings, error) from error
+        return driver, settings
+
+    return Checked(
+        stage=stage,
+        drivers=drivers,
+        projectors=tuple(checked("projector", table, table.driver) for table in tables.projectors),
+        camera=checked("camera", tables.camera, tables.camera.driver),
+        display=checked("display", tables.display, tables.display.driver),
+        relays=tuple(checked("power_switch", table, table.driver) for table in tables.relays),
+        light_sensor=(
+            None if tables.light_sensor is None
+            else checked("light_sensor", tables.light_sensor, tables.light_sensor.driver)
+        ),
+        key_panel=(
+            None if tables.key_panel is None else checked("button_panel", tables.key_panel, tables.key_panel.driver)
+        ),
+        dousers=tuple(
+            None if table.douser is None else checked("douser", table.douser, table.douser.driver)
+            for table in tables.projectors
+        ),
+        faults=tuple(faults),
+    )  # fmt: skip
+
+
+def mistake_in(table: OpenConfigTable, settings: Mapping[str, Any], error: DeviceError) -> UsageError:
+    """Turn a driver's error about its settings into an error with the line in stage.toml."""
+    place = table.place
+    named = (key for key, value in settings.items() if f"'{key}'" in error.what or f"'{value}'" in error.what)
+    line = place.line(next(named, None))
+    return UsageError(error.code, what=f"{place.file}, line {line}: {error.what}", remedy=error.remedy)

@@ -1,0 +1,151 @@
+"""Gives services a stage's lock and devices while they work on the stage."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from controller.core.storage import clear_unfinished_writes
+from controller.run.compiling import kernels_compiled
+from controller.run.journal import Journal
+from controller.run.progress import Reporter
+from controller.run.runner import Runner, Step
+from controller.run.state_machine import Machine
+from controller.stage.rig.ambient_light import dark_before
+from controller.stage.rig.lamp_session import lit, power_steps
+from controller.stage.rig.rig import Rig
+from controller.stage.sessions.check import Checked
+from controller.stage.sessions.open import opened
+from controller.stage.sessions.run import LONGEST_RUN_S, stage_lock, unfinished_run
+from hal.deadline import in_seconds
+
+MakeSteps = Callable[[Rig, Path], Sequence[Step]]
+"""The steps of a run on the opened stage; the path is the run's folder."""
+
+
+class StageSession(ABC):
+    """Work on one stage. ``stage``: its folder, which holds stage.toml."""
+
+    stage: Path
+
+    @abstractmethod
+    def locked(self) -> contextlib.AbstractContextManager[None]:
+        """For work without devices: inside, no other program works on the stage.
+
+        Raises UsageError("already-running").
+        """
+
+    @abstractmethod
+    def run(
+        self,
+        checked: Checked,
+        make_steps: MakeSteps,
+        *,
+        name: str,
+        reporter: Reporter,
+        cancel: threading.Event,
+        dark: bool = False,
+        plays: bool = False,
+        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
+    ) -> Path:
+        """Run the steps of a new or unfinished run of this name with the lamps on; the run's folder.
+
+        Those that need no stable light are done while lamps become stable, where it is the session that strikes them.
+
+        ``checked``: the session's stage; ``dark``: refuse a bright room, if the stage has a light sensor;
+        ``plays``: as in ``stage.open.opened``; ``before``: steps before the lamps are struck, if they are not lit yet.
+        Raises what the steps raise; UsageError("already-running") if another program works on the stage.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSession(StageSession):
+    """For each run: takes the stage's lock, opens its devices, strikes its lamps, and leaves the lamps safe.
+
+    ``around`` is entered before the devices are opened and left when they are closed
+    ``again``: continue a finished run of the name, too; its finished steps are not repeated
+    """
+
+    stage: Path
+    around: contextlib.AbstractContextManager[object] | None = None
+    again: bool = False
+
+    def locked(self) -> contextlib.AbstractContextManager[None]:
+        """See ``StageSession``."""
+        return stage_lock(self.stage)
+
+    def run(
+        self,
+        checked: Checked,
+        make_steps: MakeSteps,
+        *,
+        name: str,
+        reporter: Reporter,
+        cancel: threading.Event,
+        dark: bool = False,
+        plays: bool = False,
+        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
+    ) -> Path:
+        """See ``StageSession``."""
+        stage = checked.stage
+        deadline = in_seconds(LONGEST_RUN_S, cancel)
+        safety = stage.tables.safety
+        with (
+            stage_lock(stage.folder),
+            kernels_compiled(reporter) as compiled,
+            self.around or contextlib.nullcontext(),
+            opened(checked, deadline=deadline, plays=plays) as rig,
+            Journal(unfinished_run(stage.folder, name, finished=self.again)) as journal,
+        ):
+            clear_unfinished_writes(journal.folder)
+            machine = Machine(journal.record_change)
+            first = dark_before(rig.ambient_limit) if dark else []
+            made = make_steps(rig, journal.folder)
+            unsteady = [step for step in made if step.unsteady]
+            power = power_steps(rig, power_up_s=safety.power_up_s, early=[*compiled, *unsteady] if unsteady else ())
+            rest = [*(() if unsteady else compiled), *(step for step in made if not step.unsteady)]
+            steps = [*first, *before(rig), *power, *rest]
+            with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
+                Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
+            return journal.folder
+
+
+@dataclass(frozen=True, slots=True)
+class BorrowedSession(StageSession):
+    """Uses the kiosk's lock and its lit ``rig``; ``rig`` is None for work without devices.
+
+    The lamps stay lit, and the state machine is the kiosk's.
+    """
+
+    stage: Path
+    rig: Rig | None = None
+
+    def locked(self) -> contextlib.AbstractContextManager[None]:
+        """See ``StageSession``; the kiosk has the lock already."""
+        return contextlib.nullcontext()
+
+    def run(
+        self,
+        checked: Checked,
+        make_steps: MakeSteps,
+        *,
+        name: str,
+        reporter: Reporter,
+        cancel: threading.Event,
+        dark: bool = False,
+        plays: bool = False,
+        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
+    ) -> Path:
+        """See ``StageSession``. Raises ValueError without a rig."""
+        if self.rig is None:
+            raise ValueError("this session has no devices")
+        with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, name)) as journal:
+            clear_unfinished_writes(journal.folder)
+            first = dark_before(self.rig.ambient_limit) if dark else []
+            steps = [*first, *compiled, *make_steps(self.rig, journal.folder)]
+            Runner(steps, journal, reporter=reporter).run(name, deadline=in_seconds(LONGEST_RUN_S, cancel))
+            return journal.folder

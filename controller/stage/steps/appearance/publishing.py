@@ -1,0 +1,225 @@
+"""The step from solved frames to a signed, installed bundle."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from controller.bundle.format import Index, PlaylistEntry
+from controller.bundle.install import current, install, revision_floor
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import ANY_SIGNER, Trust, load_signing_key, unsigned_warning
+from controller.bundle.writer import NewAppearance, write_bundle
+from controller.config import load_stage
+from controller.config.loader import FILE
+from controller.core.errors import BundleError
+from controller.core.storage import sha256_of
+from controller.run.progress import Level, Reporter
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.published import BUNDLE, BundleFigures
+from controller.stage.artefacts.solved import is_solved, read_solved
+
+METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
+"""Figures of the solve that a bundle contains; all are the same in a repeated solve."""
+SHOWN_MS = (15_000, 1_000)
+"""Show and fade times in the bundle's playlist for appearances without times in stage.toml."""
+
+
+Outputs = Mapping[str, tuple[str, tuple[int, int]]]
+"""Output name and (width, height) by projector name."""
+
+
+def publish_step(
+    stage_folder: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    *,
+    stage: str,
+    calibration: str,
+    key: Path | None,
+    after: Sequence[StepId] = (),
+    calibrated: Calibrated | None = None,
+) -> Step:
+    """Write, sign and install the bundle of these appearances; the artefacts are the bundle and its figures.
+
+    The bundle also holds other appearances solved on the calibration: see ``kept_names``. Publishing is cheap, and the
+    content depends on more than its own steps, so every run repeats it; unchanged content gives the same bytes.
+
+    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle; ``after``: the steps
+    of this run that make the frames; ``calibrated``: what reads the run, where the caller needs it too
+    """
+    return Step(
+        StepId(StepKind.PUBLISH),
+        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key, calibrated),
+        inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
+        after=tuple(after),
+        title="Publishing the signed bundle",
+        weight=1,
+        always=True,
+    )
+
+
+def _publish(
+    folder: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    identity: tuple[str, str],
+    key: Path | None,
+    calibrated: Calibrated | None,
+    context: Context,
+) -> Sequence[Path]:
+    built, slots = context.folder / BUNDLE, folder / "bundles"
+    names = kept_names(folder, context.folder, names)
+    _report_dropped(slots, names, context.reporter)
+    trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    if (warning := unsigned_warning(trusted[0] if trusted else None, Trust(trusted, not trusted))) is not None:
+        context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
+    index = publish_solved(
+        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
+        live=_holds_live(slots), hints_ms=hints_ms(folder), calibrated=calibrated,
+    )  # fmt: skip
+    installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
+    raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
+    stored = sum(
+        blob.length for appearance in index.appearances for blobs in appearance.bands.values() for blob in blobs
+    )
+    figures = BundleFigures(built.stat().st_size, raw / stored, installed.name, names)
+    return [figures.write(context.folder), built]
+
+
+def _report_dropped(slots: Path, names: Sequence[str], reporter: Reporter) -> None:
+    """Report appearances of the installed bundle that the new one lacks, because they have another calibration."""
+    dropped = [
+        appearance.name
+        for index in _installed(slots)
+        for appearance in index.appearances
+        if appearance.name not in names
+    ]
+    if dropped:
+        several = len(dropped) > 1
+        reporter.say(
+            f"The bundle no longer holds {', '.join(dropped)}: {'they were' if several else 'it was'} made for an"
+            f" earlier calibration. `velatura appearance STAGE` makes {'them' if several else 'it'} again.",
+            Level.WARNING,
+        )
+
+
+def kept_names(stage_folder: Path, run: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """``names``, and other appearances solved in ``run`` that stage.toml or the installed bundle names.
+
+    In stage.toml's order, then as installed, then as given. Appearances of another calibration are dropped: their
+    frames do not fit.
+    """
+    listed = []
+    if (stage_folder / FILE).exists():
+        listed += [table.name for table in load_stage(stage_folder).tables.appearances]
+    listed += [appearance.name for index in _installed(stage_folder / "bundles") for appearance in index.appearances]
+    solved = [name for name in listed if name in names or is_solved(run, name)]
+    return tuple(dict.fromkeys([*solved, *names]))
+
+
+def hints_ms(stage_folder: Path) -> dict[str, tuple[int, int]]:
+    """(shown, fade) in milliseconds of each appearance of the stage.toml in this folder; empty if there is none."""
+    if not (stage_folder / FILE).exists():
+        return {}
+    return {table.name: table.hint_ms for table in load_stage(stage_folder).tables.appearances}
+
+
+def _installed(slots: Path) -> list[Index]:
+    """The names in the current bundle of the folder ``slots``; empty if none can be read."""
+    file = current(slots)
+    with contextlib.suppress(BundleError):
+        if file is not None:
+            with Bundle.open_trusted(file, ANY_SIGNER) as bundle:
+                return [bundle.index]
+    return []
+
+
+def _holds_live(slots: Path) -> bool:
+    return any(index.live is not None for index in _installed(slots))
+
+
+def publish_solved(
+    path: Path,
+    run: Path,
+    outputs: Outputs,
+    names: Sequence[str],
+    *,
+    stage: str,
+    calibration: str,
+    key: Path | None,
+    slots: Path,
+    trust: Trust = ANY_SIGNER,
+    live: bool = False,
+    hints_ms: Mapping[str, tuple[int, int]] | None = None,
+    check: Callable[[], None] = lambda: None,
+    calibrated: Calibrated | None = None,
+) -> Index:
+    """Write the solved appearances of the folder ``run`` to a bundle at ``path``, signed with the key file.
+
+    If the folder ``slots`` has the same bundle installed, the file is identical to it. Otherwise its revision is
+    one above those installed bundles that ``trust`` accepts. ``live``: include the live-mode data.
+    ``hints_ms``: (shown, fade) by name for the bundle's playlist, else ``SHOWN_MS``.
+    ``check`` is called before each appearance and may raise to stop the work. ``calibrated``: what reads ``run``, else
+    it is read here where a thumbnail is missing.
+    Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then unchanged or intact.
+    """
+    from controller.stage.steps.appearance.live_parts import live_arrays
+
+    arrays = live_arrays(run, outputs) if live else None
+
+    def write(revision: int) -> Index:
+        return write_bundle(
+            path,
+            stage=stage,
+            calibration=calibration,
+            created_unix_s=created_unix_s(run),
+            outputs=[(output, *size) for output, size in outputs.values()],
+            appearances=_appearances(calibrated or Calibrated(run, tuple(outputs)), outputs, names, check),
+            key=None if key is None else load_signing_key(key),
+            revision=revision,
+            schedule=[PlaylistEntry(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
+            live=arrays,
+        )
+
+    floor = revision_floor(slots, trust)
+    if floor >= 0:
+        index = write(floor)
+        if (slots / f"{sha256_of(path)}.vel").exists():
+            return index
+    return write(floor + 1)
+
+
+def _appearances(
+    calibrated: Calibrated, outputs: Outputs, names: Sequence[str], check: Callable[[], None]
+) -> Iterator[NewAppearance]:
+    from controller.stage.steps.appearance.thumbnails import Thumbnails
+
+    thumbnails = Thumbnails(calibrated)
+    for name in names:
+        check()
+        solved = read_solved(calibrated.folder, name, tuple(outputs))
+        frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
+        metadata = {key: solved.figures[key] for key in METADATA if key in solved.figures}
+        yield NewAppearance(name, frames, thumbnails.of(name), metadata)
+
+
+def created_unix_s(run: Path) -> int:
+    """Start time of the calibration in the folder ``run``, so that publishing again gives the same bytes.
+
+    The environment's SOURCE_DATE_EPOCH takes precedence; 0 if neither is known.
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if given.isascii() and given.isdigit() and int(given) <= 2**53:
+        return int(given)
+    try:
+        return max(0, int(time.mktime(time.strptime(run.name[:15], "%Y%m%d-%H%M%S"))))
+    except (ValueError, OverflowError):
+        return 0

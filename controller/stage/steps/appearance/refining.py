@@ -1,0 +1,295 @@
+"""The steps that photograph solved frames, correct them by the photograph, and keep the better ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask, summed
+from controller.optics.capture.brackets import merge_brackets
+from controller.optics.capture.profile import load_profile
+from controller.optics.solve.memory_need import check_memory, refine_peak_bytes, stage_size
+from controller.optics.solve.result.common_causes import equations
+from controller.optics.solve.result.refinement import (
+    ModelError,
+    PhotographedError,
+    RefinedStage,
+    ResultPhotograph,
+    corrected_target,
+    gain,
+    model_error,
+    photographed_error,
+    refusal,
+    solve_again,
+    trusted_pixels,
+    without_flicker,
+)
+from controller.run.progress import Level
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.camera import inherit_camera
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.projectors import IndirectFigures
+from controller.stage.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
+from controller.stage.rig.rig import Rig
+from controller.stage.steps import costs
+from controller.stage.steps.appearance.causes import causes_step
+from controller.stage.steps.appearance.exposure_times import brightest, speeds
+from controller.stage.steps.appearance.photographing import take_bracket
+from controller.stage.steps.appearance.solving import device_frames
+from controller.stage.steps.capture.photographs import frames_digest
+from hal.runtime.memory import free_bytes
+
+WORSE: Final = "the last correction was no better"
+ENOUGH: Final = "the rest is noise"
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOptions:
+    """``photographs``: at most so many of results, 0 to 9; ``smoothness`` of eq. 3; ``longest_exposure_s``."""
+
+    photographs: int
+    smoothness: float
+    longest_exposure_s: float
+
+    def inputs(self) -> dict[str, str]:
+        """What a correction depends on, as the journal compares it."""
+        return {"smoothness": repr(self.smoothness), "longest_exposure_s": repr(self.longest_exposure_s)}
+
+
+def refine_steps(
+    rig: Rig,
+    calibrated: Calibrated,
+    titles: Mapping[str, str],
+    options: RefineOptions,
+    *,
+    after: Mapping[str, StepId] | None = None,
+) -> list[Step]:
+    """The steps for these appearances, title by name, that are solved on ``calibrated``; none for 0 photographs.
+
+    ``after``: the step of the same run that solves each; None where they were solved before. Then what was photographed
+    on another day is not continued.
+    """
+    scale = costs.scale(projector.size_px for projector in rig.projectors)
+    steps: list[Step] = []
+    last: list[StepId] = []
+    for name, title in titles.items() if options.photographs else ():
+        before = (after[name],) if after is not None else ()
+        inputs = {"calibration": calibrated.folder.name, **options.inputs()}
+        if after is None:
+            inputs |= {"day": time.strftime("%Y-%m-%d"), "solved": solving_digest(calibrated.folder, name)}
+        for number in range(1, options.photographs + 1):
+            one = StepId(StepKind.REFINE, item=f"{number}-{name}")
+            steps.append(
+                Step(
+                    one,
+                    partial(_refine, rig, calibrated, name, number, options),
+                    inputs=inputs,
+                    after=before,
+                    title=f"Refining {title}, photograph {number}",
+                    weight=3 * costs.shot_s(scale) + costs.APPEARANCE_S * scale,
+                )
+            )
+            before = (one,)
+        last += before
+        steps.append(
+            Step(
+                StepId(StepKind.REFINED, item=name),
+                partial(_keep, calibrated, name, options.photographs),
+                inputs=inputs,
+                after=before,
+                title=f"Keeping the better frames of {title}",
+                weight=0.2,
+            )
+        )
+    if len(last) > 1:
+        steps.append(causes_step(calibrated, tuple(titles), options.photographs, after=last))
+    return steps
+
+
+def _refine(
+    rig: Rig, calibrated: Calibrated, name: str, number: int, options: RefineOptions, context: Context
+) -> Sequence[Path]:
+    if number == 1:
+        need = refine_peak_bytes(stage_size(calibrated.calibration))
+        context.reporter.say(check_memory(need, free_bytes(), f"Refining {name}"))
+    solved = read_solved(calibrated.folder, name, calibrated.projectors)
+    before = _before(context.folder, solved, calibrated, name, number)
+    if not before.ended:
+        before = _Round(rig, calibrated, solved, name, options, context).after(before, number)
+    return before.write(context.folder, name, number)
+
+
+def _before(folder: Path, solved: Solved, calibrated: Calibrated, name: str, number: int) -> Refining:
+    if number == 1:
+        return Refining(solved.linear, None, None)
+    return Refining.read(folder, name, number - 1, calibrated.projectors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One photograph of an appearance, and what follows from it."""
+
+    rig: Rig
+    calibrated: Calibrated
+    solved: Solved
+    name: str
+    options: RefineOptions
+    context: Context
+
+    def after(self, now: Refining, number: int) -> Refining:
+        """Photograph ``now.frames``; judge them, and correct them."""
+        predicted = self._predicted(now.frames)
+        mask = self.solved.reachable & self.calibrated.calibration.object_mask
+        light = predicted[mask] if mask.any() else predicted.reshape(-1, 3)
+        photograph = self._photographed(now.frames, light, number)
+        trusted = trusted_pixels(photograph, predicted, self._stage, mask)
+        refused = refusal(photograph, predicted, self._stage, mask, trusted)
+        if refused is not None:
+            self.context.reporter.say(f"A photograph of {self.name} was not used: {refused}.", Level.WARNING)
+            return replace(now, photographs=(*now.photographs, {"refused": refused}))
+        said = self._equations(now, photograph, predicted, trusted)
+        parts = self._parts(now.frames)
+        photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
+        found = self._error(photograph.radiance, trusted)
+        row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
+               "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
+        rows = (*now.photographs, row)
+        if now.best is not None and now.error is not None:
+            better = gain(now.error, found.map)
+            if better.mean <= 0:
+                return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
+            if not better.worth_it:
+                return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
+        seen, error = model_error(photograph, predicted, trusted), found.map
+        if now.seen is not None:
+            seen = now.seen.then(seen)
+            error = self._error(predicted + seen.light, seen.known).map
+        kept = seen if number < self.options.photographs else None
+        judged = Refining(now.frames, now.frames, found.map, rows, equations=said, seen=kept)
+        return self._corrected(judged, seen, error, predicted)
+
+    def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
+        """What this photograph and those before it say of common causes."""
+        frames = self._in_order(now.frames)
+        error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
+        said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
+        return said if now.equations is None else said + now.equations
+
+    def _corrected(self, now: Refining, seen: ModelError, error: FloatImage, predicted: FloatImage) -> Refining:
+        """With frames of a corrected target, if the transport says that these are worth it; ``error`` as ``seen``."""
+        self.context.advance(0.4, "solving again")
+        transport, black = self.calibrated.transport, self.calibrated.calibration.black
+        aimed = corrected_target(self.solved.target, seen, self._stage)
+        indirect = predicted - black - transport.forward(self._in_order(now.frames))
+        frames = solve_again(
+            transport,
+            self.solved.target - indirect,
+            aimed - indirect,
+            black,
+            self._in_order(now.frames),
+            exposure=self.solved.exposure,
+            smoothness=self.options.smoothness,
+            drive=self.calibrated.drive,
+            engine=self.calibrated.engine,
+            progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
+        )
+        new = dict(zip(self.calibrated.projectors, frames, strict=True))
+        expected = self._error(self._predicted(new) + seen.light, seen.known)
+        if not gain(error, expected.map).worth_it:
+            return replace(now, ended=ENOUGH)
+        row = {**now.photographs[-1], "expected_median": expected.median}
+        return replace(now, frames=new, photographs=(*now.photographs[:-1], row))
+
+    @property
+    def _stage(self) -> RefinedStage:
+        calibration = self.calibrated.calibration
+        white = summed([part.white for part in calibration.projectors])
+        indirect = [part.indirect for part in calibration.projectors if part.indirect is not None]
+        white = white + np.sum(indirect, axis=0, dtype=np.float32)
+        return RefinedStage(calibration.black, np.maximum(white, 0))
+
+    @property
+    def _flicker(self) -> list[float]:
+        known = [IndirectFigures.read(self.calibrated.folder, name) for name in self.calibrated.projectors]
+        return [0.0 if one is None else one.flicker for one in known]
+
+    def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
+        matrix = self.calibrated.calibration.camera_to_xyz
+        return photographed_error(radiance, self.solved.target, matrix, self.solved.exposure, mask)
+
+    def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
+        light = self.calibrated.predicted_light(self._in_order(frames))
+        return np.asarray(light + self.calibrated.calibration.black, np.float32)
+
+    def _parts(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
+        """The light of each projector in ``_predicted``."""
+        transport, indirect = self.calibrated.transport, self.calibrated.indirect
+        direct = [transport.forward_part(n, frame) for n, frame in enumerate(self._in_order(frames))]
+        return direct if indirect is None else [one + indirect.forward(one) for one in direct]
+
+    def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
+        return [frames[projector] for projector in self.calibrated.projectors]
+
+    def _photographed(self, frames: Mapping[str, FloatImage], light: FloatImage, number: int) -> ResultPhotograph:
+        if self.context.folder != self.calibrated.folder:
+            inherit_camera(self.calibrated.folder, self.context.folder)
+        shown = device_frames(self.calibrated.calibration, self._in_order(frames))
+        presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
+        available_s, profile = self.rig.acquirer.exposures_s(), load_profile(self.context.folder)
+        longest_s = self.options.longest_exposure_s
+        wanted_s = speeds(brightest(light), available_s, longest_s, profile, light=light, shorter=2)
+        taken = take_bracket(
+            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", (*wanted_s, wanted_s[0]),
+            shown_at_s=presented_s, of={"frames": frames_digest(shown)},
+        )  # fmt: skip
+        exposures_s = [one.exposure_s for one in taken]
+        images = [one.measured() for one in taken]
+        noise = taken[0].profile.noise if taken[0].profile is not None else None
+        merged = merge_brackets(images, exposures_s, noise=noise)
+        first, last = (images[n] / np.float32(exposures_s[n]) for n in (0, -1))
+        return ResultPhotograph(merged.radiance, merged.sigma, first, last)
+
+
+def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context) -> Sequence[Path]:
+    found = Refining.read(context.folder, name, photographs, calibrated.projectors)
+    figures = _figures(found, photographs)
+    linear = [found.frames[projector] for projector in calibrated.projectors]
+    frames = device_frames(calibrated.calibration, linear)
+    context.reporter.say(sentence(name, figures), Level.INFO if figures["before"] is not None else Level.WARNING)
+    return write_refined(calibrated.folder, name, frames, found.frames, figures)
+
+
+def _figures(found: Refining, asked: int) -> dict[str, Any]:
+    """What is reported: ``before`` and ``after``, medians of CIEDE2000; the latter is ``expected`` or photographed."""
+    counted = [row for row in found.photographs if "refused" not in row]
+    kept = [row for row in counted if row.get("kept", True)]
+    before = kept[0]["delta_e00_median"] if kept else None
+    last = kept[-1] if kept else {}
+    expected = "expected_median" in last and not found.ended
+    after = last.get("expected_median" if expected else "delta_e00_median")
+    return {"asked": asked, "before": before, "after": after, "expected": expected, "ended": found.ended,
+            "photographs": list(found.photographs)}  # fmt: skip
+
+
+def sentence(name: str, figures: Mapping[str, Any]) -> str:
+    """What was achieved, in one line."""
+    count = len(figures["photographs"])
+    photographs = f"{count} photograph{'s' * (count != 1)}"
+    if figures["before"] is None:
+        return f"{name} was not refined: no photograph could be used ({photographs})."
+    if len(figures["photographs"]) == 1 and figures["ended"]:
+        return f"{name} needed no refinement: {figures['before']:.2f} (CIEDE2000 median), {photographs}."
+    before, after = f"{figures['before']:.2f}", f"{figures['after']:.2f}"
+    expected = "an expected " if figures["expected"] else ""
+    return f"Refined {name}: {before} to {expected}{after} (CIEDE2000 median) with {photographs}."
+
+
+__all__ = ["RefineOptions", "refine_steps", "sentence"]

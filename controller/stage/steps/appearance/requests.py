@@ -1,0 +1,162 @@
+"""From the [[appearances]] of stage.toml to target pictures on the calibrated object."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from controller.config import Stage
+from controller.config.arguments import allowed, checked_arguments
+from controller.config.models import AppearanceTable
+from controller.core.arrays import FloatImage
+from controller.core.errors import UsageError
+from controller.core.storage import sha256_of
+from controller.optics.solve.targets.colour import ColourSpace
+from controller.optics.solve.targets.files import check_picture, load_target, read_picture
+from controller.optics.solve.targets.patterns import Colour, checkerboard, replace_pattern
+from controller.optics.solve.targets.pieces import in_box, on_each
+from controller.optics.solve.targets.relight import gloss, recolour
+from controller.optics.solve.targets.values import Target, through_camera
+from controller.optics.solve.targets.wrap import wrap_photograph
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.steps.appearance.rendering import blender_request
+from controller.stage.steps.appearance.solving import AppearanceRequest
+
+TITLES: Mapping[str, str] = {
+    "photograph": "A photograph wrapped around the object",
+    "pattern": "Another pattern instead of the object's own",
+    "checkerboard": "A checkerboard",
+    "gloss": "A gloss",
+    "recolour": "Recoloured",
+    "picture": "A picture as seen from the camera",
+    "blender": "Rendered by Blender",
+}
+"""Title of every kind of appearance."""
+
+NEEDS_FILE = ("photograph", "picture")
+
+
+def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[AppearanceRequest]:
+    """The appearances of stage.toml with these names, or all, checked before anything is solved.
+
+    Raises UsageError with code "appearance-unknown", "stage-key-value" or "stage-key-unknown" (with the line), and
+    "target-missing" for a missing file.
+    """
+    tables = {table.name: table for table in stage.tables.appearances}
+    unknown = [name for name in names if name not in tables]
+    if unknown or not tables:
+        raise UsageError(
+            "appearance-unknown",
+            what=f"stage.toml has no appearance {unknown[0]!r}." if unknown else "stage.toml has no [[appearances]].",
+            remedy=f"Available: {', '.join(tables)}."
+            if tables
+            else 'Add one with name and kind, for example kind = "gloss".',
+        )
+    return [_request(stage, tables[name], calibrated) for name in (names or tables)]
+
+
+def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> AppearanceRequest:
+    if table.kind not in TITLES:
+        raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
+    _ = table.hint_ms  # report its errors before an hour of solving
+    wanted = _options(table.kind)
+    required = ("tint",) if table.kind == "recolour" else ()
+    settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)
+    options = checked_arguments(table.place, settings, wanted)
+    file = None if table.file is None else stage.path(table.file)
+    if table.kind in NEEDS_FILE and file is None:
+        raise table.place.missing("file", "a picture file, relative to the stage's folder", written=settings)
+    if file is not None:
+        _check_picture(table, file, calibrated.camera_px, options.get("colour"))
+    inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
+    if table.kind == "blender":
+        return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
+    if file is not None:
+        inputs["file"] = sha256_of(file)
+
+    def target() -> Target:
+        arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
+        return make_target(table.kind, file, arguments, calibrated)
+
+    return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
+
+
+_MAKERS: Mapping[str, Callable[..., Target]] = {
+    "pattern": replace_pattern,
+    "checkerboard": checkerboard,
+    "gloss": gloss,
+    "photograph": wrap_photograph,
+}
+
+
+def _options(kind: str) -> dict[str, Any]:
+    """The settings of a kind with their types: the keyword arguments of its maker."""
+    if kind == "recolour":
+        return {"tint": Colour}
+    if kind == "blender":
+        return {"scene": str, "samples": int, "seed": int}
+    if kind == "picture":
+        return dict(_OF_FILES)
+    if kind not in _MAKERS:
+        return {}
+    types = get_type_hints(_MAKERS[kind])
+    parameters = inspect.signature(_MAKERS[kind]).parameters.values()
+    names = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
+    options = {_RENAMED.get(name, name): types[name] for name in names}
+    return {**options, **_OF_FILES} if kind in NEEDS_FILE else options
+
+
+_OF_FILES: Mapping[str, Any] = {"colour": ColourSpace}
+"""Settings on how a picture file is read."""
+_RENAMED: Mapping[str, str] = {"kind": "figure"}
+"""Arguments of makers with another name in stage.toml, where ``kind`` chooses the maker."""
+_ARGUMENTS: Mapping[str, str] = {written: name for name, written in _RENAMED.items()}
+
+
+def _check_picture(
+    table: AppearanceTable, file: Path, camera_px: tuple[int, int] | None, colour: ColourSpace | None
+) -> None:
+    """Read a picture now, so that an error shows before an hour of solving."""
+    if not file.is_file():
+        raise UsageError(
+            "target-missing",
+            what=f"The picture {file} of appearance {table.name} does not exist.",
+            remedy="Add the file, or correct `file` in stage.toml.",
+        )
+    picture = read_picture(file, colour)
+    size = camera_px if table.kind == "picture" else None
+    check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
+
+
+def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
+    """The target of a ``kind`` with its checked ``options``, on a calibrated object. Raises UsageError."""
+    mask = calibrated.transport.object_mask
+    options = dict(options)
+    colour = options.pop("colour", None)
+    if kind == "picture":
+        assert file is not None
+        rows, columns = mask.shape
+        return load_target(file, (columns, rows), colour)
+    if kind == "recolour":
+        return recolour(_as_it_is(calibrated), mask, **options)
+    geometry = read_geometry(calibrated.folder, calibrated.projectors)
+    if kind == "photograph":
+        assert file is not None
+        photograph = np.maximum(read_picture(file, colour)[..., :3], 0)
+        make = partial(wrap_photograph, photograph, **options)
+    else:
+        make = partial(_MAKERS[kind], **options)
+    return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make)))
+
+
+def _as_it_is(calibrated: Calibrated) -> FloatImage:
+    """The object under white light, scaled so that its brightest parts are 1."""
+    light = calibrated.transport.reach()
+    brightest = np.percentile(light[calibrated.transport.object_mask], 99)
+    return np.asarray(np.clip(light / brightest, 0, 1), np.float32)

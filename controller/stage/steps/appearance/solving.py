@@ -1,0 +1,206 @@
+"""The steps from a calibration to frames: transport, the base, and every appearance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+from controller.config.models import SolveTable
+from controller.core.arrays import ByteImage, FloatImage
+from controller.core.errors import UsageError
+from controller.optics.calibrate.values import Calibration
+from controller.optics.capture.patterns import Pattern, PatternKind, plan_patterns
+from controller.optics.solve.appearance import Base, BaseChoice, base_image, solve_base
+from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
+from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
+from controller.optics.solve.scaling.dither import to_device
+from controller.optics.solve.targets.values import Target
+from controller.run.progress import Level
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.solved import RequestedTarget, Solved, SolvedBase
+from controller.stage.steps import costs
+from hal.runtime.memory import free_bytes
+
+BASE = StepId(StepKind.BASE)
+
+
+def options_of(table: SolveTable) -> SolveOptions:
+    """How appearances are solved by [solve] of stage.toml, wherever they are."""
+    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
+
+
+@dataclass(frozen=True, slots=True)
+class AppearanceRequest:
+    """An appearance to solve: ``target`` gives its picture, like reflectance, and a mask of its valid pixels.
+
+    ``inputs`` are the hashes of the target's sources; ``prepare``, if given, is a step before
+    the solving, for slow targets, and ``prepare_s`` its cost.
+    """
+
+    name: str
+    title: str
+    target: Callable[[], Target]
+    inputs: dict[str, str]
+    prepare: Callable[[Context], Sequence[Path]] | None = None
+    prepare_s: float = 0.0
+
+
+def base_choice(name: str) -> BaseChoice:
+    """The base image with this name. Raises UsageError("base-unknown")."""
+    known: tuple[BaseChoice, ...] = get_args(BaseChoice)
+    for choice in known:
+        if choice == name:
+            return choice
+    raise UsageError(
+        "base-unknown", what=f"The base image {name} is unknown.", remedy=f"Choose one of {', '.join(known)}."
+    )
+
+
+def solve_steps(
+    calibrated: Calibrated,
+    requests: Sequence[AppearanceRequest],
+    options: SolveOptions,
+    after: Sequence[StepId],
+    scale: float = 1.0,
+    *,
+    answering: Answering | None = None,
+) -> list[Step]:
+    """Solve the base, then each request.
+
+    ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``steps.costs``; ``answering``
+    solves the appearances elsewhere.
+    """
+    steps = [
+        Step(
+            BASE,
+            partial(_solve_base, calibrated, options),
+            inputs=options.base_inputs(),
+            after=tuple(after),
+            title="Solving the base image",
+            weight=costs.BASE_S * scale,
+        ),
+    ]
+    for request in requests:
+        before = (*after, BASE)
+        if request.prepare is not None:
+            rendered = StepId(StepKind.TARGET, item=request.name)
+            steps.append(
+                Step(
+                    rendered,
+                    request.prepare,
+                    inputs=request.inputs,
+                    after=tuple(after),
+                    title=f"Rendering {request.title}",
+                    weight=request.prepare_s * scale,
+                )
+            )
+            before = (*before, rendered)
+        steps.append(
+            Step(
+                StepId(StepKind.APPEARANCE, item=request.name),
+                partial(_solve_appearance, calibrated, request, options, answering),
+                inputs={**options.inputs(), **request.inputs},
+                after=before,
+                title=f"Solving {request.title}",
+                weight=costs.APPEARANCE_S * scale,
+            )
+        )
+    return steps
+
+
+def random_pattern(size_px: tuple[int, int]) -> Pattern:
+    """The pattern on which a calibration is graded."""
+    return plan_patterns(size_px).of_kind(PatternKind.RANDOM)[0]
+
+
+def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context) -> Sequence[Path]:
+    need = solve_peak_bytes(stage_size(calibrated.calibration))
+    context.reporter.say(check_memory(need, free_bytes()))
+    base = solved_base(calibrated, options, _watched(context))
+    calibrated.keep_base(base)
+    return SolvedBase(base.image, base.solution).write(context.folder, calibrated.projectors)
+
+
+def solved_base(
+    calibrated: Calibrated, options: SolveOptions, progress: Callable[[int, float], None] | None = None
+) -> Base:
+    """The base image for these options. Raises as ``solve_bounded``."""
+    black = calibrated.calibration.black
+    image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
+    return solve_base(
+        calibrated.transport, image, black, smoothness=options.smoothness, progress=progress, engine=calibrated.engine
+    )
+
+
+def _watched(context: Context) -> Callable[[int, float], None]:
+    """Reports the progress of a solve whose end is unknown; a stop request raises here."""
+
+    def progress(iteration: int, kkt: float) -> None:
+        context.advance(1 - 1 / (1 + iteration / 60), f"iteration {iteration}")
+
+    return progress
+
+
+Answering = Callable[[AppearanceRequest, SolveOptions, Context], AppearanceResult]
+"""Solves an appearance, here or elsewhere."""
+
+
+def _answer_here(
+    calibrated: Calibrated, request: AppearanceRequest, options: SolveOptions, context: Context
+) -> AppearanceResult:
+    return solve_appearance(
+        calibrated.transport,
+        calibrated.base,
+        calibrated.calibration.black,
+        request.target(),
+        options,
+        drive=calibrated.drive,
+        indirect=calibrated.indirect,
+        progress=_watched(context),
+        engine=calibrated.engine,
+        folder=calibrated.folder,
+    )
+
+
+def _solve_appearance(
+    calibrated: Calibrated,
+    request: AppearanceRequest,
+    options: SolveOptions,
+    answering: Answering | None,
+    context: Context,
+) -> Sequence[Path]:
+    began_s = time.perf_counter()
+    made = (answering or partial(_answer_here, calibrated))(request, options, context)
+    if made.figures["advice"] is not None:
+        context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
+    figures: dict[str, object] = {
+        "name": request.name,
+        "title": request.title,
+        **made.figures,
+        "seconds_with_target": time.perf_counter() - began_s,
+    }
+    solved = Solved(
+        frames=device_frames(calibrated.calibration, made.frames),
+        linear=dict(zip(calibrated.projectors, made.frames, strict=True)),
+        target=made.target,
+        reachable=made.reachable,
+        figures=figures,
+        asked=RequestedTarget(made.asked, made.asked_reachable, made.valid),
+    )
+    return solved.write(context.folder, request.name)
+
+
+def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:
+    """8-bit frames by projector name, dithered."""
+    parts = zip(calibration.projectors, frames, strict=True)
+    return {part.name: to_device(values, part.radiometry) for part, values in parts}
+
+
+__all__ = ["AppearanceRequest", "SolveOptions", "device_frames", "options_of", "solve_steps"]

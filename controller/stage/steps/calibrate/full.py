@@ -1,0 +1,201 @@
+"""The steps from photographs to a calibration: radiometry, correspondences and metapixels, geometry, grade."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, astuple
+from pathlib import Path
+
+import numpy as np
+
+from controller.core.errors import CalibrationError
+from controller.core.troubles import Trouble, TroubleCode
+from controller.optics.calibrate.correspondence.colour_alignment import (
+    colour_shifts,
+    colour_sizes,
+    colours_apart,
+    fringed,
+    misaligned,
+)
+from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
+from controller.optics.calibrate.correspondence.decode import decode
+from controller.optics.calibrate.correspondence.opposites import completed
+from controller.optics.calibrate.geometry.lens import bent
+from controller.optics.calibrate.geometry.self_calibration import reconstruct
+from controller.optics.calibrate.geometry.values import CameraPrior
+from controller.optics.calibrate.metapixels.from_phase import fit_pixels
+from controller.optics.calibrate.photometry.radiometry import measure_radiometry, white_segment
+from controller.optics.capture.raw import CAMERA_BLUR_PX
+from controller.run.runner import Context, Step
+from controller.run.step_id import StepId
+from controller.stage.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
+from controller.stage.artefacts.geometry import write_geometry
+from controller.stage.artefacts.kinds import StepKind, of_projectors
+from controller.stage.artefacts.pattern_plans import PhotographOptions, PlanUsed
+from controller.stage.artefacts.photographs import Developed, light_of, noise_of, white_bracket
+from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
+from controller.stage.rig.rig import Rig, RigProjector
+from controller.stage.steps import costs
+from controller.stage.steps.calibrate.indirect import indirect_step
+from controller.stage.steps.calibrate.projector_glare import lens_troubles
+from controller.stage.steps.capture.camera import camera_step
+from controller.stage.steps.capture.patterns import capture_steps, code_step, light_step
+from controller.stage.steps.troubles import tell, tell_all
+
+
+def calibration_steps(
+    rig: Rig, prior: CameraPrior, *, longest_exposure_s: float, options: PhotographOptions | None = None
+) -> list[Step]:
+    """All steps from the first photograph to metapixels and geometry."""
+    steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
+    # The camera and all responses are measured beside photographs, so that no photograph waits for them.
+    steps.append(camera_step(rig))
+    names = [projector.name for projector in rig.projectors]
+    for projector in rig.projectors:
+        steps.append(light_step(rig, projector, options))
+        steps.append(_radiometry_step(projector))
+    for projector in rig.projectors:
+        steps.append(code_step(rig, projector, options))
+        steps.append(_pixels_step(projector))
+        steps.append(indirect_step(projector))
+    steps.append(
+        Step(
+            StepId(StepKind.GEOMETRY),
+            lambda context: _reconstruct(rig, prior, context),
+            inputs={"prior": repr(prior)},
+            after=of_projectors(names, StepKind.PIXELS),
+            title="Reconstructing the object and the poses",
+            weight=costs.geometry_s(costs.scale(projector.size_px for projector in rig.projectors)),
+        )
+    )
+    return steps
+
+
+def _radiometry_step(projector: RigProjector) -> Step:
+    return Step(
+        StepId(StepKind.RADIOMETRY, projector.name),
+        lambda context: _radiometry(projector, context),
+        after=(StepId(StepKind.BLACK), StepId(StepKind.LIGHT, projector.name), StepId(StepKind.CAMERA)),
+        title=f"Measuring the response of {projector.name}",
+        weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
+        calculates=True,
+    )
+
+
+def _pixels_step(projector: RigProjector) -> Step:
+    return Step(
+        StepId(StepKind.PIXELS, projector.name),
+        lambda context: _pixels(projector, context),
+        after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.CODES)),
+        title=f"Decoding {projector.name} and fitting its metapixels",
+        weight=costs.PIXELS_S * costs.scale([projector.size_px]),
+        calculates=True,
+    )
+
+
+def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
+    used = PlanUsed.read(context.folder, projector.name)
+    black = read_black(context.folder)
+    taken = light_of(projector.name).by_name(context.folder)
+    bracket = white_bracket(list(taken.values()))
+    white = merge_photographs(bracket)
+    context.advance(0.5)
+    captures = Developed(taken, {"black": black, "white": white})
+    radiometry, report = measure_radiometry(
+        captures,
+        used.plan(projector.size_px),
+        known_px=used.known_px(context.folder, projector.name),
+        noise=noise_of(bracket[0]),
+    )
+    said = {TroubleCode.WHITE_SEGMENT: white_segment(projector.name, radiometry.segment)}
+    matrix = bracket[0].read().camera_to_xyz
+    light = Light(
+        response=radiometry.response,
+        mixing=radiometry.mixing,
+        white=np.maximum(white - black, 0).astype(np.float32),
+        black=black,
+        camera_to_xyz=_SRGB_TO_XYZ if matrix is None else matrix,
+        segment=np.array([radiometry.segment]) if radiometry.segment else None,
+        paint=radiometry.paint,
+    )
+    figures = write_radiometry_figures(context.folder, projector.name, asdict(report))
+    told = tell(context, StepId(StepKind.RADIOMETRY, projector.name), said)
+    return [light.write(context.folder, projector.name), figures, told]
+
+
+_SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""IEC 61966-2-1; for a camera without its own colour matrix."""
+
+
+def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
+    light = Light.read(context.folder, projector.name)
+    used = PlanUsed.read(context.folder, projector.name)
+    plan = used.plan(projector.size_px)
+    taken = read_captures(context.folder, projector.name)
+    ready = {"black": light.black, "white": light.white + light.black}
+    captures = completed(Developed(taken, ready), plan)
+    apart = colours_apart(captures, plan, light.white, light.mixing)
+    shifts = colour_shifts(apart)
+    apart_px = shifts.sure_px
+    colours = None if apart_px is None else ColourPlaces.of(apart_px, light.white, light.mixing)
+    blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5)
+    correspondence = decode(
+        captures,
+        plan,
+        camera_blur_px=blur_px,
+        scratch=context.folder,
+        known_px=used.known_px(context.folder, projector.name),
+        noise=noise_of(taken[plan.sinusoids("phase-x")[0].name]),
+        colours=colours,
+    )
+    if not correspondence.valid.any():
+        raise CalibrationError(
+            "projector-reaches-nothing",
+            what=f"No pixel of projector {projector.name} was found on the object.",
+            remedy="Check that it points at the object, is in focus and not blocked, and that the room is dark.",
+        )
+    context.advance(0.4, "correspondences")
+    sizes = colour_sizes(apart, correspondence.projector_px)
+    apart_said = {
+        TroubleCode.PANEL_ALIGNMENT: misaligned(projector.name, shifts),
+        TroubleCode.COLOUR_FRINGES: fringed(projector.name, sizes, projector.size_px),
+    }
+    fitted = fit_pixels(captures, plan, correspondence, colours, light.white)
+    metapixels = fitted.metapixels
+    pixels = Pixels(
+        projector_px=correspondence.projector_px,
+        modulation=correspondence.modulation,
+        seen=correspondence.valid,
+        centre_px=metapixels.centre_px,
+        covariance_px2=metapixels.covariance_px2,
+        valid=metapixels.valid,
+        shown_px=fitted.phase_map.projector_px,
+        spread_px2=fitted.phase_map.spread_px2,
+        mosaic=fitted.mosaic,
+        colours_px=apart_px,
+        spread=None if fitted.spread is None else np.array(astuple(fitted.spread)),
+    )
+    valid, seen = np.count_nonzero(metapixels.valid), np.count_nonzero(correspondence.valid)
+    noted = None if apart_px is None else tuple((float(x), float(y)) for x, y in apart_px)
+    figures = PixelFigures(int(valid), int(metapixels.valid.size), int(seen), noted)
+    said = tell(context, StepId(StepKind.PIXELS, projector.name), apart_said)
+    return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name), said]
+
+
+def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Path]:
+    correspondences = [read_correspondence(context.folder, projector.name) for projector in rig.projectors]
+    rows, columns = correspondences[0].valid.shape
+    found = reconstruct(
+        correspondences,
+        (columns, rows),
+        [projector.size_px for projector in rig.projectors],
+        prior,
+        progress=lambda fraction: context.advance(fraction, "geometry"),
+    )
+    names = [projector.name for projector in rig.projectors]
+    troubles = lens_troubles(context, rig.projectors, found.geometry)
+    for name, lens in zip(names, found.geometry.projectors, strict=True):
+        if (text := bent(name, lens)) is not None:
+            troubles.append(Trouble(text, name, TroubleCode.LENS_DISTORTION))
+    said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
+    return [*write_geometry(context.folder, names, found), said]

@@ -1,1 +1,0 @@
-"""One module or package per experiment; `controller.study.catalogue` lists them."""

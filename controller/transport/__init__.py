@@ -1,9 +1,0 @@
-"""The light transport T: metapixels as patches, and the products T p and T' r.
-
-Entry: `factory.build_transport` makes the `LightTransport` of a calibration, a linear operator in SciPy's sense.
-"""
-
-from controller.transport.factory import build_transport
-from controller.transport.operator import LightTransport
-
-__all__ = ["LightTransport", "build_transport"]

@@ -1,4 +1,0 @@
-"""Vector intrinsics (LLVM) for the kernels of transport and scaling, one module per kernel family.
-
-All are made of the helpers in `vectors`. `tests/controller/transport/simd` has each kernel in plain NumPy.
-"""

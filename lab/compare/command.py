@@ -1,0 +1,46 @@
+"""``velatura benchmark``."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controller.cli.running import BenchSize, Json, Seeds, work
+
+if TYPE_CHECKING:
+    from controller.run.progress import Reporter
+
+
+def benchmark(
+    method: Annotated[
+        list[str] | None,
+        typer.Option(help="A method's name, module:function or file.py:function; repeat it for more (default: all)."),
+    ] = None,
+    scene: Annotated[
+        list[str] | None, typer.Option(help="dark, flat, room or traced; repeat it for more (default: all).")
+    ] = None,
+    size: BenchSize = "small",
+    out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("benchmark"),
+    seed: Seeds = None,
+    as_json: Json = False,
+) -> None:
+    """Compare methods on fixed emulated scenes, by photographs of what they make. Continues unfinished work."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from lab.compare.service import benchmark
+
+        return benchmark(
+            methods=tuple(method or ()),
+            scene_names=tuple(scene or ()),
+            size=size,
+            out=out,
+            seeds=seed or [1],
+            reporter=reporter,
+            cancel=cancel,
+        )
+
+    work(do, as_json=as_json)

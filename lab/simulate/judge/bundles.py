@@ -1,0 +1,94 @@
+"""Checks what a kiosk promises of its bundles: one that can be read is shown, and one that can't is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from controller.bundle.fallback import chosen
+from controller.bundle.install import previous
+from controller.bundle.reader import Bundle
+from controller.bundle.starts import Starts
+from controller.core.errors import VelaturaError
+from lab.simulate.disk import STAGE
+from lab.simulate.judge.found import Found
+from lab.simulate.judge.promises import Broken
+from lab.simulate.stage import OUTPUTS, TRUST
+from lab.simulate.world import SimulatedWorld
+
+if TYPE_CHECKING:
+    from controller.kiosk.api.kiosk import StageKiosk
+    from controller.kiosk.service import Service
+
+NAMED_S: Final = 30.0
+SHOWN_S: Final = 900.0
+"""Until a player whose bundle is damaged goes back to the one before: starts in vain, of which each waits longer."""
+_FOLDER: Final = STAGE / "bundles"
+
+
+class BundleWitness:
+    """``spoilt``: the names of the files that can't be read any more, and when each went bad; ``dark``: whether a
+    picture is wanted and could be shown, and is not.
+    """
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        self._world = world
+        self.spoilt: dict[str, float] = {}
+        self.dark = False
+        self._began_s = 0.0
+        self._found = Found(world)
+
+    def begins(self) -> None:
+        """A service does."""
+        self._began_s = self._world.scheduler.now_s
+        self._found.forget("dark")
+        self._found.forget("unnamed")
+
+    def disturbed(self) -> None:
+        """Something happened to the player or its display: it begins again."""
+        self._found.forget("dark")
+
+    def judge(self, kiosk: StageKiosk, service: Service) -> None:
+        """After a step. Raises Broken."""
+        unnamed = self._unnamed(kiosk, service) if self.spoilt else ""
+        unnamed_s = self._found.for_s("unnamed", bool(unnamed))
+        if unnamed_s > NAMED_S:
+            said = " ".join(kiosk.snapshot().warnings) or "nothing"
+            raise Broken("bundle named", f"{unnamed} can't be read, for {unnamed_s:.0f} s it says: {said}")
+        self.dark = self._is_dark(service)
+        dark_s = self._found.for_s("dark", self.dark)
+        if dark_s > SHOWN_S:
+            raise Broken("bundle shown", f"it is black for {dark_s:.0f} s")
+
+    def _unnamed(self, kiosk: StageKiosk, service: Service) -> str:
+        """The bundle that can't be read with which the service began, if it does not say so; else nothing."""
+        bundle = service.bundles.bundle()
+        if bundle is None or self.spoilt.get(bundle.name, self._began_s) >= self._began_s:
+            return ""
+        return "" if any("bundle" in text for text in kiosk.snapshot().warnings) else bundle.name
+
+    def _is_dark(self, service: Service) -> bool:
+        """Whether a picture is wanted and could be shown, and is not."""
+        screen, want = self._world.screen, service.player.want
+        if screen.appearance or want is None or want.bundle is None or service.player.identifying:
+            return False
+        crashes = screen.hung or screen.trouble or screen.dies_at_start or screen.dies_at_play
+        shows = not screen.why_dark([(output, 0, 0) for output in OUTPUTS.values()])
+        return shows and not crashes and not self._world.disk.blind and self._playable()
+
+    def _playable(self) -> bool:
+        """Whether the installed bundle can be read, or the one before, which was not given up itself."""
+        now, earlier = chosen(_FOLDER), previous(_FOLDER)
+        if now is not None and now.name not in self.spoilt:
+            return True
+        given_up = Starts.read(_FOLDER).given_up
+        return earlier is not None and earlier.name not in {given_up, *self.spoilt}
+
+
+def is_sound(file: Path) -> bool:
+    """Whether a bundle can be read."""
+    try:
+        Bundle.open_trusted(file, TRUST).close()
+    except VelaturaError:
+        return False
+    return True

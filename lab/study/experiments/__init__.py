@@ -1,0 +1,1 @@
+"""One module or package per experiment; `lab.study.catalogue` lists them."""

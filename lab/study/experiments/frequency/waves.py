@@ -1,0 +1,88 @@
+"""Waves on the object, one frequency a band of rows, and how much of their contrast a photograph keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.optics.plan.resolution import FAINT, MEAN
+from controller.optics.solve.targets.values import Target, through_camera
+from controller.stage.report.pictures import crop_around
+from lab.study.subject.subject import ReachableTarget, Subject
+
+BANDS = 18
+LOWEST, HIGHEST = 0.15, 1.25
+"""Frequencies, in cycles a pixel of one projector as the camera sees it; one projector's pixels end at 0.5."""
+MIDDLE = 0.6
+"""Of the object's width: farther out the surface turns away, its pixels are narrower and would blur the figure."""
+GREEN = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """The target and where its waves are: one frequency a band of rows, rising downwards.
+
+    ``frequency`` (bands,) cycles a camera pixel; ``band`` (rows, columns) its number, -1 where nothing is measured;
+    ``phase`` (rows, columns) radians; ``pitch_px`` camera pixels a projector pixel
+    """
+
+    target: Target
+    frequency: Float64
+    band: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    phase: Float64
+    pitch_px: float
+
+
+def make_waves(subject: Subject, n: int, *, amplitude: float = FAINT) -> Waves:
+    """Bands of upright waves over the object's middle, their frequency in pixels of projector ``n``."""
+    mask = subject.mask
+    box = crop_around(mask, margin=0.0)
+    pitch = _pitch_px(subject, n, box)
+    frequency = np.linspace(LOWEST, HIGHEST, BANDS) / pitch
+    rows, columns = np.arange(mask.shape[0]), np.arange(mask.shape[1])
+    height = (box.rows.stop - box.rows.start) / BANDS
+    number = np.clip(((rows - box.rows.start) / height).astype(np.int64), 0, BANDS - 1)
+    middle = 0.5 * (box.columns.start + box.columns.stop)
+    phase = 2 * np.pi * frequency[number][:, None] * (columns - middle)
+    image = np.where(mask[..., None], (MEAN + amplitude * np.cos(phase))[..., None], 0).astype(np.float32)
+    image = np.repeat(image, 3, axis=2)
+    # The rim of a band has its neighbour's waves in its blur.
+    inner = np.abs((rows - box.rows.start) / height - number - 0.5) < 0.35
+    near = np.abs(columns - middle) < 0.5 * MIDDLE * (box.columns.stop - box.columns.start)
+    band = np.where(mask & inner[:, None] & near, number[:, None], -1)
+    return Waves(through_camera(Target(image, mask)), frequency, band, np.asarray(phase), pitch)
+
+
+def _pitch_px(subject: Subject, n: int, box: object) -> float:
+    """Camera pixels along a row that a pixel of projector ``n`` takes, median over the object's middle."""
+    metapixels = subject.calibration.projectors[n].metapixels
+    centre = np.where(metapixels.valid[..., None], metapixels.centre_px, np.nan).astype(np.float64)
+    across = np.diff(centre, axis=1)[..., 0]
+    known = np.isfinite(across)
+    middle = np.nanmedian(centre[..., 0])
+    span = np.nanpercentile(centre[..., 0], 97) - np.nanpercentile(centre[..., 0], 3)
+    known &= np.abs(centre[:, 1:, 0] - middle) < 0.5 * MIDDLE * span
+    return float(np.median(np.abs(across[known])))
+
+
+def kept_contrast(picture: FloatImage, wanted: ReachableTarget, waves: Waves) -> Float64:
+    """(bands,): the wave's amplitude in phase with the target's, over the target's, in the green channel."""
+    kept = np.full(waves.frequency.size, np.nan)
+    for number in range(waves.frequency.size):
+        inside = (waves.band == number) & wanted.mask
+        if inside.sum() < 200:
+            continue
+        ours, theirs = (_amplitude(image[..., GREEN][inside], waves, inside) for image in (picture, wanted.radiance))
+        kept[number] = ours / theirs
+    return kept
+
+
+def _amplitude(values: FloatImage, waves: Waves, inside: Mask) -> float:
+    """Least squares of cosine, sine and a slow change; what is not in phase counts as lost."""
+    phase = waves.phase[inside]
+    x = np.nonzero(inside)[1].astype(np.float64)
+    x = (x - x.mean()) / max(float(np.ptp(x)), 1.0)
+    parts = np.stack([np.cos(phase), np.sin(phase), np.ones_like(x), x, x * x, x**3], axis=1)
+    return float(np.linalg.lstsq(parts, values.astype(np.float64), rcond=None)[0][0])

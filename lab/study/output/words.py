@@ -1,0 +1,137 @@
+"""Texts of the pages: what an experiment shows and what it does not, and why it misses a criterion.
+
+No text holds a measured number: it would be of another run than the page. An experiment tells those itself.
+
+Apart from the experiments, so that a better sentence does not make an experiment be done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+DESCRIPTIONS: Final[Mapping[str, str]] = {
+    "ablation": """\
+The same target, solved with more and more parts of the method, and photographed. *Naive inverse*: the light of
+photographed dots, inverted without bounds (LSMR) and clipped afterwards. *Gaussian metapixels*: fitted
+to the same dots, without any correction of their centres. *Regularisation*: centres moved in order of priority,
+gaps filled. *Smoothness*: eq. 3 at its default strength. *Quadrilaterals* replace the Gaussians; everything else is
+as in the step before. Rows of each light transport are scaled so that all pixels at white give the white image
+(decision 1). The paper does not scale them, so the early steps are better here than in the paper.""",
+    "regions": """\
+A piece of the camera's picture of one target, solved in four phases of regions (paper 3.2; they overlap by 25
+%), and globally. Differences are over the piece without a border of half of the largest region. Times are wall
+times of this piece on a busy machine. They show which variant is slower, not how long the paper's would take here;
+`lab/timings/README.md` has times of the whole picture.""",
+    "residual": """\
+A checkerboard on a pale curved shell, as the paper describes it: the first two projectors stand to the left, and light
+the right half at grazing angles or not at all; the third stands to the right. Everything is compared over the whole
+object that any of the three lights, at two exposures: as bright as all three can make 95 % of it, and as bright as
+the first can make 95 % of what it lights. *Normalised residual*: rms difference of photograph and target in a region
+of 16x16 camera pixels, over the target's white; the mean is over regions. The paper says neither what it normalises
+by nor whether its figures are from the solve or from photographs; both are given here. Its shape and angles are not
+known to the degree either: places and squares were chosen before anything was measured, and not changed after. With
+smaller squares, more regions contain an edge, and every figure is larger.""",
+    "sharpness": """\
+lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
+(eq. 9), in the neighbourhood of each pixel; edges are Canny's, at the target's own threshold. Two targets: a
+checkerboard, as in the paper, and a photograph, whose edges have all directions and strengths. *Naive* is the light of
+photographed dots, inverted without bounds and clipped afterwards; *full* is the bounded, smooth solve on the calibrated
+shares. All four make the same target at an exposure that one projector can reach. The paper does not say how
+large its neighbourhoods are: ours were chosen before anything was measured.""",
+    "frequency": """\
+Bands of upright waves around a grey, faint and bold, their frequency rising downwards, over the middle of a
+pale shell, at an exposure that one projector can reach. *Contrast kept* is the amplitude in phase with the
+target's wave, in the photograph's green channel, over the target's own as the camera sees it; light at
+another phase or frequency counts as lost. F is the frequency where it first falls below a half. The paper says
+neither which contrast nor which criterion it used. The bases, for the faint waves, contain the target's detail above
+a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6). *As the plan calculates
+it*: as `velatura plan` does, from the measured blur, pitch and light. Superposition adds positions of light, not
+contrast, so the blur of the optics limits how much finer three are than one: the ratio is asked for only where the
+optics are sharp enough, as on [another page](frequency-sharp.md).""",
+    "earlier": """\
+The same target at an exposure that the best projector can reach alone, so that brightness makes no difference.
+*One projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* lights each point with its brightest
+projector and blends the seams, in the spirit of Raskar 2001. *Unconstrained inverse* inverts the light of
+photographed dots and clips afterwards, in the spirit of Wetzstein and Bimber 2007. *Bounded, no pixel model*
+keeps the bounds inside the solve on the same dots. These are our own implementations on our calibration, which
+is better than theirs was; none of their code was run.""",
+    "live": """\
+One target by base times scale: base and scale are multiplied projector pixel by projector pixel, which takes
+milliseconds where a solve takes seconds. By *eq. 6* a pixel's scale is the mean over its light; shown, the pixel
+blurs it a second time. *Narrower means* are used by `velatura live`: means over a Gaussian 0.4 times as wide
+(decision 33), in 8-bit frames; those of eq. 6 are dithered from floating point. The base *white* cancels
+the object's own pattern at full resolution; *minimum* leaves that to the scale. With either mean it shows
+speckles where it has almost no light itself, mostly at depth edges. The seconds include work that is done once: maps
+and compiled code.""",
+}
+SHARP_DESCRIPTION: Final = """\
+The same waves as on the page [The finest sinusoid](frequency.md), on a stage with sharper optics: the shell with three
+projectors at planned places, their lenses better than the usual ones of the bench (0.2 pixels in focus) and stopped
+down until no depth of the object is out of focus. Everything else is as there."""
+SIX_PROJECTORS_DESCRIPTION: Final = """\
+As the page of three projectors, on the same shell with six round it: left, right, above, far left, far right, high.
+Three of them light all of it about evenly, so the first three are not those of the other page. Everything is compared
+over the whole object that any of the six lights, at two exposures: as bright as all six can make 95 % of it, and as
+bright as the first can make 95 % of what it lights. The paper's figures are of an exposure that three can make. They
+are asked here, too, at one that only six can make, for which the first three lack light."""
+
+TOO_FINE: Final = """\
+What is left lies at edges, of the target or of the object's own paint, which are finer than the projectors' pixels. For
+the recoloured object this was tested by the model: without smoothness, without weights and with a ten times stricter
+solve it stays; with a fifth of the light it falls by less than a third, which is not enough."""
+
+MISS_REASONS: Final[Mapping[tuple[str, str], str]] = {
+    ("ablation", "+ Gaussian metapixels"): """\
+The raw light beats the Gaussians here. Its dots are photographed up to 16 times longer than white and its rows
+are scaled, so it contains the pixels' true shape with little noise. A Gaussian has neither their nearly square
+shape nor the paint's edges inside a pixel. Our shares reach about the same error without any photograph of dots.
+Fainter dots were not tried.""",
+    ("ablation", "+ regularisation"): """\
+It moves the few centres that dots located badly, so the large errors become smaller (RMSE) and the median hardly
+changes.""",
+    ("ablation", "+ smoothness"): """\
+Smoothness removes noise from the frames, so that CIEDE2000 and RMSE fall, and a little detail, too: SSIM falls, and so
+does lambda.""",
+    ("earlier", "ours is better than: bounded, no pixel model"): """\
+Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
+photographs a projector (see the ablation). Ours is smoothed. In the ablation, smoothness costs SSIM, too, but less
+than is missing here; why the rest is missing was not found.""",
+    ("residual", "mean, median region"): """\
+Each projector adds the errors of its own calibration and its own noise; where one already reaches a region well, the
+next cannot make it better. That is what the median region shows, and the mean hides.""",
+    ("residual-six", "mean, median region"): """\
+Where two projectors light a region well, further ones can hardly make it better: by the model they reduce the residual
+a little more, but the errors of their own calibration add as much. What is left of the mean and of the 95 % lies at
+the object's rim, as the maps show.""",
+    **{
+        ("appearances", f"{title}: CIEDE2000 at most"): TOO_FINE
+        for title in ("recoloured", "pattern replaced", "translucent marble", "inter-reflections", "head lowered")
+    },
+    ("robustness", "indirect light"): """\
+Light that comes back from the room also falls where the target is dark, and no frame can take it away: many more pixels
+are out of reach, as the table says, and too bright. A target with less contrast was not tried.""",
+    ("robustness", "a visitor's shadow"): """\
+The covered pixels lack one projector's light, and nothing measures that while a picture is shown. The median hardly
+changes, because most pixels are not covered.""",
+    ("frequency", "F_3 / F_1 at least 1.4, at 50% contrast"): """\
+To make a wave finer than one projector's pixels, three have to sharpen it against their blur, up to full light and
+down to none, and a bold wave leaves less room for that than a faint one.""",
+    ("frequency", "a base high-passed at F_1 keeps"): """\
+The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
+well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
+with the base's limit at a quarter of F_1 nothing is lost.""",
+}
+"""Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""
+
+
+def description(name: str) -> str:
+    """The paragraph of an experiment, or nothing."""
+    beside = {"residual-six": SIX_PROJECTORS_DESCRIPTION, "frequency-sharp": SHARP_DESCRIPTION}
+    return beside.get(name) or DESCRIPTIONS.get(name, "")
+
+
+def miss_reason(name: str, asked: str) -> str:
+    """Why the criterion is missed, as far as it was found; nothing where nothing was written down."""
+    own = name.removesuffix("-sharp")
+    return " ".join(text for (one, begins), text in MISS_REASONS.items() if one == own and asked.startswith(begins))

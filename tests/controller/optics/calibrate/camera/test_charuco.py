@@ -1,0 +1,194 @@
+"""The camera's lens from boards that this test renders itself, ray by ray, through a lens that it bends itself."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from controller.core.errors import CalibrationError, UsageError, WorkError
+from controller.optics.calibrate.camera.charuco import SQUARES, BoardView, board_picture, calibrate_views, find_corners
+from controller.optics.calibrate.camera.exif import intrinsics_from_exif
+from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics, read_intrinsics, write_intrinsics
+
+Grey = npt.NDArray[np.uint8]
+SIZE = (776, 520)
+FOCAL, CENTRE, K1, K2 = 1100.0, (391.5, 255.0), -0.09, 0.01
+TILTS = ((25, 0), (-25, 5), (5, 28), (-5, -28), (20, 20), (-20, -20), (22, -18), (0, 2))
+
+
+@functools.cache
+def ray_through(dx: float, dy: float) -> npt.NDArray[np.float64]:
+    """Of each pixel, at this place in it: before the lens bends it."""
+    column, row = np.meshgrid(np.arange(SIZE[0]) + dx, np.arange(SIZE[1]) + dy)
+    bent = np.stack([column - CENTRE[0], row - CENTRE[1]], axis=2) / FOCAL
+    flat = bent
+    for _ in range(30):
+        r2 = np.sum(flat**2, axis=2, keepdims=True)
+        flat = bent / (1 + K1 * r2 + K2 * r2**2)
+    return np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=2)
+
+
+@functools.cache
+def printed_board() -> npt.NDArray[np.float32]:
+    return board_picture(2200).astype(np.float32)
+
+
+def photograph(tilt_x: float, tilt_y: float, *, noise: float = 2.0, seed: int = 0) -> Grey:
+    """The printed board as a camera sees it: 2 x 2 rays a pixel, traced to the board's plane."""
+    rng = np.random.default_rng([seed, int(tilt_x) + 100, int(tilt_y) + 100])
+    paper = printed_board()
+    scale = (SQUARES[0] + 1) / paper.shape[1]
+    turn = cv2.Rodrigues(np.radians([tilt_x, tilt_y, rng.uniform(-15, 15)]))[0]
+    middle = np.array([rng.uniform(-1, 1), rng.uniform(-0.7, 0.7), 20.0 + rng.uniform(-1, 3)])
+    offsets = (np.arange(2) + 0.5) / 2 - 0.5
+    grey = np.zeros(SIZE[::-1], dtype=np.float32)
+    for dx in offsets:
+        for dy in offsets:
+            ray = ray_through(dx, dy)
+            reach = (turn[:, 2] @ middle) / (ray @ turn[:, 2])
+            on_board = (ray * reach[..., None] - middle) @ turn
+            x = on_board[..., 0] / scale + (paper.shape[1] - 1) / 2
+            y = on_board[..., 1] / scale + (paper.shape[0] - 1) / 2
+            grey += cv2.remap(paper, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderValue=180.0)
+    return np.asarray(np.clip(20 + 0.8 * grey / 4 + rng.normal(0, noise, grey.shape), 0, 255), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def found() -> CameraIntrinsics:
+    views = [find_corners(photograph(*tilt)) for tilt in TILTS]
+    return calibrate_views([view for view in views if view is not None], SIZE)
+
+
+def test_the_lens_of_the_photographs_is_found_within_its_sigmas(found: CameraIntrinsics) -> None:
+    focal, cx, cy, _ = found.sigmas
+    assert abs(np.log(found.focal_px / FOCAL)) < min(4 * focal, 0.002)
+    assert abs(found.centre_px[0] - CENTRE[0]) < min(4 * cx, 3.0)
+    assert abs(found.centre_px[1] - CENTRE[1]) < min(4 * cy, 3.0)
+    assert found.k1 == pytest.approx(K1, abs=0.02)
+    assert focal < 0.002
+    assert found.views == len(TILTS)
+    assert found.rms_px < 0.3
+
+
+def test_the_lens_comes_back_from_its_file(found: CameraIntrinsics, tmp_path: Path) -> None:
+    write_intrinsics(tmp_path / "lens.toml", found)
+    again = read_intrinsics(tmp_path / "lens.toml")
+    assert (again.size_px, again.focal_px, again.centre_px, again.k1) == (
+        found.size_px,
+        found.focal_px,
+        found.centre_px,
+        found.k1,
+    )
+    np.testing.assert_array_equal(again.covariance, found.covariance)
+    prior = again.prior(distance_m=1.2)
+    assert prior.focal_length_px == found.focal_px
+    assert prior.focal_length_rel_sigma == pytest.approx(found.sigmas[0])
+    assert (prior.distance_m, prior.distortion_k1, prior.size_px) == (1.2, found.k1, SIZE)
+
+
+def corners(tilts: list[tuple[float, float]], seed: int = 1) -> list[BoardView]:
+    """Views by OpenCV's own projection, with a tenth of a pixel of noise."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(1, SQUARES[0]), np.arange(1, SQUARES[1])), axis=2).reshape(-1, 2)
+    board = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1).astype(np.float32)
+    matrix = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
+    views = []
+    for tilt in tilts:
+        move = np.array([-5.5, -4.0, 22.0]) + rng.normal(0, 0.5, 3)
+        px, _ = cv2.projectPoints(board, np.radians([*tilt, rng.uniform(-9, 9)]), move, matrix, np.array([K1, 0, 0, 0]))
+        views.append(BoardView(board, (px.reshape(-1, 2) + rng.normal(0, 0.1, (len(grid), 2))).astype(np.float32)))
+    return views
+
+
+def test_the_covariance_is_what_repeated_sessions_scatter_by() -> None:
+    sessions = [calibrate_views(corners(list(TILTS), seed), SIZE) for seed in range(40)]
+    logs = np.log([session.focal_px for session in sessions])
+    expected = float(np.median([session.sigmas[0] for session in sessions]))
+    assert np.std(logs) == pytest.approx(expected, rel=0.4)
+    assert np.mean(np.abs(logs - np.log(FOCAL)) < 2 * expected) > 0.85
+
+
+def test_a_wrong_corner_does_no_harm() -> None:
+    views = corners(list(TILTS))
+    views[0].seen_px[7] += 9.0
+    assert calibrate_views(views, SIZE).focal_px == pytest.approx(FOCAL, rel=0.003)
+
+
+def test_a_photograph_without_a_board_has_no_corners_and_two_views_are_too_few() -> None:
+    blank = np.full(SIZE[::-1], 90, dtype=np.uint8)
+    assert find_corners(blank) is None
+    with pytest.raises(CalibrationError) as refused:
+        calibrate_views(corners(list(TILTS[:2])), SIZE)
+    assert refused.value.code == "camera-too-few-views"
+
+
+def test_parallel_views_are_refused_as_such() -> None:
+    with pytest.raises(CalibrationError) as refused:
+        calibrate_views(corners([(x, 1.0) for x in (0.0, 1.0, 2.0, 0.5, 1.5, -1.0)]), SIZE)
+    assert refused.value.code == "camera-views-parallel"
+
+
+def test_corners_that_no_lens_explains_are_refused() -> None:
+    rng = np.random.default_rng(2)
+    views = [BoardView(v.board, (v.seen_px + rng.normal(0, 12, v.seen_px.shape)).astype(np.float32)) for v in corners(
+        list(TILTS)
+    )]  # fmt: skip
+    with pytest.raises(CalibrationError) as refused:
+        calibrate_views(views, SIZE)
+    assert refused.value.code in ("camera-fit-poor", "camera-too-few-views")
+
+
+def jpeg(path: Path, tags: Mapping[int, object]) -> Path:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("L", (388, 260)).save(path, exif=exif)
+    return path
+
+
+def test_exif_gives_the_focal_length_by_the_sensors_pitch_or_by_its_35_mm_equivalent(tmp_path: Path) -> None:
+    from PIL.TiffImagePlugin import IFDRational
+
+    pitch = {0x920A: IFDRational(35), 0xA20E: IFDRational(3888000, 877), 0xA210: 2}
+    found = intrinsics_from_exif(jpeg(tmp_path / "a.jpg", pitch))
+    assert found.focal_px == pytest.approx(35 / 25.4 * 3888000 / 877)
+    assert (found.method, found.size_px) == ("exif", (388, 260))
+    assert found.sigmas[0] == pytest.approx(0.03)
+    found = intrinsics_from_exif(jpeg(tmp_path / "b.jpg", {0xA405: 50}))
+    assert found.focal_px == pytest.approx(50 / 43.267 * np.hypot(388, 260))
+
+
+def test_a_photograph_that_tells_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError) as refused:
+        intrinsics_from_exif(jpeg(tmp_path / "c.jpg", {}))
+    assert refused.value.code == "camera-focal-length-unknown"
+    (tmp_path / "d.jpg").write_bytes(b"not a picture")
+    with pytest.raises(WorkError) as unreadable:
+        intrinsics_from_exif(tmp_path / "d.jpg")
+    assert unreadable.value.code == "photograph-unreadable"
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("focal = [", "camera-intrinsics-unreadable"),
+        ("width_px = 3", "camera-intrinsics-invalid"),
+        ("width_px = 3\nheight_px = 2\nprincipal_point_px = [1, true]", "camera-intrinsics-invalid"),
+        ("width_px = 3\nheight_px = 2\nprincipal_point_px = [1, 1]\ncovariance = [[1]]", "camera-intrinsics-invalid"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_the_key(tmp_path: Path, text: str, code: str) -> None:
+    (tmp_path / "lens.toml").write_text(text)
+    with pytest.raises(UsageError) as refused:
+        read_intrinsics(tmp_path / "lens.toml")
+    assert refused.value.code == code
+    with pytest.raises(UsageError) as missing:
+        read_intrinsics(tmp_path / "none.toml")
+    assert missing.value.code == "camera-intrinsics-missing"

@@ -1,0 +1,67 @@
+"""The room behind and below an object is told from it; an object alone is left whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from controller.optics.calibrate.geometry.background import room_pixels
+
+ROWS, COLUMNS = 120, 180
+Floats = npt.NDArray[np.float64]
+
+
+def rays() -> Floats:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    return np.stack(((x - 89.5) / 200.0, (y - 59.5) / 200.0, np.ones((ROWS, COLUMNS))), axis=-1)
+
+
+def ball(middle: tuple[float, float, float], radius: float) -> Floats:
+    """Distances along the rays; infinite beside it."""
+    ray = rays()
+    along, square = ray @ np.array(middle), (ray**2).sum(axis=2)
+    root = along**2 - square * (np.dot(middle, middle) - radius**2)
+    return np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / square, np.inf)
+
+
+def plane(normal: tuple[float, float, float], offset: float) -> Floats:
+    away = offset / (rays() @ np.array(normal))
+    return np.where(away > 0, away, np.inf)
+
+
+def points(*surfaces: Floats) -> npt.NDArray[np.float32]:
+    nearest = np.min(surfaces, axis=0)
+    noise = 1.0 + 1e-4 * np.random.default_rng(1).standard_normal(nearest.shape)
+    return np.where(np.isfinite(nearest)[..., None], rays() * (nearest * noise)[..., None], np.nan).astype(np.float32)
+
+
+BALL = ball((0.03, 0.02, 1.0), 0.15)
+TABLE = plane((0.0, 0.97, 0.24), 0.415)
+WALL = plane((0.1, 0.05, 1.0), 1.4)
+
+
+def test_table_and_wall_are_the_rooms_and_the_ball_is_not() -> None:
+    found, on_ball = room_pixels(points(BALL, TABLE, WALL)), np.isfinite(BALL)
+    assert found[on_ball].mean() < 0.03
+    assert found[~on_ball].mean() > 0.98
+
+
+def test_shadows_without_points_go_with_what_is_beside_them() -> None:
+    seen = points(BALL, TABLE, WALL)
+    seen[20:60, 140:170] = np.nan
+    assert room_pixels(seen)[20:60, 140:170].all()
+
+
+@pytest.mark.parametrize("alone", [BALL, np.where(np.isfinite(BALL), WALL, np.inf)], ids=["ball", "flat"])
+def test_an_object_before_nothing_is_left_whole_even_a_flat_one(alone: Floats) -> None:
+    assert not room_pixels(points(alone)).any()
+
+
+def test_round_things_that_fill_the_picture_are_no_room() -> None:
+    assert not room_pixels(points(ball((0.0, 0.0, 1.5), 1.2))).any()
+
+
+def test_a_wall_alone_is_the_object() -> None:
+    assert not room_pixels(points(WALL)).any()
+    assert not room_pixels(points(WALL, ball((0.0, 0.0, 1.4), 0.1))).any()

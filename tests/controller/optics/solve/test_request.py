@@ -1,0 +1,148 @@
+"""An appearance from picture to frames: what is told of it, and what is advised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.core.arrays import FloatImage
+from controller.optics.solve.appearance import Base, Mode, base_image, solve_base
+from controller.optics.solve.request import SolveOptions, solve_appearance
+from controller.optics.solve.targets.values import Target
+from controller.optics.transport import LightTransport, build_transport
+from controller.optics.transport.indirect.indirect_light import IndirectLight
+from tests.controller.optics.solve.conftest import plane_calibration
+
+STAGE = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
+OPTIONS = SolveOptions(share=0.9, smoothness=0.001)
+
+
+@pytest.fixture(scope="module")
+def transport() -> LightTransport:
+    return build_transport(STAGE)
+
+
+@pytest.fixture(scope="module")
+def base(transport: LightTransport) -> Base:
+    return solve_base(transport, base_image(STAGE), STAGE.black, smoothness=OPTIONS.smoothness)
+
+
+def picture(pitch_px: float) -> Target:
+    y, x = np.mgrid[0:120, 0:160].astype(np.float32)
+    wave: FloatImage = 0.5 + 0.3 * np.sin(2 * np.pi * x / pitch_px) * np.sin(2 * np.pi * y / pitch_px)
+    mask = np.ones((120, 160), np.bool_)
+    mask[:10] = False
+    return Target(np.repeat(wave[..., None], 3, axis=2).astype(np.float32), mask)
+
+
+@pytest.mark.parametrize(
+    ("pitch_px", "mode", "made", "advised"),
+    [
+        (80, "auto", "scale", False),
+        (40, "auto", "full", False),
+        (5, "auto", "full", False),
+        (5, "scale", "scale", True),
+        (40, "scale", "scale", False),
+        (40, "full", "full", False),
+    ],
+)
+def test_fine_detail_is_solved_in_full_or_advised_to_be(
+    transport: LightTransport, base: Base, pitch_px: float, mode: Mode, made: str, advised: bool
+) -> None:
+    found = solve_appearance(transport, base, STAGE.black, picture(pitch_px), replace(OPTIONS, mode=mode))
+    assert found.figures["mode"] == made
+    assert (found.figures["advice"] is not None) is advised
+
+
+def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:
+    found = solve_appearance(transport, base, STAGE.black, picture(40), OPTIONS)
+    assert not found.reachable[:10].any()
+    assert found.reachable[10:].mean() > 0.85
+
+
+def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport, base: Base) -> None:
+    options = replace(OPTIONS, share=0.6, adapt=1.0)
+    asked = picture(60)
+    found = solve_appearance(transport, base, STAGE.black, asked, options)
+    plain = solve_appearance(transport, base, STAGE.black, asked, replace(options, adapt=0.0))
+    values = {key: value for key, value in found.figures.items() if isinstance(value, float)}
+    assert values["reachable_share"] < 0.7 < 0.95 < values["adapted_share"]
+    np.testing.assert_allclose(found.asked, plain.target)
+    np.testing.assert_array_equal(found.asked_reachable, plain.reachable)
+    np.testing.assert_array_equal(plain.asked, plain.target)
+    assert found.reachable.sum() > found.asked_reachable.sum()
+    assert not found.valid[:10].any()
+    assert OPTIONS.inputs() != options.inputs()
+    assert "adapt" not in OPTIONS.inputs(), "results of stages that do not adapt stay valid"
+
+
+def test_the_base_is_not_solved_again_for_another_way_of_using_it() -> None:
+    quick = replace(OPTIONS, mode="scale", share=0.5, adapt=1.0)
+    assert quick.inputs() != OPTIONS.inputs()
+    assert quick.base_inputs() == OPTIONS.base_inputs()
+    assert replace(OPTIONS, base="high-pass").base_inputs() == OPTIONS.base_inputs()
+    assert replace(OPTIONS, base="minimum").base_inputs() != OPTIONS.base_inputs()
+    assert replace(OPTIONS, smoothness=0.5).base_inputs() != OPTIONS.base_inputs()
+
+
+def thrown_back(*, near: float, strength: float, side: int = 8) -> IndirectLight:
+    """Blocks give each other light: so much of it to those around, the rest to all alike; paint of three colours."""
+    grid = (120 // side, 160 // side)
+    blocks = grid[0] * grid[1]
+    row, column = np.divmod(np.arange(blocks), grid[1])
+    apart = np.hypot(row[:, None] - row, column[:, None] - column)
+    around = np.exp(-0.5 * (apart / 3) ** 2)
+    factors = near * around / around.sum(axis=1, keepdims=True) + (1 - near) / blocks
+    paint = strength * STAGE.projectors[0].white / STAGE.projectors[0].white.max()
+    return IndirectLight(factors.astype(np.float32), paint, np.ones((120, 160), np.bool_), grid, side)
+
+
+@pytest.mark.parametrize("mode", ["scale", "full"])
+def test_indirect_light_is_left_room_for(transport: LightTransport, base: Base, mode: Mode) -> None:
+    """What surfaces throw back differs somewhat from what is known of it."""
+    truth, known = thrown_back(near=0.7, strength=0.4), thrown_back(near=0.5, strength=0.4)
+    wave = picture(60)
+    errors = {}
+    for name, indirect in (("none", None), ("known", known), ("truth", truth)):
+        found = solve_appearance(transport, base, STAGE.black, wave, replace(OPTIONS, mode=mode), indirect=indirect)
+        direct = transport.forward(found.frames)
+        seen = STAGE.black + direct + truth.forward(direct)
+        there = found.reachable & transport.object_mask
+        error = (seen - found.target)[there] / found.target[there]
+        errors[name] = float(np.sqrt(np.mean(error**2)))
+    assert errors["truth"] < errors["known"] < 0.5 * errors["none"]
+
+
+def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightTransport, base: Base) -> None:
+    target = picture(60)
+    target.image[40:80, 60:100] = 0.01
+    indirect = thrown_back(near=0.3, strength=0.5)
+    with_it, without = (
+        solve_appearance(transport, base, STAGE.black, target, OPTIONS, indirect=one) for one in (indirect, None)
+    )
+    assert without.reachable[45:75, 65:95].mean() > 0.9
+    assert with_it.reachable[45:75, 65:95].mean() < 0.1
+    assert with_it.reachable[85:].mean() > 0.8
+
+
+def test_the_brightest_target_counts_on_indirect_light(transport: LightTransport, base: Base) -> None:
+    """With a fifth more light on everything, targets may be about so much brighter."""
+    even = thrown_back(near=0.0, strength=0.4)
+    with_it, without = (
+        solve_appearance(transport, base, STAGE.black, picture(40), OPTIONS, indirect=one) for one in (even, None)
+    )
+    ratio = float(with_it.figures["exposure"] or 0) / float(without.figures["exposure"] or 1)
+    assert 1.02 < ratio < 1.4
+
+
+@pytest.mark.parametrize("adapt", [0.0, 1.0])
+def test_the_whole_picture_is_told_as_the_target(transport: LightTransport, base: Base, adapt: float) -> None:
+    indirect = thrown_back(near=0.5, strength=0.4)
+    options = replace(OPTIONS, adapt=adapt, mode="full")
+    found = solve_appearance(transport, base, STAGE.black, picture(40), options, indirect=indirect)
+    direct = transport.forward(found.frames)
+    seen = STAGE.black + direct + indirect.forward(direct)
+    there = found.reachable & transport.object_mask
+    assert np.median(np.abs(seen - found.target)[there] / found.target[there]) < 0.01

@@ -1,0 +1,131 @@
+"""Streams of pictures: what is due, what is too late, what is not yet whole."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from controller.core.arrays import ByteImage
+from controller.core.errors import UsageError
+from controller.stage.live.sources import FolderSource, VideoSource, open_source
+
+
+def grey(value: int) -> ByteImage:
+    return np.full((48, 64, 3), value, np.uint8)
+
+
+def video(path: Path, values: list[int], rate: float = 10.0) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, (64, 48))
+    for value in values:
+        writer.write(grey(value))
+    writer.release()
+    return path
+
+
+def write(folder: Path, name: str, value: int) -> None:
+    assert cv2.imwrite(str(folder / name), grey(value))
+
+
+def test_a_video_gives_the_frame_that_is_due_and_counts_those_it_passed_over(tmp_path: Path) -> None:
+    source = VideoSource(video(tmp_path / "v.avi", [10, 60, 110, 160, 210]), loop=False)
+    first = source.next(0.05)
+    assert first is not None
+    assert (first.number, first.skipped) == (0, 0)
+    assert abs(int(first.pixels.mean()) - 10) < 4
+    assert source.next(0.06) is None
+    later = source.next(0.35)
+    assert later is not None
+    assert (later.number, later.skipped) == (3, 2)
+    assert abs(int(later.pixels.mean()) - 160) < 4
+    last = source.next(0.9)
+    assert last is not None, "the last one is shown, however late"
+    assert (last.number, last.skipped) == (4, 0)
+    assert not source.ended
+    assert source.next(0.95) is None
+    assert source.ended
+    source.close()
+
+
+def test_a_looping_video_begins_again(tmp_path: Path) -> None:
+    source = VideoSource(video(tmp_path / "v.avi", [10, 110, 210]), loop=True)
+    seen = [source.next(0.05 + 0.1 * n) for n in range(8)]
+    values = [int(one.pixels.mean()) for one in seen if one is not None]
+    assert np.allclose(values, [10, 110, 210, 10, 110, 210, 10, 110], atol=4)
+    assert not source.ended
+    source.close()
+
+
+def test_a_folder_that_fills_gives_its_newest_picture_once_and_counts_the_others(tmp_path: Path) -> None:
+    source = FolderSource(tmp_path, loop=False, rate_hz=25)
+    assert source.next(0.0) is None
+    write(tmp_path, "0001.png", 50)
+    (tmp_path / "notes.txt").write_text("no picture")
+    first = source.next(0.1)
+    assert first is not None
+    assert int(first.pixels.mean()) == 50
+    assert source.next(0.2) is None
+    for number, value in ((2, 60), (3, 70), (4, 80)):
+        write(tmp_path, f"000{number}.png", value)
+    newest = source.next(0.3)
+    assert newest is not None
+    assert (int(newest.pixels.mean()), newest.skipped) == (80, 2)
+
+
+def test_a_picture_that_is_written_over_is_shown_again(tmp_path: Path) -> None:
+    source = FolderSource(tmp_path, loop=False, rate_hz=25)
+    write(tmp_path, "render.png", 50)
+    assert source.next(0.0) is not None
+    write(tmp_path, "render.png", 90)
+    os.utime(tmp_path / "render.png", ns=(10**18, 10**18))
+    again = source.next(0.1)
+    assert again is not None
+    assert int(again.pixels.mean()) == 90
+
+
+def test_a_half_written_picture_waits_and_a_damaged_one_is_told_of(tmp_path: Path) -> None:
+    write(tmp_path, "a.png", 50)
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
+    written_s = (tmp_path / "a.png").stat().st_mtime
+    now = [written_s + 0.01]
+    source = FolderSource(tmp_path, loop=False, rate_hz=25, clock=lambda: now[0])
+    assert source.next(0.0) is None
+    now[0] += 10
+    with pytest.raises(UsageError) as refused:
+        source.next(0.1)
+    assert refused.value.code == "target-unreadable"
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_a_picture_that_is_gone_when_it_is_looked_at_is_passed_over(tmp_path: Path, *, loop: bool) -> None:
+    source = FolderSource(tmp_path, loop=loop, rate_hz=10)
+    (tmp_path / "1.png").symlink_to(tmp_path / "kept" / "1.png")
+    assert source.next(0.0) is None
+    (tmp_path / "kept").mkdir()
+    write(tmp_path / "kept", "1.png", 50)
+    found = source.next(0.1)
+    assert found is not None
+    assert int(found.pixels.mean()) == 50
+
+
+def test_a_looping_folder_shows_its_pictures_in_turn(tmp_path: Path) -> None:
+    for number, value in enumerate((10, 110, 210)):
+        write(tmp_path, f"{number}.png", value)
+    source = FolderSource(tmp_path, loop=True, rate_hz=10)
+    seen = [source.next(0.05 + 0.1 * n) for n in range(5)]
+    assert [int(one.pixels.mean()) for one in seen if one is not None] == [10, 110, 210, 10, 110]
+    late = source.next(0.95)
+    assert late is not None
+    assert late.skipped == 4
+
+
+@pytest.mark.parametrize("name", ["missing.mp4", "text.mp4"])
+def test_what_is_no_stream_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "text.mp4").write_text("not a video")
+    with pytest.raises(UsageError) as refused:
+        open_source(tmp_path / name, loop=False, rate_hz=25)
+    assert refused.value.code == "live-source-unreadable"

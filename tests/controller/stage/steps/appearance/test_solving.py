@@ -1,0 +1,57 @@
+"""The steps that solve use the engine that the run's calibration was opened with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from controller.core.arrays import FloatImage
+from controller.optics.solve.bounded.descent import IterationControl
+from controller.optics.solve.bounded.problem import Solution, SolveInput
+from controller.optics.solve.engines.processor import Processor
+from controller.optics.solve.request import SolveOptions
+from controller.optics.solve.targets.values import Target
+from controller.optics.transport import LightTransport
+from controller.run.journal import Journal
+from controller.run.progress import Silent
+from controller.run.runner import Runner
+from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
+from hal.deadline import in_seconds
+from lab.timings.tools.synthetic import synthetic_target, write_synthetic_run
+
+CAMERA = (36, 50)
+
+
+class Watched(Processor):
+    """The processor, with a list of what it did."""
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
+        self.did.append("solve")
+        return super().solve(given, control)
+
+    def scaled(
+        self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage
+    ) -> FloatImage:
+        self.did.append("scale")
+        return super().scaled(transport, light, inverse, mixed, coverage)
+
+
+def test_the_base_and_every_appearance_are_made_by_it(tmp_path: Path) -> None:
+    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
+    engine = Watched()
+    calibrated = Calibrated(tmp_path, names, engine)
+    picture = Target(0.5 * synthetic_target(CAMERA), np.ones(CAMERA, np.bool_))
+    for mode, expected in (("full", ["solve", "solve"]), ("scale", ["solve", "solve", "scale"])):
+        request = AppearanceRequest(mode, mode, lambda: picture, {})
+        options = SolveOptions(0.9, 0.001, mode)  # type: ignore[arg-type]
+        with Journal(tmp_path) as journal:
+            Runner(solve_steps(calibrated, [request], options, ()), journal, reporter=Silent()).run(
+                "appearance", deadline=in_seconds(60)
+            )
+        # the base is kept: it is the same for both
+        assert engine.did == expected
