@@ -21,7 +21,7 @@ from hal.runtime.caches import cache_folder, temporary
 from hal.runtime.control_groups import GROUPS, MEMBERSHIP, groups_of
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-PACKAGES: Final = ("controller", "plugins", "hal", "lab.timings", "tests")
+PACKAGES: Final = ("controller", "plugins", "hal", "lab", "tests")
 """Packages with kernels."""
 LOCATORS: Final = "hal.runtime.compute.KernelFolder,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
 _IMPORT: Final = re.compile(
