@@ -38,7 +38,7 @@ def tree(tmp_path: Path) -> Path:
 def _tree(root: Path) -> Path:
     for package in ("hal", "controller"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (root / "lab" / "timings").mkdir()
+    (root / "lab" / "timings").mkdir(parents=True)
     (root / "lab" / "timings" / "constants.py").write_text("FACTOR = 2.0\n")
     (root / "lab" / "timings" / "kernel.py").write_text(KERNEL.format(package="lab.timings"))
     return root
