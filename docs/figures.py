@@ -79,9 +79,9 @@ def _errors(root: Path, place: int) -> str:
 
 
 def _photographs(root: Path) -> str:
-    """Of a projector of the paper's size: the last row of the decision's table, rounded up."""
-    (decision,) = (root / "docs" / "decisions").glob("0009-*.md")
-    (_, now) = re.findall(r"\*\*([\d.]+)\*\*", decision.read_text())
+    """Of a projector of the paper's size: the last row of the note's table, rounded up."""
+    (note,) = (root / "docs" / "notes").glob("*-0009-*.md")
+    (_, now) = re.findall(r"\*\*([\d.]+)\*\*", note.read_text())
     return str(-int(-float(now) // 1))
 
 

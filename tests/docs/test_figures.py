@@ -19,8 +19,8 @@ def test_every_document_and_every_page_of_the_study_says_what_was_measured() -> 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     """The documents that this is about, in a folder that may be changed."""
-    (tmp_path / "docs" / "decisions").mkdir(parents=True)
-    for path in [*ROOT.glob("*.md"), *(ROOT / "docs" / "decisions").glob("0009-*.md")]:
+    (tmp_path / "docs" / "notes").mkdir(parents=True)
+    for path in [*ROOT.glob("*.md"), *(ROOT / "docs" / "notes").glob("*-0009-*.md")]:
         shutil.copyfile(path, tmp_path / path.relative_to(ROOT))
     shutil.copytree(ROOT / STUDY, tmp_path / STUDY, ignore=shutil.ignore_patterns("pictures"))
     return tmp_path
