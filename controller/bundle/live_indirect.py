@@ -1,6 +1,6 @@
 """Light by way of other surfaces, for live targets: what of it falls on blocks of the target, found by samples.
 
-Part of the definition in ``live_maps`` (docs/reference/bundle-format.md, "Live section", docs/decisions/0047).
+Part of the definition in ``live_maps`` (docs/reference/bundle-format.md, "Live section", docs/decisions/0014).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from controller.core.errors import BundleError
 from controller.core.storage import stream_atomically
 
 FAST_FROM_BYTES: Final = 32 * 1024 * 1024
-"""Pixel bytes of a swap from which on decoding counts for more than the file's size (docs/decisions/0070)."""
+"""Pixel bytes of a swap from which on decoding counts for more than the file's size (docs/decisions/0021)."""
 MOST_LARGER: Final = 1.5
 """So many times larger than with Zstandard a bundle may be for LZ4's sake,"""
 MOST_ADDED: Final = 1 / 50

@@ -6,4 +6,4 @@ from typing import Final
 
 SMOOTHNESS: Final = 0.0003
 """Strength of smoothness, relative to the mean diagonal of the data's majoriser: that with the least error on
-calibrated stages (docs/decisions/0117)."""
+calibrated stages (docs/decisions/0008)."""

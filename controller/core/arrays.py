@@ -1,7 +1,7 @@
 """Array types, and the container for arrays on disk.
 
 The container is NumPy's published ``.npz`` format (a zip of ``.npy`` members), never with pickled objects. Members are
-not packed and begin at multiples of 64 bytes, so that a large file can be used where it is (docs/decisions/0055).
+not packed and begin at multiples of 64 bytes, so that a large file can be used where it is (docs/decisions/0004).
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def prepare_threads() -> None:
     """Set the environment variables for numba and its OpenMP library, before the first kernel runs.
 
     OpenMP's threads spin while they wait. With other busy programs, each spins for a thread that has no CPU, and
-    a solve takes up to 40 times as long (docs/decisions/0035). A variable set by the user is kept.
+    a solve takes up to 40 times as long (docs/decisions/0004). A variable set by the user is kept.
     """
     # By itself numba prefers TBB where a system has it, and TBB's threads spin, at the end of a process, too.
     os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")

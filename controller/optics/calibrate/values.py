@@ -49,7 +49,7 @@ class Metapixels:
 class PhaseMap:
     """Where each camera pixel looks on a projector's image, and how far the projector's pixels spread there.
 
-    From it the transport makes the shares of each camera pixel's light (docs/decisions/0010).
+    From it the transport makes the shares of each camera pixel's light (docs/decisions/0006).
 
     ``projector_px`` (camera rows, columns, 2) float32: x and y in projector pixels, NaN where unknown
     ``spread_px2`` (projector rows, columns, 3) float32: covariance xx, xy, yy of the light of a pixel in projector

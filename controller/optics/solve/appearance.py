@@ -264,7 +264,7 @@ def make_appearance(
     ``reachable`` (rows, columns): where base and scale must come near the target, for the mode "auto" to keep them;
     None: they are judged by the target's detail alone. ``start``: frames of a similar target, for a full solve.
 
-    A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 25).
+    A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 8).
     """
     check_target(transport, target)
     detail = fine_detail(transport, base, target, black)

@@ -1,4 +1,4 @@
-"""How much memory calibrations and solves take at their peak, calculated before they begin (docs/decisions/0055).
+"""How much memory calibrations and solves take at their peak, calculated before they begin (docs/decisions/0004).
 
 Counted are arrays of the process itself. A calibration's own arrays lie in files, and what of them is in memory can be
 had back by the system at any time.

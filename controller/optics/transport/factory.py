@@ -1,6 +1,6 @@
 """Which light transport a calibration gets.
 
-Where the phase map is known, each camera sample has its own shares (``windows``, docs/decisions/0010). Where only
+Where the phase map is known, each camera sample has its own shares (``windows``, docs/decisions/0006). Where only
 metapixels are, the shares are their Gaussians (``gaussians``).
 """
 

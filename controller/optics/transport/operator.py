@@ -7,7 +7,7 @@ object's colour stay as sharp as the camera sees them.
 
 One operator is what one camera sees of all projectors: T = [T_1 ... T_N], in columns. Solvers read the camera only
 through sensor buffers (flat float32 vectors), so that several cameras can become one operator whose buffer is theirs
-joined end to end (docs/decisions/0038).
+joined end to end (docs/decisions/0005).
 """
 
 from __future__ import annotations

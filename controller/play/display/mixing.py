@@ -37,7 +37,7 @@ def mixture_of(before: FrameSet, after: FrameSet, outputs: Sequence[OutputSize])
 def mix_sets(before: FrameSet, after: FrameSet, share: float, into: FrameSet, pool: Executor | None = None) -> None:
     """Write ``sqrt((1 - share) before^2 + share after^2)``, rounded, into ``into``; ``share`` is in [0, 1].
 
-    The square stands for every projector's response (docs/decisions/0016-fades-mix-squares.md). Both ends are
+    The square stands for every projector's response (docs/decisions/0022). Both ends are
     exact. All sets have the same shapes; ``into`` is neither of the others: a black set, or of ``mixture_of``. On the
     threads of ``pool`` if given.
     """

@@ -73,7 +73,7 @@ def paper_model(calibration: Calibration) -> Calibration:
 
 
 def raw_transport(plain: Calibration, shares: Sequence[Shares]) -> LightTransport:
-    """T of dots alone; only its rows are scaled, so that all pixels at white give the white image (decision 1)."""
+    """T of dots alone; only its rows are scaled, so that all pixels at white give the white image (decision 5)."""
     rows, columns = plain.object_mask.shape
     return build_transport(plain, patches=patches_of_weights(shares, (rows, columns)))
 

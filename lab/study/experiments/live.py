@@ -1,4 +1,4 @@
-"""Beyond the paper: what base times scale loses beside a solve, and what narrower means give back (decision 33)."""
+"""Beyond the paper: what base times scale loses beside a solve, and what narrower means give back (decision 10)."""
 
 from __future__ import annotations
 

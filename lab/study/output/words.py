@@ -17,7 +17,7 @@ photographed dots, inverted without bounds (LSMR) and clipped afterwards. *Gauss
 to the same dots, without any correction of their centres. *Regularisation*: centres moved in order of priority,
 gaps filled. *Smoothness*: eq. 3 at its default strength. *Quadrilaterals* replace the Gaussians; everything else is
 as in the step before. Rows of each light transport are scaled so that all pixels at white give the white image
-(decision 1). The paper does not scale them, so the early steps are better here than in the paper.""",
+(decision 5). The paper does not scale them, so the early steps are better here than in the paper.""",
     "regions": """\
 A piece of the camera's picture of one target, solved in four phases of regions (paper 3.2; they overlap by 25
 %), and globally. Differences are over the piece without a border of half of the largest region. Times are wall
@@ -60,7 +60,7 @@ is better than theirs was; none of their code was run.""",
 One target by base times scale: base and scale are multiplied projector pixel by projector pixel, which takes
 milliseconds where a solve takes seconds. By *eq. 6* a pixel's scale is the mean over its light; shown, the pixel
 blurs it a second time. *Narrower means* are used by `velatura live`: means over a Gaussian 0.4 times as wide
-(decision 33), in 8-bit frames; those of eq. 6 are dithered from floating point. The base *white* cancels
+(decision 10), in 8-bit frames; those of eq. 6 are dithered from floating point. The base *white* cancels
 the object's own pattern at full resolution; *minimum* leaves that to the scale. With either mean it shows
 speckles where it has almost no light itself, mostly at depth edges. The seconds include work that is done once: maps
 and compiled code.""",
@@ -119,7 +119,7 @@ To make a wave finer than one projector's pixels, three have to sharpen it again
 down to none, and a bold wave leaves less room for that than a faint one.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
-well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 33) lose less;
+well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 10) lose less;
 with the base's limit at a quarter of F_1 nothing is lost.""",
 }
 """Why a criterion of an experiment is missed, by the experiment's name and the beginning of what is asked."""

@@ -46,7 +46,7 @@ GOALS: Final = {0: (0.7, 4.0), 1: (0.5, 3.5), 2: (0.4, 3.0)}
 BLOCK_PX: Final = 50
 BORDER_PX: Final = 6
 OUTLINE_PX: Final = 3
-"""Pixels so near to the object's border see the room, too, where projectors stay dark (docs/decisions/0059)."""
+"""Pixels so near to the object's border see the room, too, where projectors stay dark (docs/decisions/0011)."""
 RESPONSE_AT: Final = 64
 FORGIVEN: Final = 0.02
 """Drive beyond [0, 1] that counts as in reach yet."""

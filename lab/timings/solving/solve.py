@@ -121,7 +121,7 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
     warm = traced(transport, target, black, 60, start=start, enough=whole.best * (1 + NEAR_ENOUGH))
     number, at = warm.reached(whole.best * (1 + NEAR_ENOUGH))
     rows.append(at_most("appearance from base x scale to 0.01 of the best", at.seconds, None, unit="s",
-                        how=f"{number} sweeps, no longer done: decision 25; {_processor(at)}"))  # fmt: skip
+                        how=f"{number} sweeps, no longer done: decision 8; {_processor(at)}"))  # fmt: skip
     ready = interactive(transport, base, black, [part.radiometry for part in calibration.projectors])
     shown = timed(lambda: ready.frames(target), repeats=15)
     slow = timed(lambda: _reference(transport, base, target, calibration), repeats=2)

@@ -2,7 +2,7 @@
 
 The camera sees a grey sinusoid as the sum of three, one of each colour of the projector, as strong as the paint throws
 it back. Its place is a mean of theirs, and they cancel each other in part. Both follow from the white image and are
-taken back, so that places are those of green everywhere (docs/decisions/0082).
+taken back, so that places are those of green everywhere (docs/decisions/0006).
 """
 
 from __future__ import annotations

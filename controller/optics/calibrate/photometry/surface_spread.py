@@ -49,7 +49,7 @@ SURE: Final = 4.0
 """Standard errors, by the differences between parts, from which a share counts."""
 MOST_VARIED: Final = 0.4
 """Standard deviation of the parts' shares, of the share. A material is the same everywhere; light between near
-surfaces, which falls off alike, is not (docs/decisions/0107)."""
+surfaces, which falls off alike, is not (docs/decisions/0015)."""
 
 
 @dataclass(frozen=True, slots=True)

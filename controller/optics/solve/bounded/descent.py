@@ -4,7 +4,7 @@ A sweep is one Gauss-Seidel pass: each projector takes a projected gradient step
 scaled by a diagonal preconditioner that bounds its own part of the Hessian alone; with n projectors alike that is n
 times as far as a step of all at once could go. Momentum carries on from sweep to sweep, with over-relaxation by part of
 the sweep's own step (Kim and Fessler 2016), and restarts where it points uphill (O'Donoghue and Candes 2015). What the
-constants are worth: docs/decisions/0025.
+constants are worth: docs/decisions/0008.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ At one place of the camera's image, all projectors together make the light B p, 
 projector. Where one colour for all projectors gives the wanted light within [0, 1], that is the initial estimate.
 Elsewhere the projectors have to differ: one may give a colour without crosstalk, another one's crosstalk may be needed.
 Sweeps find that slowly, since it changes the light by little; here it is a problem of a few unknowns
-(docs/decisions/0025).
+(docs/decisions/0008).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import planes_above
 
 EdgeWeights = npt.NDArray[np.uint16]
-"""Squared weights of the smoothness edges (3, pixels), in steps of 1 / EDGE_WEIGHT_STEPS (docs/decisions/0055)."""
+"""Squared weights of the smoothness edges (3, pixels), in steps of 1 / EDGE_WEIGHT_STEPS (docs/decisions/0004)."""
 
 
 @dataclass(frozen=True, slots=True)

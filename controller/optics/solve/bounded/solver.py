@@ -1,7 +1,7 @@
 """Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
 
 Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
-by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0022, 0025). T is (nearly)
+by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0008). T is (nearly)
 non-negative, so the row sums |T_n|' w |T_n| 1 majorise the data part of the Hessian of projector n, and give every one
 of its pixels a step of its own.
 """
@@ -24,7 +24,7 @@ from controller.optics.transport import LightTransport
 
 TOLERANCE: Final = 3e-5
 """Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
-calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0055)."""
+calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0004)."""
 MOST_ITERATIONS: Final = 1000
 
 

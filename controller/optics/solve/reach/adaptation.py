@@ -11,7 +11,7 @@ well away from a limit stays as it is, differences beyond it shrink.
 3. Light: no brighter than a smooth ceiling. Mostly all channels together, so that highlights keep their colour.
 
 Chroma comes before lightness: a pixel whose channels lack light alone is not dimmed. Arrays in, arrays out
-(docs/decisions/0048).
+(docs/decisions/0011).
 """
 
 from __future__ import annotations

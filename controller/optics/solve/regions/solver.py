@@ -5,7 +5,7 @@ phases take alternate rows and columns of regions; what an earlier phase has set
 region determines its own pixels; those of its margin are provisional, and its neighbours solve them again. The
 regions of a phase don't touch each other, so their order does not matter. Earlier values being fixed, the result is
 near the optimum, not at it: the global solver (``bounded``) is the default, this one is for comparison
-(docs/decisions/0008).
+(docs/decisions/0007).
 """
 
 from __future__ import annotations

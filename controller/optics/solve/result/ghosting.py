@@ -2,7 +2,7 @@
 
 The photograph's error and the object's reflectance are compared in the logarithm of light, as lightness and two
 opponent colours (after Ruderman et al. 1998), in bands from 1 to 8 % of the picture: finer differences are edges that
-no projector pixel can follow, wider ones are shading. Arrays in, arrays out (docs/decisions/0048).
+no projector pixel can follow, wider ones are shading. Arrays in, arrays out (docs/decisions/0011).
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ BAND_PIXELS: Final = 1 << 18
 """Pixels compared at a time, so that memory stays bounded at any size."""
 SHARE_OF_MEDIAN: Final = 0.5
 """Canny's high threshold is this share of the median gradient along the target's own edges, so that a result with less
-contrast still has them (docs/decisions/0058). The low threshold is ``WEAK`` of the high one."""
+contrast still has them (docs/decisions/0033). The low threshold is ``WEAK`` of the high one."""
 WEAK: Final = 0.4
 EDGE_SIGMA_PX: Final = 1.4
 GRADIENT_SCALE: Final = 2000.0

@@ -2,7 +2,7 @@
 
 The photograph less what the transport predicts of the same frames is the model's error there. The target less that
 error is what the next solve aims at: where the model is right, nothing changes, and what is out of reach does not add
-up from photograph to photograph. Arrays in, arrays out (docs/decisions/0044).
+up from photograph to photograph. Arrays in, arrays out (docs/decisions/0012).
 """
 
 from __future__ import annotations

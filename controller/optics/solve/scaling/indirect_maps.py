@@ -1,7 +1,7 @@
 """The maps of indirect light for live targets (``bundle.live_indirect``), from the stage's G.
 
 Live targets have few, large blocks: indirect light is smooth but for the paint, which stays in the target's own pixels
-(docs/decisions/0047).
+(docs/decisions/0014).
 """
 
 from __future__ import annotations

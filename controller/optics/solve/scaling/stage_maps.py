@@ -2,8 +2,8 @@
 
 P_s is the mean of the scale image C_s over a projector pixel's light in the camera (paper eq. 6). The light transport
 gives that mean exactly; here each pixel keeps the centre and the covariance of its weights, which are those of a
-Gaussian to within what a stage's grade leaves open (docs/decisions/0021), and the mean is taken over a narrower one
-(docs/decisions/0033).
+Gaussian to within what a stage's grade leaves open (docs/decisions/0010), and the mean is taken over a narrower one
+(docs/decisions/0010).
 """
 
 from __future__ import annotations

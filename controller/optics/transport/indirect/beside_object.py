@@ -1,4 +1,4 @@
-"""Which projector pixels light the room beside the object, and not the object (docs/decisions/0059)."""
+"""Which projector pixels light the room beside the object, and not the object (docs/decisions/0011)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Paint throws back the light of other surfaces as it throws back that of the projectors. So the indirect part of white,
 over its direct part, has the colour of what falls there, in units of the lamp's white. Where surfaces around have other
-colours, that says how much each of them gives (docs/decisions/0114).
+colours, that says how much each of them gives (docs/decisions/0015).
 """
 
 from __future__ import annotations

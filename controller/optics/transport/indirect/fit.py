@@ -1,7 +1,7 @@
 """G from what was measured: form factors of the reconstructed surface, and the indirect part of each white image.
 
 Surfaces give each other all light that leaves them, and so that by way of others, too. How much each gives is found
-for all light of whites and stripes; G, which begins with direct light, adds up all ways (docs/decisions/0114).
+for all light of whites and stripes; G, which begins with direct light, adds up all ways (docs/decisions/0015).
 """
 
 from __future__ import annotations

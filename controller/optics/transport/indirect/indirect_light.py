@@ -3,10 +3,10 @@
 Most of it arrives by way of other surfaces. After its first bounce light does not remember which projector it came
 from. So G acts on the direct camera image d = L p: (G d)(x) = S(x) up(F down(d))(x). Blocks of camera pixels give each
 other light by F; S is what a camera pixel makes of the light that falls on it, and holds the paint
-(docs/decisions/0045).
+(docs/decisions/0014).
 
 Where colours depend on the paint, what L says of them is corrected first, by D, a matrix of each camera pixel's three
-channels (docs/decisions/0099). Then N spreads it under the surface (docs/decisions/0107): with
+channels (docs/decisions/0015). Then N spreads it under the surface (docs/decisions/0015): with
 y = (I + N)(I + D) d, the camera sees y + S up F down y.
 """
 

@@ -101,7 +101,7 @@ def _apart(phase_map: PhaseMap, mixing: FloatImage) -> Float64:
     """(3, 5): x and y of where a channel of the camera looks, less the map's place; xx, xy, yy more of its spread.
 
     A channel sees a mixture of the projector's colours. Where they lie apart, it looks at the mean of their places, and
-    their distance from it is spread (docs/decisions/0082).
+    their distance from it is spread (docs/decisions/0006).
     """
     if phase_map.colours_px is None:
         return np.zeros((3, 5))

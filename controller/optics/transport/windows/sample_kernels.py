@@ -3,7 +3,7 @@
 A site of the camera (one colour of one pixel) sees the projector's image plane at a place phi, blurred by a Gaussian of
 covariance S. Its light is shared out over the projector pixels around phi. A window is kept as parameters, 15 bytes
 whatever its size; the shares come from tables (``profiles``). There are three sorts of windows: small and upright,
-small and skewed, and any others, whose rows a skewed S shifts along x (docs/decisions/0024).
+small and skewed, and any others, whose rows a skewed S shifts along x (docs/decisions/0006).
 
 Windows are sorted by projector, colour and tile of the projector's image. Each such cell has a small buffer that stays
 in the processor's near caches. Nothing is assumed about where neighbouring sites look: folds and occlusions are but

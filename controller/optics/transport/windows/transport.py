@@ -2,7 +2,7 @@
 
 T_n p = D ( w_n (.) G_n (p M_n') ). A row of G_n is the projector's blur around the phase map phi at one sample of the
 camera: exp(-1/2 (phi - v)' S^-1 (phi - v)) over the projector pixels v, divided by its sum. w_n is the white image as
-sampled, and D the interpolation of the camera's colours, exactly as the pictures were made (docs/decisions/0010).
+sampled, and D the interpolation of the camera's colours, exactly as the pictures were made (docs/decisions/0006).
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ from controller.stage.steps.capture.photographs import Planned, take_all
 from controller.stage.steps.troubles import tell
 
 JUDGING_BYTES: Final = 300
-"""A camera pixel, while one projector is judged (decision 97)."""
+"""A camera pixel, while one projector is judged (decision 3)."""
 
 
 def verify_step(calibrated: Calibrated, after: Sequence[StepId], scale: float) -> Step:
