@@ -42,9 +42,6 @@ from controller.cli.error_reports import DONE, FAILED, report_error
 from controller.cli.running import Json, StageFolder, group, projector_names, work
 from controller.core.errors import UsageError
 from hal.runtime.caches import prepare_libraries
-from lab.compare.command import benchmark
-from lab.simulate.command import simulate
-from lab.study.command import study
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -255,9 +252,6 @@ COMMANDS: Final[tuple[Callable[..., Any], ...]] = (
     export,
     plan,
     report,
-    study,
-    benchmark,
-    simulate,
     states,
     *serve_commands.COMMANDS,
     *kiosk_commands.COMMANDS,

@@ -82,8 +82,8 @@ def commands() -> str:
 
 def _commands(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
     if hasattr(command, "commands"):
-        for name, inner in command.commands.items():
-            yield from _commands(inner, (*path, name))
+        for name in command.list_commands(None):
+            yield from _commands(command.get_command(None, name), (*path, name))
     else:
         yield path, command
 

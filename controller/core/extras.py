@@ -20,7 +20,6 @@ EXTRAS: Final = {
     "cluster": "solve on many machines (--scheduler)",
     "ndi": "live targets by NDI",
     "gpu": "solve on a graphics processor",
-    "study": "judge a study by FLIP, and light of Mitsuba on the emulated stage",
 }
 """Purpose of each extra of pyproject.toml that people install."""
 _MODULES: Final = {
@@ -36,7 +35,6 @@ _MODULES: Final = {
     "cluster": "dask distributed",
     "ndi": "cyndilib",
     "gpu": "wgpu",
-    "study": "drjit flip_evaluator mitsuba",
 }
 EXTRA_OF: Final = {module: extra for extra, modules in _MODULES.items() for module in modules.split()}
 """The extra of each imported third-party module; "" for the base installation."""

@@ -40,7 +40,7 @@ def wrong(text: str, root: Any) -> list[str]:
     found = []
     for match in NAMED.finditer(text):
         name, words = match[1], match[2].partition(" -- ")[0].split()  # after that come another program's words
-        command = root.commands.get(name)
+        command = root.get_command(None, name)
         if command is not None and hasattr(command, "commands") and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
         if command is None or (hasattr(command, "commands") and words):

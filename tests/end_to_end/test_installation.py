@@ -10,6 +10,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -79,6 +80,14 @@ def test_the_wheel_alone_has_a_help_that_names_the_extras(wheel: Path, tmp_path:
     metadata = next((tmp_path / "plain").rglob("velatura-*.dist-info")) / "METADATA"
     assert "License-Expression: Apache-2.0" in metadata.read_text()
     assert list((tmp_path / "plain").rglob("licenses/LICENSE"))
+
+
+def test_the_wheel_holds_the_product_alone(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        tops = {name.partition("/")[0] for name in archive.namelist()}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {
+        "controller", "hal", "plugins", "firmware_configs",
+    }  # fmt: skip
 
 
 def test_an_uninstall_leaves_nothing(wheel: Path, tmp_path: Path) -> None:
