@@ -26,7 +26,7 @@ GENERATED: Final = DOCS / "generated"
 DOCUMENTED: Final = ("controller", "hal")
 RAISING: Final = ("controller", "hal", "plugins")
 STABLE: Final = "controller.api"
-API_ORDER: Final = ("photographs", "captures", "codes", "calibration", "transport", "solving", "results", "benchmark")
+API_ORDER: Final = ("captures", "codes", "calibration", "transport", "solving", "results")
 CODE: Final = re.compile(r"^[a-z<][a-z0-9<>_]*(-[a-z0-9<>_]+)+$|^[a-z]{4,}$")
 
 

@@ -23,44 +23,39 @@ Read ``captures`` first if you have photographs, ``transport`` if you have matri
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from controller.api.calibration import CalibratedRun, calibrate, decode, fit_metapixels, measure_response, read_run
-    from controller.api.captures import CaptureSet, draw_patterns, read_captures
-    from controller.api.codes import decode_folder
-    from controller.api.photographs import Developed, develop, merge_brackets
-    from controller.api.results import compare, export
-    from controller.api.solving import (
-        ReachableTarget,
-        base_image,
-        encode,
-        reachable_target,
-        scale,
-        solve,
-        solve_base,
-    )
-    from controller.api.transport import build_transport, indirect_light, transport_from_matrices
-    from controller.core.errors import VelaturaError
-    from controller.optics.calibrate.metapixels.from_phase import FittedPixels
-    from controller.optics.calibrate.values import (
-        Calibration,
-        Correspondence,
-        Geometry,
-        Metapixels,
-        PhaseMap,
-        Pinhole,
-        ProjectorCalibration,
-        Radiometry,
-    )
-    from controller.optics.capture.brackets import MergedBracket
-    from controller.optics.capture.profile import CameraNoise, CameraProfile
-    from controller.optics.solve.appearance import Base
-    from controller.optics.solve.bounded.problem import Solution
-    from controller.optics.solve.result.metrics import Comparison
-    from controller.optics.transport import LightTransport
-    from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.api.calibration import CalibratedRun, calibrate, decode, fit_metapixels, measure_response, read_run
+from controller.api.captures import CaptureSet, Developed, develop, draw_patterns, merge_brackets, read_captures
+from controller.api.codes import decode_folder
+from controller.api.results import compare, export
+from controller.api.solving import (
+    ReachableTarget,
+    base_image,
+    encode,
+    reachable_target,
+    scale,
+    solve,
+    solve_base,
+)
+from controller.api.transport import build_transport, indirect_light, transport_from_matrices
+from controller.core.errors import VelaturaError
+from controller.optics.calibrate.metapixels.from_phase import FittedPixels
+from controller.optics.calibrate.values import (
+    Calibration,
+    Correspondence,
+    Geometry,
+    Metapixels,
+    PhaseMap,
+    Pinhole,
+    ProjectorCalibration,
+    Radiometry,
+)
+from controller.optics.capture.brackets import MergedBracket
+from controller.optics.capture.profile import CameraNoise, CameraProfile
+from controller.optics.solve.appearance import Base
+from controller.optics.solve.bounded.equations import Solution
+from controller.optics.solve.result.metrics import Comparison
+from controller.optics.transport import LightTransport
+from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 __all__ = [
     "Base",
@@ -107,46 +102,3 @@ __all__ = [
     "solve_base",
     "transport_from_matrices",
 ]
-
-_MODULES: Final = {
-    "controller.api.photographs": ("Developed", "develop", "merge_brackets"),
-    "controller.api.captures": ("CaptureSet", "draw_patterns", "read_captures"),
-    "controller.api.codes": ("decode_folder",),
-    "controller.api.calibration": (
-        "CalibratedRun", "calibrate", "decode", "fit_metapixels", "measure_response", "read_run",
-    ),
-    "controller.api.transport": ("build_transport", "indirect_light", "transport_from_matrices"),
-    "controller.api.solving": (
-        "ReachableTarget", "base_image", "encode", "reachable_target", "scale", "solve", "solve_base",
-    ),
-    "controller.api.results": ("compare", "export"),
-    "controller.optics.calibrate.metapixels.from_phase": ("FittedPixels",),
-    "controller.optics.calibrate.values": (
-        "Calibration", "Correspondence", "Geometry", "Metapixels", "PhaseMap", "Pinhole", "ProjectorCalibration",
-        "Radiometry",
-    ),
-    "controller.optics.capture.brackets": ("MergedBracket",),
-    "controller.optics.capture.profile": ("CameraNoise", "CameraProfile"),
-    "controller.core.errors": ("VelaturaError",),
-    "controller.optics.solve.appearance": ("Base",),
-    "controller.optics.solve.bounded.solver": ("Solution",),
-    "controller.optics.solve.result.metrics": ("Comparison",),
-    "controller.optics.transport": ("LightTransport",),
-    "controller.optics.transport.indirect.indirect_light": ("IndirectLight",),
-}  # fmt: skip
-_HOME: Final = {name: module for module, names in _MODULES.items() for name in names}
-
-
-def __dir__() -> list[str]:
-    return [*__all__, "__doc__", "__name__"]
-
-
-if not TYPE_CHECKING:  # a type checker sees the imports above, and reports names that are not there
-
-    def __getattr__(name: str) -> object:
-        """Import a name when it is first used, so that ``import controller.api`` takes no time."""
-        if name not in _HOME:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        found = getattr(importlib.import_module(_HOME[name]), name)
-        globals()[name] = found
-        return found

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.api.captures import DESCRIPTION, description_of, unfit
-from controller.api.photographs import develop
+from controller.api.captures import DESCRIPTION, description_of, develop, unfit
 from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError

@@ -14,10 +14,9 @@ from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, Radiometry
 from controller.optics.solve import appearance
 from controller.optics.solve.appearance import Base
-from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, solve_bounded
-from controller.optics.solve.reach.exposure import expose_target
-from controller.optics.solve.reach.feasibility import target_radiance
+from controller.optics.solve.reach.feasibility import expose_target, target_radiance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight

@@ -15,7 +15,7 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import LightTransport, factory
-from controller.optics.transport.gaussians.custom_weights import patches_of_weights
+from controller.optics.transport.gaussians.patches import patches_of_weights
 from controller.optics.transport.indirect.fit import fit_indirect
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.engines.choice import choose_engine
-from controller.optics.solve.engines.processor import Engine
+from controller.optics.solve.appearance import exposed_for_one, traditional_compensation
+from controller.optics.solve.bounded.engine import Engine
+from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.reach.feasibility import target_radiance
-from controller.optics.solve.traditional import exposed_for_one, traditional_compensation
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event

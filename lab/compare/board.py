@@ -13,7 +13,7 @@ import numpy as np
 from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.optics.solve.result.evaluation import TITLES, as_table
+from controller.optics.solve.result.metrics import TITLES, as_table
 from controller.stage.report.pictures import crop_around
 from lab.compare.entering import TARGET
 from lab.compare.judging import TARGETS, Judged

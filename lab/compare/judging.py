@@ -12,7 +12,7 @@ import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import VelaturaError, WorkError
-from controller.optics.solve.result.evaluation import PixelSet
+from controller.optics.solve.result.metrics import PixelSet
 from controller.optics.solve.targets.patterns import checkerboard
 from controller.optics.solve.targets.values import Target, through_camera
 from controller.optics.transport import LightTransport, build_transport

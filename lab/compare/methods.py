@@ -15,9 +15,9 @@ from scipy.ndimage import map_coordinates
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
 from controller.optics.calibrate.values import Calibration, ProjectorCalibration
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
-from controller.optics.solve.reach.exposure import direct_part
+from controller.optics.solve.reach.feasibility import direct_part
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight

@@ -10,7 +10,7 @@ import numpy as np
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
-from controller.optics.solve.reach.exposure import direct_part
+from controller.optics.solve.reach.feasibility import direct_part
 from controller.optics.transport import LightTransport, build_transport
 from controller.stage.steps.appearance.solving import device_frames
 from lab.compare.api import BenchmarkTarget, MakeFrames

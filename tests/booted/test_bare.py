@@ -58,7 +58,7 @@ def test_a_service_that_is_broken_into_can_do_little_on_this_debian(bare: Kiosk,
 
 def test_a_graphics_processor_could_solve_on_this_debian(bare: Kiosk) -> None:
     """None is plugged in; the program that would use one is there, and looks for it."""
-    program = "from controller.optics.solve.engines.graphics import graphics_sentence; print(graphics_sentence())"
+    program = "from controller.optics.solve.engines import graphics_sentence; print(graphics_sentence())"
     said = bare.machine.call("/opt/velatura/bin/python", "-c", program, user="velatura")
     assert said.strip() == "Solves run on the processor: no graphics processor was found."
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controller.optics.solve.result.evaluation import TITLES
+from controller.optics.solve.result.metrics import TITLES
 from docs.figures import ROOT, STUDY
 from lab.study.catalogue import EXPERIMENTS
 from lab.study.output.keeping import SEEDS, read_study

@@ -25,7 +25,7 @@ from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import Computed
 from controller.optics.solve.request import solve_appearance
-from controller.optics.solve.result.evaluation import by_pixels, visible_object
+from controller.optics.solve.result.metrics import by_pixels, visible_object
 from controller.optics.solve.targets.files import load_target
 from controller.optics.solve.targets.values import srgb_to_linear
 from controller.panel.uploads import Targets, UploadLimits

@@ -19,7 +19,7 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.preview.reach import kept_at
 from controller.kiosk.values import Computed
-from controller.optics.solve.engines.graphics import MODULE
+from controller.optics.solve.engines import MODULE
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import Checked
 

@@ -28,11 +28,11 @@ from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.kiosk.preview.computed import no_device
 from controller.kiosk.preview.pictures import write_picture
 from controller.kiosk.store.targets import fitted, png_size
-from controller.optics.solve.engines.choice import choose_engine
-from controller.optics.solve.engines.processor import Processor
+from controller.optics.solve.bounded.engine import Processor
+from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.optics.solve.request import AppearanceResult, solve_appearance
-from controller.optics.solve.result.evaluation import by_pixels, visible_object
+from controller.optics.solve.result.metrics import by_pixels, visible_object
 from controller.optics.solve.targets.files import load_target
 from controller.optics.solve.targets.values import Target
 from controller.stage.artefacts.calibrated import Calibrated

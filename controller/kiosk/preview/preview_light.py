@@ -22,7 +22,7 @@ from controller.core.storage import write_atomically
 if TYPE_CHECKING:
     from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.sampled import SampledLight
+    from controller.optics.transport.operator import SampledLight
     from controller.stage.artefacts.calibrated import Calibrated
 
 FOLDER: Final = "kiosk/preview"
@@ -88,7 +88,7 @@ def sampled(calibrated: Calibrated) -> PreviewLight:
     """The light of a whole calibration at about ``LONGEST_PX`` pixels along its longer side."""
     from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.sampled import SampledLight
+    from controller.optics.transport.operator import SampledLight
 
     whole, indirect = calibrated.transport, calibrated.indirect
     rows, columns = whole.camera_shape
@@ -140,7 +140,7 @@ def _read(file: Path) -> PreviewLight | None:
     """What an earlier service has kept; None if it is not there or damaged."""
     from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.sampled import SampledLight
+    from controller.optics.transport.operator import SampledLight
 
     try:
         with np.load(file) as parts:

@@ -75,7 +75,7 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     from controller.kiosk.preview.pictures import write_picture
     from controller.kiosk.preview.preview_light import preview_light
     from controller.optics.solve.request import aim_at
-    from controller.optics.solve.result.evaluation import visible_object
+    from controller.optics.solve.result.metrics import visible_object
     from controller.stage.steps.appearance.solving import options_of
 
     light = preview_light(checked.stage.folder, run, checked.names)

@@ -46,7 +46,7 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill",
     """
     import cv2
 
-    from controller.optics.solve.targets.profiles import Unsuitable, embedded_profile, with_profile
+    from controller.optics.solve.targets.colour import Unsuitable, embedded_profile, with_profile
 
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
     if decoded is None:

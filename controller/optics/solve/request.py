@@ -26,13 +26,18 @@ from controller.optics.solve.appearance import (
     make_appearance,
     solve_base,
 )
+from controller.optics.solve.bounded.engine import Engine
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import TOLERANCE
-from controller.optics.solve.bounded.weights import appearance_weights
-from controller.optics.solve.engines.processor import Engine
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
-from controller.optics.solve.reach.exposure import direct_part, expose_target
-from controller.optics.solve.reach.feasibility import Feasibility, feasibility, target_radiance
+from controller.optics.solve.reach.feasibility import (
+    Feasibility,
+    direct_part,
+    expose_target,
+    feasibility,
+    target_radiance,
+)
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
@@ -112,7 +117,7 @@ def solve_appearance(
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
     ``indirect``: light by way of other surfaces, of which the frames then leave room in the target.
-    ``engine``: what does the heavy loops (``engines``); None: the processor
+    ``engine``: what does the heavy loops (``solve.engines``); None: the processor
     ``folder``: for nameless files of what need not stay in memory during the solve; None: it stays there
 
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.

@@ -18,9 +18,8 @@ import scipy.sparse as sp
 from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.metapixels.depth_edges import EdgeShares
-from controller.optics.transport.camera_box import CameraBox
 from controller.optics.transport.operator import LightTransport
-from controller.optics.transport.planes import image_planes
+from controller.optics.transport.planes import CameraBox, image_planes
 
 NOISES: Final = 2.0
 """Differences of this many standard deviations of their noise are halved; smaller ones vanish, larger ones stay."""

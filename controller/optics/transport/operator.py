@@ -25,8 +25,7 @@ from scipy.sparse.linalg import LinearOperator
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.checks import check_shape
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.planes import frame_planes, image_planes, plane_frames, plane_image
+from controller.optics.transport.planes import CameraBox, frame_planes, image_planes, plane_frames, plane_image
 
 FAINTEST: Final = 1e-6
 """A camera pixel counts as lit by a projector above this fraction of the projector's brightest white."""
@@ -240,3 +239,67 @@ def _planes(x: _Vector, pixels: int) -> FloatImage:
 def _vector(planes: FloatImage, x: _Vector) -> _Vector:
     """Flat, and in double precision where ``x`` is: norms of solvers that work in it must not overflow."""
     return planes.reshape(-1).astype(np.result_type(x, np.float32), copy=False)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledLight(LightTransport):
+    """T of projectors that have one pixel each.
+
+    ``white`` (projectors, 3, rows, columns) float32: the light of each projector's white at the pixels that are kept
+    """
+
+    white: FloatImage
+
+    @classmethod
+    def of(cls, transport: LightTransport, at: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]) -> Self:
+        """Of a whole transport, at the camera's rows and columns ``at``."""
+        count = len(transport.sizes)
+        ones = np.ones((3, transport.pixels), np.float32)
+        kept = np.ix_(*at)
+        white = np.stack([transport.forward_planes(ones, projectors=(n, n + 1))[:, kept[0], kept[1]]
+                          for n in range(count)])  # fmt: skip
+        lit = np.stack([np.asarray(part)[kept] for part in transport.lit])
+        return cls.made(transport.mixing, lit, white, transport.segments)
+
+    @classmethod
+    def made(cls, mixing: FloatImage, lit: Mask, white: FloatImage, segments: Sequence[float]) -> Self:
+        """From its parts."""
+        seen = lit.reshape(len(lit), -1).sum(axis=1)
+        per_weight = np.divide(1, seen, out=np.zeros(len(lit), np.float32), where=seen > 0).astype(np.float32)
+        return cls(mixing, lit, per_weight, ((1, 1),) * len(lit), white, segments=tuple(segments))
+
+    def forward_planes(
+        self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        image = np.zeros((3, *self.camera_shape), np.float32) if out is None else out
+        image[...] = 0
+        for n in range(*(projectors or (0, len(self.white)))):
+            image += self.white[n] * (self.mixing[n] @ p[:, n])[:, None, None]
+        return image
+
+    def adjoint_planes(
+        self, r: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
+    ) -> FloatImage:
+        planes = np.zeros((3, self.pixels), np.float32) if out is None else out
+        for n in range(*(projectors or (0, len(self.white)))):
+            planes[:, n] = self.mixing[n].T @ np.einsum("cyx,cyx->c", self.white[n], r)
+        return planes
+
+    def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:
+        planes = np.zeros((3, self.pixels), np.float32)
+        for n in range(*(projectors or (0, len(self.white)))):
+            planes[:, n] = image[:, self.lit[n]].sum(axis=1) * self.per_weight[n]
+        return planes
+
+    def submatrix(
+        self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
+    ) -> sp.csr_matrix[np.float64]:
+        blocks = [
+            [self.mixing[n][row, column] * self.white[n][row][box.window].reshape(-1, 1) for column in channels
+             for n in pixels]
+            for row in channels
+        ]  # fmt: skip
+        return sp.csr_matrix(np.block(blocks).astype(np.float64))
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {"mixing": self.mixing, "lit": self.lit, "white": self.white, "segments": np.array(self.segments)}

@@ -9,7 +9,7 @@ from controller.core.arrays import FloatImage
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import Base, prepare_base
-from controller.optics.solve.engines.processor import Engine, Processor
+from controller.optics.solve.bounded.engine import Engine, Processor
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.fit import beside, fit_indirect

@@ -19,7 +19,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import json_path, npz_path, read_json, stem, write_json
 
 if TYPE_CHECKING:
-    from controller.optics.solve.bounded.problem import Solution
+    from controller.optics.solve.bounded.equations import Solution
     from controller.optics.solve.result.refinement import ModelError
     from controller.optics.solve.targets.values import Target
 
@@ -47,7 +47,7 @@ class SolvedBase:
     @classmethod
     def read(cls, run: Path, projectors: Sequence[str]) -> Self:
         """The frames in the order of ``projectors``."""
-        from controller.optics.solve.bounded.problem import Solution
+        from controller.optics.solve.bounded.equations import Solution
 
         arrays = load_arrays(npz_path(run, StepKind.BASE))
         frames = tuple(arrays[f"frame-{name}"] for name in projectors)

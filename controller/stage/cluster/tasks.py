@@ -19,7 +19,7 @@ import xxhash
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
 from controller.optics.solve.appearance import Base, prepare_base
-from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target

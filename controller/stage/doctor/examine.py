@@ -13,7 +13,7 @@ from typing import Any, Final
 from controller.config.loader import FILE
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
-from controller.optics.solve.engines.graphics import graphics_sentence
+from controller.optics.solve.engines import graphics_sentence
 from controller.run.progress import Reporter
 from controller.stage.doctor.search_address import PJLINK, search_address
 from controller.stage.doctor.trying import Trying, devices_of

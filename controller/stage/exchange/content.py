@@ -14,7 +14,7 @@ from controller.optics.calibrate.mesh.grid_mesh import Mesh, grid_mesh
 from controller.optics.calibrate.metapixels.initial_estimate import project
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.optics.transport import LightTransport
-from controller.optics.transport.camera_box import CameraBox
+from controller.optics.transport.planes import CameraBox
 
 
 @dataclass(frozen=True)

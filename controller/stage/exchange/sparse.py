@@ -15,7 +15,7 @@ from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
 from controller.core.storage import stream_atomically, write_atomically
 from controller.optics.transport import LightTransport
-from controller.optics.transport.camera_box import CameraBox
+from controller.optics.transport.planes import CameraBox
 from controller.stage.artefacts.names import safe_name
 from controller.stage.exchange.content import Content
 

@@ -16,8 +16,8 @@ import numpy as np
 from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, check_pixels, read_picture_bytes
+from controller.optics.solve.targets.colour import Unsuitable, embedded_profile
 from controller.optics.solve.targets.files import check_picture, read_picture
-from controller.optics.solve.targets.profiles import Unsuitable, embedded_profile
 from controller.optics.solve.targets.values import linear_to_srgb
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")

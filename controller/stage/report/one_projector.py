@@ -9,8 +9,15 @@ from typing import Any
 
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.result.evaluation import TITLES, PixelSet, as_table, by_pixels, visible_object
-from controller.optics.solve.result.metrics import Comparison, compare
+from controller.optics.solve.result.metrics import (
+    TITLES,
+    Comparison,
+    PixelSet,
+    as_table,
+    by_pixels,
+    compare,
+    visible_object,
+)
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.published import Dimmed, read_photograph_of
 from controller.stage.artefacts.solved import RequestedTarget, Solved

@@ -16,7 +16,7 @@ import jinja2
 from controller.core.arrays import ByteImage
 from controller.core.lettering import font_file
 from controller.core.storage import write_atomically
-from controller.optics.solve.result.evaluation import as_rows
+from controller.optics.solve.result.metrics import as_rows
 from controller.stage.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.stage.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
 

@@ -11,7 +11,7 @@ from typing import Any
 from controller.bundle.install import current
 from controller.config.models import SolveTable
 from controller.optics.solve.appearance import BaseChoice
-from controller.optics.solve.engines.choice import choose_engine
+from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.request import SolveOptions
 from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal

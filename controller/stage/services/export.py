@@ -11,7 +11,7 @@ import numpy as np
 from controller.core.arrays import ByteImage, FloatImage, summed
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
-from controller.optics.transport.camera_box import CameraBox
+from controller.optics.transport.planes import CameraBox
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import has_geometry, projectors_of, read_geometry
 from controller.stage.artefacts.projectors import Light, Pixels

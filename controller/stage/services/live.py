@@ -18,7 +18,7 @@ from controller.bundle.reader import Bundle
 from controller.core.arrays import FloatImage
 from controller.core.errors import BundleError
 from controller.core.storage import runtime_folder
-from controller.optics.solve.reach.exposure import exposure
+from controller.optics.solve.reach.feasibility import exposure
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from controller.play.live.stream import TARGET

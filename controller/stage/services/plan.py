@@ -13,14 +13,12 @@ import numpy as np
 from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.optics.plan.drawing import layout, value_map
-from controller.optics.plan.figures import combined_light, figures_of
+from controller.optics.plan.figures import combined_light, figures_of, layout, value_map
 from controller.optics.plan.optics import lit_by
 from controller.optics.plan.plan_file import EXAMPLE, PlanTables, read_plan
 from controller.optics.plan.search import PlacementPlan, candidates_of, choose_placements
-from controller.optics.plan.target_object import TargetObject, read_target_object, sampled
+from controller.optics.plan.target_object import TargetObject, read_target_object, sampled, seen_from
 from controller.optics.plan.values import Placement, PlanGoal, Surface
-from controller.optics.plan.view import seen_from
 from controller.run.progress import Reporter, Tracker
 from controller.stage.report.page import Goal, Page, ReportPicture, render
 

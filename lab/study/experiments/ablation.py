@@ -10,10 +10,10 @@ from controller.core.arrays import FloatImage
 from controller.optics.calibrate.metapixels.quadrilateral import quadrilateral_weights
 from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
 from controller.optics.calibrate.values import Calibration, Metapixels
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.gaussians.custom_weights import patches_of_weights
+from controller.optics.transport.gaussians.patches import patches_of_weights
 from controller.stage.report.pictures import crop_around
 from controller.stage.steps.calibrate.dots import CLEAR_GAIN
 from lab.study.output.drawing import LabelledPicture, detail, screen, strip

@@ -13,9 +13,8 @@ from controller.optics.calibrate.photometry.reflectance import own_reflectance
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.feasibility import choose_exposure, feasibility
-from controller.optics.solve.result.evaluation import TITLES, PixelSet, by_pixels
 from controller.optics.solve.result.ghosting import Ghosting, ghosting
-from controller.optics.solve.result.metrics import lab_of
+from controller.optics.solve.result.metrics import TITLES, PixelSet, by_pixels, lab_of
 from controller.stage.report.pictures import Crop, crop_around
 from lab.study.output.drawing import LabelledPicture, Line, plotted, screen, strip
 from lab.study.subject.subject import Subject

@@ -9,10 +9,10 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.appearance import traditional_compensation
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
 from controller.optics.solve.result.metrics import colour_difference
-from controller.optics.solve.traditional import traditional_compensation
 from controller.optics.transport import LightTransport, build_transport
 from controller.stage.report.pictures import crop_around, error_picture
 from lab.study.experiments.ablation import paper_model, raw_transport

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
+from controller.optics.solve.bounded.regions import solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.regions.solver import solve_regions
 from lab.study.output.drawing import LabelledPicture, detail, maps, screen, strip
 from lab.study.subject.measuring import predicted
 from lab.study.subject.subject import ReachableTarget, Subject

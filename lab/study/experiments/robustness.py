@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError
-from controller.optics.solve.result.evaluation import TITLES
+from controller.optics.solve.result.metrics import TITLES
 from lab.study.output.drawing import Line, SmallPlot, small_plots
 from lab.study.subject.measuring import SET_COLUMNS, set_cells
 from lab.study.subject.subject import BenchChange, StageControl, Subject

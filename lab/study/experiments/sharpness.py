@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
 from controller.optics.solve.targets.patterns import checkerboard
 from controller.optics.solve.targets.values import through_camera
 from controller.optics.transport import build_transport

@@ -11,8 +11,14 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.optics.solve.result.evaluation import TITLES, PixelSet, by_pixels
-from controller.optics.solve.result.metrics import compare, sharpness_around, structural_similarity
+from controller.optics.solve.result.metrics import (
+    TITLES,
+    PixelSet,
+    by_pixels,
+    compare,
+    sharpness_around,
+    structural_similarity,
+)
 from controller.optics.solve.targets.values import linear_to_srgb
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import image_planes, plane_frames

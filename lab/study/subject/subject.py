@@ -14,8 +14,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, Geometry, Metapixels
 from controller.optics.calibrate.verify.drift import Drift
 from controller.optics.solve.reach.drive_levels import DriveLevels
-from controller.optics.solve.reach.exposure import expose_target
-from controller.optics.solve.reach.feasibility import target_radiance
+from controller.optics.solve.reach.feasibility import expose_target, target_radiance
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from controller.core.arrays import FloatImage
 from controller.optics.solve.appearance import Base
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
 from controller.optics.solve.scaling.dither import to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import scaling_maps

@@ -18,7 +18,7 @@ import numpy as np
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import base_image
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.windows.sample_kernels import OTHER, SORTS, UPRIGHT
+from controller.optics.transport.windows.profiles import OTHER, SORTS, UPRIGHT
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import projectors_of
 from lab.timings import Row, at_most

@@ -21,9 +21,9 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.optics.solve.appearance import base_image, prepare_base, scale_frames
-from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.engine import Engine, Processor
+from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.engines.processor import Engine, Processor
 from controller.optics.solve.gpu.device import Device, adapters
 from controller.optics.solve.gpu.engine import GpuEngine
 from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance

@@ -27,13 +27,10 @@ import scipy.sparse as sp
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.solve.appearance import base_image
-from controller.optics.solve.bounded.descent import IterationControl, block_coordinate_descent
-from controller.optics.solve.bounded.equations import smoothness_term
-from controller.optics.solve.bounded.problem import Problem
-from controller.optics.solve.bounded.smoothness import EDGE_WEIGHT_STEPS
+from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
+from controller.optics.solve.bounded.equations import EDGE_WEIGHT_STEPS, Problem, smoothness_term
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.planes import plane_image
+from controller.optics.transport.planes import CameraBox, plane_image
 from lab.timings import Row, at_least, at_most, timed
 from lab.timings.tools.synthetic import synthetic_calibration
 from lab.timings.tools.traced import traced

@@ -18,10 +18,9 @@ import numpy as np
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.equations import build_problem, initial_point
+from controller.optics.solve.bounded.regions import PHASES, SIZE_PX, BoxProblem, Regions, solve_box, solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
-from controller.optics.solve.regions.box_solvers import BoxProblem, solve_box
-from controller.optics.solve.regions.solver import PHASES, SIZE_PX, Regions, solve_regions
 from controller.optics.transport import LightTransport, build_transport
 from hal.runtime.compute import usable_cpus
 from lab.timings import Row, Timing, at_least, at_most

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError
-from controller.optics.solve.result.evaluation import PixelSet
+from controller.optics.solve.result.metrics import PixelSet
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import ShotId

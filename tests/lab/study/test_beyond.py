@@ -15,7 +15,7 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.optics.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.optics.calibrate.verify.registration import Motion
-from controller.optics.solve.result.evaluation import PixelSet
+from controller.optics.solve.result.metrics import PixelSet
 from controller.optics.transport import build_transport
 from controller.stage.steps.modes import DotOptions
 from hal.errors import DeviceError

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from numba import prange
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
-from controller.optics.solve.bounded.problem import EdgeWeights
+
+EdgeWeights = npt.NDArray[np.uint16]
+"""Squared weights of the smoothness edges (3, pixels), in steps of 1 / EDGE_WEIGHT_STEPS (docs/decisions/0004)."""
 
 
 @compiled(parallel=True, fastmath=True)

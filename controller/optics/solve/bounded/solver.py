@@ -1,7 +1,7 @@
 """Compensation images by a global, bounded, smooth least-squares solve (paper 2.2-2.4, eqs 2 and 3).
 
 Minimise  sum_u w_u |T p + K - C|^2  +  s sum over adjacent pixels of alpha^2 (p_i - p_j)^2   subject to 0 <= p <= 1
-by accelerated projected gradient, one projector after the other (``descent``, docs/decisions/0008). T is (nearly)
+by accelerated projected gradient, one projector after the other (``engine``, docs/decisions/0008). T is (nearly)
 non-negative, so the row sums |T_n|' w |T_n| 1 majorise the data part of the Hessian of projector n, and give every one
 of its pixels a step of its own.
 """
@@ -17,9 +17,8 @@ from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.checks import all_finite, check_image
 from controller.core.errors import UsageError
-from controller.optics.solve.bounded.descent import IterationControl
-from controller.optics.solve.bounded.problem import Solution, SolveInput
-from controller.optics.solve.engines.processor import Engine, Processor
+from controller.optics.solve.bounded.engine import Engine, IterationControl, Processor
+from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.transport import LightTransport
 
 TOLERANCE: Final = 3e-5
@@ -57,7 +56,7 @@ def solve_bounded(
     start : frames to start from, for example those of a similar target
     tolerance : stop when the rms scaled projected gradient step falls below it
     progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration, or once in a few of them
-    engine : what does the sweeps (``engines``); None: the processor
+    engine : what does the sweeps (``solve.engines``); None: the processor
 
     Raises
     ------

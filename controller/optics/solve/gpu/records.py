@@ -15,9 +15,21 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
-from controller.optics.transport.windows.cells import even_gains
-from controller.optics.transport.windows.profiles import LANES, PHASE_BITS, PHASES, SHEAR_BITS, Profiles, SmallProfiles
-from controller.optics.transport.windows.sample_kernels import NEAR, OTHER, SORTS, STRIP, TILE, Windows
+from controller.optics.transport.windows.products import even_gains
+from controller.optics.transport.windows.profiles import (
+    LANES,
+    NEAR,
+    OTHER,
+    PHASE_BITS,
+    PHASES,
+    SHEAR_BITS,
+    SORTS,
+    STRIP,
+    TILE,
+    Profiles,
+    SmallProfiles,
+    Windows,
+)
 
 MARGIN: Final = 32
 """Windows begin at most so many pixels outside the frame."""

@@ -19,8 +19,8 @@ from controller.optics.solve.bounded.initial_estimate import BLOCK_PX
 from controller.optics.solve.gpu.device import GROUP, Buffer, Device, DeviceRefused, Held, Work
 from controller.optics.solve.gpu.records import BLOCK, RECORD_BYTES, bands_of, place_columns, reach_of
 from controller.optics.transport import LightTransport
-from controller.optics.transport.camera_box import CameraBox
 from controller.optics.transport.edge_terms import EdgedTransport, EdgeTerm
+from controller.optics.transport.planes import CameraBox
 from controller.optics.transport.windows.transport import WindowTransport
 
 SQUARE: Final = 8

@@ -1,1 +1,1 @@
-"""What can be reached of a target: `exposure`, `feasibility`, `drive_levels`; `adaptation` where light is lacking."""
+"""What can be reached of a target, and its exposure: `feasibility`, `drive_levels`; `adaptation` bends the rest."""

@@ -1,1 +1,1 @@
-"""What became of a target: `metrics`, `evaluation` and `ghosting` of a photographed result, and its `refinement`."""
+"""What became of a target: `metrics` and `ghosting` of a photographed result, and its `refinement`."""

@@ -17,9 +17,9 @@ import numpy as np
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import masked_blur
+from controller.optics.solve.bounded.engine import Engine
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
-from controller.optics.solve.engines.processor import Engine
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import feasibility, target_radiance
 from controller.optics.solve.result.metrics import colour_difference

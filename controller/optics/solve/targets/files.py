@@ -14,8 +14,16 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.core.files import read_picture_bytes
 from controller.optics.capture.linear_files import Unreadable, exr_chromaticities, read_exr
-from controller.optics.solve.targets.colour import SPACES, ColourSpace, Primaries, decoded
-from controller.optics.solve.targets.profiles import Profile, Unsuitable, embedded_profile, read_profile
+from controller.optics.solve.targets.colour import (
+    SPACES,
+    ColourSpace,
+    Primaries,
+    Profile,
+    Unsuitable,
+    decoded,
+    embedded_profile,
+    read_profile,
+)
 from controller.optics.solve.targets.values import Target
 
 PHOTOGRAPHS: Final = {"astronaut": Path(__file__).with_name("astronaut.png")}

@@ -1,8 +1,9 @@
-"""A target picture, and the sRGB curve between picture files and linear light (IEC 61966-2-1)."""
+"""A target picture, its parts on objects that stand apart, and the sRGB curve of picture files (IEC 61966-2-1)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.blur import masked_blur
+from controller.optics.calibrate.values import Geometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +60,54 @@ def through_camera(target: Target, *, sigma_px: float = CAMERA_FILTER_PX) -> Tar
     """
     image = np.where(target.mask[..., None], masked_blur(target.image, target.mask, sigma_px), 0)
     return Target(np.asarray(image, np.float32), target.mask, f"by the camera's own blur, {sigma_px:g} px")
+
+
+LEAST_SHARE = 0.04
+"""A part smaller than this share of the whole is not an object of its own, but belongs to the nearest one."""
+
+
+def pieces(mask: Mask) -> list[Mask]:
+    """Split ``mask`` (rows, columns) into objects that do not touch in the image, the largest first.
+
+    Slivers and islands (shadows cut them off) go to the nearest object. The masks are disjoint and cover ``mask``.
+    """
+    from scipy import ndimage
+
+    labels, count = ndimage.label(mask, structure=np.ones((3, 3)))
+    if count == 0:
+        return []
+    sizes = np.bincount(labels.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable") + 1
+    large = [int(label) for label in order if sizes[label - 1] >= LEAST_SHARE * mask.sum()] or [int(order[0])]
+    nearest = ndimage.distance_transform_edt(~np.isin(labels, large), return_distances=False, return_indices=True)
+    owner = labels[tuple(nearest)]
+    return [mask & (owner == label) for label in large]
+
+
+def on_each(mask: Mask, make: Callable[[Mask], Target]) -> Target:
+    """The targets that ``make`` gives for each object of ``mask``, side by side in one."""
+    image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
+    said: Mask = np.zeros(mask.shape, np.bool_)
+    softened = ""
+    for piece in pieces(mask):
+        part = make(piece)
+        image[piece] = part.image[piece]
+        said |= part.mask & piece
+        softened = part.softened or softened
+    return Target(image, said, softened)
+
+
+def in_box(geometry: Geometry, mask: Mask, make: Callable[[Geometry, Mask], Target]) -> Target:
+    """``make`` for the part of the picture (rows, columns) that ``mask`` has pixels in; it may look at no others.
+
+    An object is a part of a picture, and each of several a small one.
+    """
+    if not mask.any():
+        return make(geometry, mask)
+    rows, columns = (slice(int(at[0]), int(at[-1]) + 1) for at in (np.flatnonzero(mask.any(axis=n)) for n in (1, 0)))
+    part = replace(geometry, points_m=geometry.points_m[rows, columns], normals=geometry.normals[rows, columns])
+    made = make(part, mask[rows, columns])
+    image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
+    said: Mask = np.zeros(mask.shape, np.bool_)
+    image[rows, columns], said[rows, columns] = made.image, made.mask
+    return replace(made, image=image, mask=said)

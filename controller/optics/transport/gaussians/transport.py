@@ -1,28 +1,180 @@
 """The light transport where only metapixels are known: Gaussians in the camera image, normalised (paper 4.2.3).
 
-Where the camera's own blur H is known, it stands in the shares: G_n p = H (a_n (.) g_n p) / H (a_n (.) g_n 1), with g_n
-the shares on the object and a_n the white image before the blur (docs/decisions/0006).
+The camera's own blur H (its optics and the interpolation of its colours) comes after the object's colour: at a painted
+edge a camera pixel's light is an average over places of different colour. So where H is known, it stands in the shares:
+G_n p = H (a_n (.) g_n p) / H (a_n (.) g_n 1), with g_n the shares on the object and a_n the white image before the blur
+(docs/decisions/0006).
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from numba import prange
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
-from controller.optics.calibrate.values import Calibration
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.gaussians.blur import blur_planes, gaussian_taps, sharpened, without_blur
-from controller.optics.transport.gaussians.matrix import patch_rows
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.jit import compiled
+from controller.optics.calibrate.values import Calibration, Metapixels
 from controller.optics.transport.gaussians.patches import Patches, build_patches
 from controller.optics.transport.gaussians.products import adjoint_planes, forward_planes, gaussian_sums, multiply_add
 from controller.optics.transport.operator import FAINTEST, LightTransport
-from controller.optics.transport.planes import image_planes
+from controller.optics.transport.planes import CameraBox, image_planes
+from controller.optics.transport.simd.gaussians import LANES
+
+Pixels = npt.NDArray[np.int64]
+
+
+def patch_rows(
+    patches: Patches,
+    gain: FloatImage,
+    after: FloatImage,
+    taps: FloatImage,
+    mixing: FloatImage,
+    box: CameraBox,
+    pixels: Pixels,
+    channels: tuple[int, ...],
+) -> sp.csr_matrix[np.float64]:
+    """``LightTransport.submatrix`` of patches; the arrays are those of ``PatchTransport``."""
+    radius = taps.shape[1] // 2
+    wide = box.grown(radius, (int(patches.camera_shape[0]), int(patches.camera_shape[1])))
+    owner = np.searchsorted(patches.start, pixels, side="right") - 1
+    shares = _shares(patches, pixels, wide)
+    by_projector = [np.flatnonzero(owner == n) for n in np.unique(owner)]
+    order = np.argsort(np.concatenate(by_projector), kind="stable")
+    blocks = []
+    for c in channels:
+        parts = []
+        for mine in by_projector:
+            n = int(owner[mine[0]])
+            part = sp.diags_array(gain[n, c][wide.window].ravel().astype(np.float64)) @ shares[:, mine]
+            if radius > 0:
+                factor = after[n, c][box.window].ravel().astype(np.float64)
+                part = sp.diags_array(factor) @ (_blur(taps[c], box, wide) @ part)
+            parts.append(part)
+        whole = sp.hstack(parts, format="csc")[:, order]
+        mixed = [whole @ sp.diags_array(mixing[owner, c, d].astype(np.float64)) for d in channels]
+        blocks.append(sp.hstack(mixed, format="csr"))
+    return sp.csr_matrix(sp.vstack(blocks, format="csr"))
+
+
+def _shares(patches: Patches, pixels: Pixels, box: CameraBox) -> sp.csc_matrix[np.float64]:
+    """(camera pixels of the box, projector pixels): the weights of the metapixels, before gain."""
+    size = int((patches.rows[pixels].astype(np.int64) * patches.groups[pixels]).sum()) * LANES
+    row, column, value = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
+    count = _gather(patches, pixels, box, row, column, value)
+    shape = ((box.bottom - box.top) * (box.right - box.left), pixels.size)
+    return sp.csc_matrix((value[:count], (row[:count], column[:count])), shape=shape)
+
+
+@compiled()
+def _gather(
+    patches: Patches,
+    pixels: Pixels,
+    box: CameraBox,
+    row: npt.NDArray[np.int32],
+    column: npt.NDArray[np.int32],
+    value: Float64,
+) -> int:
+    top, left, bottom, right = box
+    n = 0
+    for i in range(pixels.size):
+        v = pixels[i]
+        k = np.int64(patches.first[v]) * LANES
+        for y in range(patches.row[v], patches.row[v] + patches.rows[v]):
+            for x in range(patches.column[v], patches.column[v] + patches.groups[v] * LANES):
+                if patches.weights[k] > 0 and top <= y < bottom and left <= x < right:
+                    row[n], column[n], value[n] = (y - top) * (right - left) + x - left, i, patches.weights[k]
+                    n += 1
+                k += 1
+    return n
+
+
+def _blur(taps: FloatImage, box: CameraBox, wide: CameraBox) -> sp.csr_matrix[np.float64]:
+    """(pixels of ``box``, pixels of ``wide``): the camera's blur, as in ``blur_planes``."""
+    down = _taps_between(taps, (box.top, box.bottom), (wide.top, wide.bottom))
+    across = _taps_between(taps, (box.left, box.right), (wide.left, wide.right))
+    return sp.csr_matrix(sp.kron(sp.csr_matrix(down), sp.csr_matrix(across), format="csr"))
+
+
+def _taps_between(taps: FloatImage, to: tuple[int, int], since: tuple[int, int]) -> Float64:
+    k = np.arange(*since)[None, :] - np.arange(*to)[:, None] + taps.size // 2
+    return np.where((k >= 0) & (k < taps.size), taps[np.clip(k, 0, taps.size - 1)], 0).astype(np.float64)
+
+
+SHARPENING_ROUNDS = 4
+LEAST_VARIANCE_PX2 = 0.1
+"""A metapixel is never thought sharper than this: a projector pixel has a size of its own."""
+
+
+def gaussian_taps(sigma_px: tuple[float, float, float]) -> FloatImage:
+    """(3, 2 r + 1) float32: a sampled Gaussian a channel, each summing to 1; a single 1 where there is no blur."""
+    radius = max(0, math.ceil(3 * max(sigma_px)))
+    at = np.arange(-radius, radius + 1)
+    taps = np.stack([np.exp(-0.5 * (at / max(sigma, 1e-3)) ** 2) for sigma in sigma_px])
+    return np.asarray(taps / taps.sum(axis=1, keepdims=True), np.float32)
+
+
+@compiled(parallel=True, fastmath=True)
+def blur_planes(planes: FloatImage, taps: FloatImage, scratch: FloatImage, out: FloatImage) -> None:
+    """Convolve (3, rows, columns) with ``taps`` along both axes, nothing beyond the border; its own transpose.
+
+    ``scratch`` and ``out`` have the shape of ``planes``; ``out`` may be ``planes``.
+    """
+    channels, rows, columns = planes.shape
+    radius = taps.shape[1] // 2
+    for line in prange(channels * rows):
+        c, y = line // rows, line % rows
+        row = scratch[c, y]
+        row[:] = 0
+        for k in range(taps.shape[1]):
+            shift, tap = k - radius, taps[c, k]
+            first, last = max(0, -shift), min(columns, columns - shift)
+            for x in range(first, last):
+                row[x] += tap * planes[c, y, x + shift]
+    for line in prange(channels * rows):
+        c, y = line // rows, line % rows
+        row = out[c, y]
+        row[:] = 0
+        for k in range(max(0, radius - y), min(taps.shape[1], rows - y + radius)):
+            tap, from_row = taps[c, k], scratch[c, y + k - radius]
+            for x in range(columns):
+                row[x] += tap * from_row[x]
+
+
+def sharpened(image: FloatImage, taps: FloatImage) -> FloatImage:
+    """What (3, rows, columns) >= 0 was before the blur, as far as noise allows: a few rounds of Richardson and Lucy."""
+    found = image.copy()
+    scratch, blurred = np.empty_like(image), np.empty_like(image)
+    faint = 1e-6 * float(image.max(initial=0)) + 1e-30
+    for _ in range(SHARPENING_ROUNDS):
+        blur_planes(found, taps, scratch, blurred)
+        np.divide(image, np.maximum(blurred, faint), out=blurred)
+        blur_planes(blurred, taps, scratch, blurred)
+        found *= blurred
+    return found
+
+
+def without_blur(metapixels: Metapixels, sigma_px: tuple[float, float, float]) -> Metapixels:
+    """The metapixels on the object: their covariances minus the camera's, averaged over its channels."""
+    variance = float(np.mean(np.square(sigma_px)))
+    if variance == 0:
+        return metapixels
+    xx, xy, yy = np.moveaxis(metapixels.covariance_px2.astype(np.float64), -1, 0)
+    middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    least = np.minimum(LEAST_VARIANCE_PX2, middle - apart)
+    wide, narrow = (np.maximum(value - variance, least) for value in (middle + apart, middle - apart))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine, sine = np.where(apart > 0, (xx - yy) / 2 / apart, 1.0), np.where(apart > 0, xy / apart, 0.0)
+    middle, apart = (wide + narrow) / 2, (wide - narrow) / 2
+    covariance = np.stack([middle + apart * cosine, apart * sine, middle - apart * cosine], axis=-1)
+    return dataclasses.replace(metapixels, covariance_px2=covariance.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

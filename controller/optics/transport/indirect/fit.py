@@ -1,7 +1,8 @@
 """G from what was measured: form factors of the reconstructed surface, and the indirect part of each white image.
 
 Surfaces give each other all light that leaves them, and so that by way of others, too. How much each gives is found
-for all light of whites and stripes; G, which begins with direct light, adds up all ways (docs/decisions/0015).
+for all light of whites and stripes; G, which begins with direct light, adds up all ways (docs/decisions/0015). What a
+paint changes of the colours that the local transport predicts is part of it (``paint_colours``).
 """
 
 from __future__ import annotations
@@ -13,20 +14,97 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.core.arrays import FloatImage, Mask, summed
+from controller.core import channels
+from controller.core.arrays import Float64, FloatImage, Mask, strips, summed
+from controller.optics.calibrate.photometry.paint_mixing import colour_of
 from controller.optics.calibrate.photometry.surface_spread import typical_spread
-from controller.optics.calibrate.values import Calibration, ProjectorCalibration
+from controller.optics.calibrate.values import Calibration, ProjectorCalibration, Radiometry
 from controller.optics.capture.patterns import plan_patterns
 from controller.optics.transport.indirect.blocks import down, parted, up
-from controller.optics.transport.indirect.bounces import Both, by_all_ways, with_bounces
-from controller.optics.transport.indirect.falling_colours import falling_colours
 from controller.optics.transport.indirect.form_factors import form_factors
-from controller.optics.transport.indirect.indirect_light import IndirectLight
-from controller.optics.transport.indirect.paint_colours import paint_colours
-from controller.optics.transport.indirect.shape import shaped
+from controller.optics.transport.indirect.indirect_light import Colours, IndirectLight
 from controller.optics.transport.indirect.stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
 from controller.optics.transport.indirect.surface_light import SurfaceLight
-from controller.optics.transport.indirect.weights import BlockLight, Part, Term, block_light, fit_weights
+from controller.optics.transport.indirect.weights import (
+    BlockLight,
+    Part,
+    Term,
+    block_light,
+    falling_colours,
+    fit_weights,
+    shaped,
+)
+
+
+def paint_colours(calibration: Calibration, lit: Mask) -> Colours | None:
+    """D (3, 3, rows, columns) of ``IndirectLight``; None where one mixing holds for all paints.
+
+    One D stands for all projectors: their mean, weighted by their white light. Lamps of one kind have the same.
+
+    Parameters
+    ----------
+    calibration : with ``Radiometry.paint`` of each projector, or of none
+    lit : (rows, columns) camera pixels whose direct light the transport knows; D is 0 elsewhere
+    """
+    if any(part.radiometry.paint is None for part in calibration.projectors):
+        return None
+    found = np.zeros((3, 3, *lit.shape), np.float16)
+    for rows in strips(len(lit)):
+        light, total = np.zeros((3, 3, *lit[rows].shape)), np.full(lit[rows].shape, 1e-30)
+        for part in calibration.projectors:
+            white = np.maximum(part.white[rows], 0).astype(np.float64)
+            strength = channels.total(white)
+            light += strength * _deviation(part.radiometry, colour_of(white))
+            total += strength
+        found[:, :, rows] = np.where(lit[rows], light / total, 0)
+    return found
+
+
+def _deviation(radiometry: Radiometry, colour: Float64) -> Float64:
+    """D (3, 3, rows, columns) of one projector; ``colour`` (rows, columns, 3, 3) of its white, as of ``colour_of``."""
+    assert radiometry.paint is not None
+    mixing = np.einsum("yxkj,kcj->yxkc", colour, radiometry.paint)
+    # No colour takes light away: what says so is the error of B, on paints that are nearly black in one channel.
+    mixing = np.maximum(mixing, 0.0)
+    mixing /= mixing.sum(axis=-1, keepdims=True)
+    relative = mixing @ np.linalg.inv(radiometry.mixing) - np.eye(3)
+    return np.asarray(np.einsum("yxkm,yxmk->kmyx", relative, colour), np.float64)
+
+
+Both = tuple[FloatImage, FloatImage]
+"""Of the object, and of surfaces that are none of it."""
+DOUBLED: Final = 3
+"""2^3 bounces are counted. Surfaces throw back less than half of what falls on them on the mean, so 1 % is left."""
+
+
+def with_bounces(direct: Both, factors: Both, back: Both) -> Both:
+    """All light that leaves blocks (blocks, pictures, 3), where ``direct`` light is that of projectors.
+
+    ``factors`` (blocks, blocks): light that falls from blocks of object and room; ``back`` (blocks, 1, 3): what they
+    make of light that falls on them
+    """
+    own, room = direct
+    shape = own.shape
+    for _ in range(2**DOUBLED):
+        falling = sum(one @ light.reshape(len(light), -1) for one, light in zip(factors, (own, room), strict=True))
+        falling = np.asarray(falling, np.float32).reshape(shape)
+        own, room = direct[0] + back[0] * falling, direct[1] + back[1] * falling
+    return own, room
+
+
+def by_all_ways(factors: Both, back: Both) -> Both:
+    """(blocks, blocks) each: light that falls by way of any number of surfaces, for light of projectors alone.
+
+    One matrix for all colours: what is thrown back is the mean of them, and white is made right by colour afterwards.
+    ``factors``, ``back``: see ``with_bounces``. A series, and so never negative.
+    """
+    step = factors[0] * back[0].mean(axis=1) + factors[1] * back[1].mean(axis=1)
+    found = np.concatenate(factors, axis=1)
+    for number in range(DOUBLED):
+        found += step @ found
+        step = step @ step if number + 1 < DOUBLED else step
+    return found[:, : len(step)], found[:, len(step) :]
+
 
 NEAR_BLOCKS: Final = (1.0, 3.0)
 """Standard deviations of near light, in blocks: what spreads under the surface, or between neighbours."""

@@ -186,6 +186,3 @@ def _across(normals: Float64) -> Float64:
     other = np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     found = np.cross(normals, other)
     return np.asarray(found / channels.length(found)[:, None])
-
-
-__all__ = ["form_factors"]

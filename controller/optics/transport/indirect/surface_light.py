@@ -102,6 +102,3 @@ def _solved(values: FloatImage, distance: float) -> FloatImage:
     spectrum = fft.dctn(values, axes=(0, 1), norm="ortho", overwrite_x=True)
     spectrum *= left
     return np.asarray(fft.idctn(spectrum, axes=(0, 1), norm="ortho", overwrite_x=True), np.float32)
-
-
-__all__ = ["SurfaceLight"]

@@ -36,8 +36,7 @@ from controller.optics.transport.simd.vectors import (
     vector_of,
     with_lane,
 )
-from controller.optics.transport.windows.profiles import GROUP, LANES, SKEW_STEPS, SmallProfiles
-from controller.optics.transport.windows.sample_kernels import STRIP, Windows
+from controller.optics.transport.windows.profiles import GROUP, LANES, SKEW_STEPS, STRIP, SmallProfiles, Windows
 
 _SIXTEEN, _FOUR = vector_of(FLOAT, GROUP), vector_of(FLOAT, LANES)
 _FLAGS: Final = ["contract", "nsz", "reassoc"]

@@ -10,17 +10,23 @@ import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.jit import compiled
-from controller.optics.transport.camera_box import CameraBox
+from controller.optics.transport.planes import CameraBox
 from controller.optics.transport.windows.profiles import (
     LANES,
+    NEAR,
+    OTHER,
     PHASE_BITS,
     PHASES,
     SHEAR_BITS,
     SKEW_STEPS,
+    SKEWED,
+    SORTS,
+    STRIP,
+    TILE,
     Profiles,
     SmallProfiles,
+    Windows,
 )
-from controller.optics.transport.windows.sample_kernels import NEAR, OTHER, SKEWED, SORTS, STRIP, TILE, Windows
 
 Sites = npt.NDArray[np.int64]
 

@@ -7,6 +7,8 @@ sampled, and D the interpolation of the camera's colours, exactly as the picture
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -19,17 +21,39 @@ import scipy.sparse as sp
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, PhaseMap
-from controller.optics.transport.camera_box import CameraBox
 from controller.optics.transport.operator import FAINTEST, LightTransport
-from controller.optics.transport.planes import image_planes
-from controller.optics.transport.scratch import borrow
+from controller.optics.transport.planes import CameraBox, image_planes
 from controller.optics.transport.windows.build import build_windows
-from controller.optics.transport.windows.cells import even_gains
 from controller.optics.transport.windows.matrix import SampleRows, window_rows, windows_of_sites
 from controller.optics.transport.windows.mosaic import collect, interpolate, normal_residual
-from controller.optics.transport.windows.products import adjoint_sites, forward_sites
-from controller.optics.transport.windows.profiles import Profiles, SmallProfiles, build_profiles, build_small_profiles
-from controller.optics.transport.windows.sample_kernels import Windows
+from controller.optics.transport.windows.products import adjoint_sites, even_gains, forward_sites
+from controller.optics.transport.windows.profiles import (
+    Profiles,
+    SmallProfiles,
+    Windows,
+    build_profiles,
+    build_small_profiles,
+)
+
+_scratch: list[FloatImage] = []
+
+
+@contextmanager
+def borrow(shape: tuple[int, ...]) -> Iterator[FloatImage]:
+    """A float32 array with any content. A simultaneous caller gets another one; one is kept afterwards."""
+    # pop and append of a list are atomic
+    try:
+        array = _scratch.pop()
+    except IndexError:
+        array = np.empty(0, np.float32)
+    if array.shape != shape:
+        array = np.empty(shape, np.float32)
+    try:
+        yield array
+    finally:
+        if not _scratch:
+            _scratch.append(array)
+
 
 WHOLE: Final = 0.998
 """A camera pixel is lit by a projector where the samples it is made of have windows for this part of its white."""

@@ -14,9 +14,8 @@ import numpy as np
 from controller.core.arrays import FloatImage, Mask
 from controller.core.storage import sha256_of
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.result.evaluation import as_table, by_pixels
 from controller.optics.solve.result.ghosting import ghosting
-from controller.optics.solve.result.metrics import compare, sharpness_windows
+from controller.optics.solve.result.metrics import as_table, by_pixels, compare, sharpness_windows
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated

@@ -19,9 +19,8 @@ from controller.core.storage import sha256_of
 from controller.optics.solve.targets.colour import ColourSpace
 from controller.optics.solve.targets.files import check_picture, load_target, read_picture
 from controller.optics.solve.targets.patterns import Colour, checkerboard, replace_pattern
-from controller.optics.solve.targets.pieces import in_box, on_each
 from controller.optics.solve.targets.relight import gloss, recolour
-from controller.optics.solve.targets.values import Target, through_camera
+from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
 from controller.optics.solve.targets.wrap import wrap_photograph
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry

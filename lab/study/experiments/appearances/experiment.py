@@ -12,12 +12,11 @@ import numpy as np
 
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import VelaturaError
+from controller.optics.solve.appearance import traditional_compensation
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
-from controller.optics.solve.result.evaluation import TITLES, PixelSet
-from controller.optics.solve.result.metrics import colour_difference
+from controller.optics.solve.result.metrics import TITLES, PixelSet, colour_difference
 from controller.optics.solve.targets.values import Target
-from controller.optics.solve.traditional import traditional_compensation
 from controller.optics.transport import build_transport
 from controller.stage.report.pictures import Crop, crop_around, error_picture
 from lab.study.experiments.appearances.targets import LOOKS, Look, as_it_is

@@ -16,9 +16,8 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.solve.targets.files import read_picture
 from controller.optics.solve.targets.patterns import replace_pattern
-from controller.optics.solve.targets.pieces import on_each
 from controller.optics.solve.targets.relight import gloss, recolour
-from controller.optics.solve.targets.values import Target, through_camera
+from controller.optics.solve.targets.values import Target, on_each, through_camera
 from controller.optics.solve.targets.wrap import object_space, painted
 from controller.stage.blender import job
 from controller.stage.blender.job import RenderSettings, as_seen, own_paint, write_job

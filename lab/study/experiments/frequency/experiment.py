@@ -12,10 +12,10 @@ import numpy as np
 from controller.config.writer import toml_text
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.core.storage import write_atomically
-from controller.optics.plan.resolution import FAINT, KEPT, MEAN, last_kept
+from controller.optics.plan.figures import FAINT, KEPT, MEAN, last_kept
 from controller.optics.solve.appearance import scale_frames, solve_base
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.result.evaluation import visible_object
+from controller.optics.solve.result.metrics import visible_object
 from controller.optics.transport import build_transport
 from controller.stage.report.pictures import crop_around
 from lab.study.experiments.frequency.planned import blurs, predicted

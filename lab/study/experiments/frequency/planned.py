@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.optics.plan.figures import KEPT, LineProjector, kept_contrast, last_kept
 from controller.optics.plan.optics import PIXEL_VARIANCE_PX2
-from controller.optics.plan.resolution import KEPT, LineProjector, kept_contrast, last_kept
 from lab.study.experiments.frequency.waves import GREEN, Waves
 from lab.study.subject.subject import ReachableTarget, Subject
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.optics.plan.resolution import FAINT, MEAN
+from controller.optics.plan.figures import FAINT, MEAN
 from controller.optics.solve.targets.values import Target, through_camera
 from controller.stage.report.pictures import crop_around
 from lab.study.subject.subject import ReachableTarget, Subject

@@ -15,8 +15,8 @@ import numpy as np
 
 import controller
 from controller.optics.solve.appearance import base_image, solve_base
+from controller.optics.solve.bounded.equations import appearance_weights
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
-from controller.optics.solve.bounded.weights import appearance_weights
 from controller.optics.solve.scaling.interactive import interactive
 from controller.optics.solve.targets.files import shipped_photograph
 from controller.optics.solve.targets.values import through_camera

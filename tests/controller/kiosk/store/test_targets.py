@@ -15,7 +15,7 @@ from PIL import Image, ImageCms
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.targets import fitted, regions_of, restricted
-from controller.optics.solve.targets.profiles import with_profile
+from controller.optics.solve.targets.colour import with_profile
 
 VIEW = (60, 40)
 

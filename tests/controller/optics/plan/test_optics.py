@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from controller.core.arrays import Float64, Mask
-from controller.optics.plan.aim import aimed
 from controller.optics.plan.optics import FWHM, best_focus, blur, lit_by
+from controller.optics.plan.search import aimed
 from controller.optics.plan.target_object import TargetObject, sampled
 from controller.optics.plan.values import MountingPoint, Placement, ProjectorModel, Surface
 from tests.controller.optics.plan.conftest import EYE

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from controller.optics.plan.resolution import LineProjector, finest_wave, kept_contrast, last_kept, solved
+from controller.optics.plan.figures import LineProjector, finest_wave, kept_contrast, last_kept, solved
 
 BRIGHT = 2.0
 

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from controller.core.errors import UsageError
-from controller.optics.plan.target_object import AFTER_M, TargetObject, read_target_object, sampled
-from controller.optics.plan.view import seen_from
+from controller.optics.plan.target_object import AFTER_M, TargetObject, read_target_object, sampled, seen_from
 from tests.controller.optics.plan.conftest import EYE
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.optics.solve.result.evaluation import TITLES, as_rows, as_table, by_pixels, visible_object
+from controller.optics.solve.result.metrics import TITLES, as_rows, as_table, by_pixels, visible_object
 
 SHAPE = (100, 200)
 MATRIX = np.array([[0.41, 0.36, 0.18], [0.21, 0.72, 0.07], [0.02, 0.12, 0.95]])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from controller.optics.solve.reach.smooth_limits import SmoothLimits, _quantile, lowest_above
+from controller.optics.solve.reach.adaptation import SmoothLimits, _quantile, lowest_above
 
 
 def test_a_sheet_lies_on_wide_obstacles_falls_off_beside_them_and_leaves_out_narrow_ones() -> None:

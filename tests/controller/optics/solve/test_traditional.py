@@ -10,8 +10,8 @@ import pytest
 
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.appearance import traditional_compensation
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.traditional import traditional_compensation
 from controller.optics.transport import build_transport
 
 Stage = Callable[..., Calibration]

@@ -43,7 +43,7 @@ def phase_map_shares(phase_map: PhaseMap) -> sp.csr_matrix[np.float64]:
     """Each camera pixel's normalised Gaussian over the projector's pixels, cut at four standard deviations.
 
     The blur is that of the projector pixel nearest to where the camera pixel looks. The plain form of what
-    ``controller.optics.transport.windows.sample_kernels`` keeps, without the camera's colours.
+    ``controller.optics.transport.windows.profiles`` keeps, without the camera's colours.
     """
     rows, columns = phase_map.spread_px2.shape[:2]
     position = phase_map.projector_px.reshape(-1, 2).astype(np.float64)

@@ -16,9 +16,8 @@ from controller.optics.transport.indirect.blocks import down_up
 from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.form_factors import form_factors
 from controller.optics.transport.indirect.indirect_light import IndirectLight
-from controller.optics.transport.indirect.shape import ALIKE_BLOCKS, PART_NOISE, UNSURE, shaped
 from controller.optics.transport.indirect.stripes import blocks_of, coarse_stripes, dark_light, stripe_parts
-from controller.optics.transport.indirect.weights import BlockLight
+from controller.optics.transport.indirect.weights import ALIKE_BLOCKS, PART_NOISE, UNSURE, BlockLight, shaped
 from tests.controller.optics.solve.conftest import plane_calibration
 
 SHAPE = (22, 27)

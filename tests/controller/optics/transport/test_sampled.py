@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.sampled import SampledLight
+from controller.optics.transport.operator import SampledLight
+from controller.optics.transport.planes import CameraBox
 
 
 def sampled() -> SampledLight:

@@ -13,8 +13,7 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.planes import frame_planes, image_planes
+from controller.optics.transport.planes import CameraBox, frame_planes, image_planes
 from tests.controller.optics.transport.conftest import random_frames
 from tests.controller.optics.transport.windows.test_transport import mapped
 

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from controller.core.arrays import load_arrays, save_arrays
 from controller.optics.calibrate.geometry.values import Reconstruction
 from controller.optics.calibrate.values import Geometry, Pinhole
-from controller.optics.solve.bounded.problem import Solution
+from controller.optics.solve.bounded.equations import Solution
 from controller.optics.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.depth_edges import edged, write_terms

@@ -15,8 +15,7 @@ import scipy.sparse as sp
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.optics.transport import LightTransport
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.planes import frame_planes
+from controller.optics.transport.planes import CameraBox, frame_planes
 from controller.stage.artefacts.names import safe_name
 from controller.stage.exchange import sparse
 from controller.stage.exchange.content import Content

@@ -10,8 +10,8 @@ import pytest
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.appearance import exposed_for_one
 from controller.optics.solve.result.metrics import Comparison, compare
-from controller.optics.solve.traditional import exposed_for_one
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.published import Dimmed, write_photograph
 from controller.stage.artefacts.solved import RequestedTarget, Solved

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.optics.plan.resolution import last_kept
+from controller.optics.plan.figures import last_kept
 from controller.optics.solve.result.metrics import sharpness
 from lab.study.experiments.frequency.experiment import bases
 from lab.study.experiments.frequency.waves import kept_contrast, make_waves

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.bounded.descent import IterationControl, block_coordinate_descent
+from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
 from controller.optics.solve.bounded.equations import build_problem, initial_point
 from controller.optics.solve.bounded.solver import SMOOTHNESS
 from controller.optics.transport import LightTransport, build_transport

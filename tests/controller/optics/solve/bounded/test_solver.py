@@ -15,9 +15,13 @@ from hypothesis import strategies as st
 
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration, Metapixels
-from controller.optics.solve.bounded.equations import build_problem, smoothness_term
-from controller.optics.solve.bounded.problem import Solution
-from controller.optics.solve.bounded.smoothness import EDGE_WEIGHT_STEPS, squared_edge_weights
+from controller.optics.solve.bounded.equations import (
+    EDGE_WEIGHT_STEPS,
+    Solution,
+    build_problem,
+    smoothness_term,
+    squared_edge_weights,
+)
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import frame_planes, image_planes, plane_frames

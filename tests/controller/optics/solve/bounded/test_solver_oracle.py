@@ -11,11 +11,10 @@ import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage
 from controller.optics.calibrate.values import Calibration, PhaseMap
-from controller.optics.solve.bounded.equations import build_problem
-from controller.optics.solve.bounded.problem import Problem
+from controller.optics.solve.bounded.equations import Problem, build_problem
 from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.camera_box import CameraBox
+from controller.optics.transport.planes import CameraBox
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller.optics.solve.bounded.weights import appearance_weights
+from controller.optics.solve.bounded.equations import appearance_weights
 
 
 def test_the_dark_counts_more_and_what_is_beyond_reach_counts_less() -> None:

@@ -11,7 +11,7 @@ from controller.core.arrays import FloatImage
 from controller.optics.solve.gpu.device import CHUNK_BYTES, Clear, Device, DeviceRefused
 from controller.optics.solve.gpu.transport import DeviceTransport
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.windows.sample_kernels import SORTS
+from controller.optics.transport.windows.profiles import SORTS
 from controller.optics.transport.windows.transport import WindowTransport
 from tests.controller.optics.solve.conftest import plane_calibration
 from tests.controller.optics.solve.gpu.conftest import any_windows, few, stages

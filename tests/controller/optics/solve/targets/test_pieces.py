@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from controller.core.arrays import Mask
-from controller.optics.solve.targets.pieces import on_each, pieces
-from controller.optics.solve.targets.values import Target
+from controller.optics.solve.targets.values import Target, on_each, pieces
 
 
 def two_discs() -> Mask:

@@ -21,9 +21,8 @@ from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.files import load_target, shipped_photograph
 from controller.optics.solve.targets.patterns import checkerboard, replace_pattern
-from controller.optics.solve.targets.pieces import in_box
 from controller.optics.solve.targets.relight import gloss, recolour
-from controller.optics.solve.targets.values import Target, linear_to_srgb, srgb_to_linear, through_camera
+from controller.optics.solve.targets.values import Target, in_box, linear_to_srgb, srgb_to_linear, through_camera
 from controller.optics.solve.targets.wrap import object_space, wrap_photograph
 
 ROWS, COLUMNS, FOCAL = 160, 240, 400.0

@@ -14,7 +14,7 @@ from scipy import ndimage
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import build_transport
-from controller.optics.transport.gaussians.blur import gaussian_taps, without_blur
+from controller.optics.transport.gaussians.transport import gaussian_taps, without_blur
 from tests.controller.optics.transport.conftest import products
 
 Stage = Callable[..., Calibration]

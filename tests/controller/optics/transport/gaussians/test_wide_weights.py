@@ -12,9 +12,8 @@ from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.gaussians import custom_weights
-from controller.optics.transport.gaussians.custom_weights import patches_of_weights
-from controller.optics.transport.gaussians.patches import FULL_WEIGHT
+from controller.optics.transport.gaussians import patches
+from controller.optics.transport.gaussians.patches import FULL_WEIGHT, patches_of_weights
 from tests.controller.optics.transport.conftest import random_frames
 
 SIZES = ((3, 4), (2, 5))
@@ -121,7 +120,7 @@ def test_narrow_weights_are_stored_as_metapixels_are() -> None:
 def test_weights_that_would_take_all_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rng, shape = np.random.default_rng(3), (300, 300)
     weights = weights_of(shape, [(1.0, 1.0)] * 20, dots=2, rng=rng)
-    monkeypatch.setattr(custom_weights, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(patches, "MOST_BYTES", 1 << 20)
     with pytest.raises(UsageError) as refused:
         patches_of_weights(weights, shape)
     assert refused.value.code == "weights-too-wide"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from controller.core.arrays import FloatImage
 from controller.optics.transport.indirect.blocks import parted
-from controller.optics.transport.indirect.bounces import Both, by_all_ways, with_bounces
+from controller.optics.transport.indirect.fit import Both, by_all_ways, with_bounces
 
 COUNT = 12
 

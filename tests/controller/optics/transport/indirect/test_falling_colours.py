@@ -11,9 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.arrays import Float64, FloatImage
-from controller.optics.transport.indirect.falling_colours import FallingColours, falling_colours, lamp_colours
-from controller.optics.transport.indirect.shape import shaped
-from controller.optics.transport.indirect.weights import BlockLight
+from controller.optics.transport.indirect.weights import (
+    BlockLight,
+    FallingColours,
+    falling_colours,
+    lamp_colours,
+    shaped,
+)
 
 GRID, SIDE = (5, 8), 6
 BLOCKS = GRID[0] * GRID[1]

@@ -9,8 +9,7 @@ import pytest
 
 from controller.core.arrays import Float64
 from controller.optics.calibrate.values import Calibration, ProjectorCalibration, Radiometry
-from controller.optics.transport.indirect.fit import fit_indirect
-from controller.optics.transport.indirect.paint_colours import paint_colours
+from controller.optics.transport.indirect.fit import fit_indirect, paint_colours
 from tests.controller.optics.calibrate.spectra import colours
 from tests.controller.optics.solve.conftest import plane_calibration
 

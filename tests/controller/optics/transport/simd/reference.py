@@ -9,8 +9,16 @@ import numpy.typing as npt
 
 from controller.optics.transport.simd.gaussians import LANES as WEIGHTS
 from controller.optics.transport.simd.scaling import SIDE, STEPS
-from controller.optics.transport.windows.profiles import GROUP, LANES, PHASES, SHEARS, SKEW_STEPS, SmallProfiles
-from controller.optics.transport.windows.sample_kernels import STRIP, Windows
+from controller.optics.transport.windows.profiles import (
+    GROUP,
+    LANES,
+    PHASES,
+    SHEARS,
+    SKEW_STEPS,
+    STRIP,
+    SmallProfiles,
+    Windows,
+)
 
 Array = npt.NDArray[Any]
 Double = npt.NDArray[np.float64]

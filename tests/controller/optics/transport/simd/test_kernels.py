@@ -17,10 +17,11 @@ from controller.optics.transport.windows.profiles import (
     LANES,
     PHASES,
     SKEW_STEPS,
+    STRIP,
     SmallProfiles,
+    Windows,
     build_small_profiles,
 )
-from controller.optics.transport.windows.sample_kernels import STRIP, Windows
 from tests.controller.optics.transport.simd import reference
 
 WEIGHTS = gaussians.LANES

@@ -17,9 +17,9 @@ from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration, PhaseMap
 from controller.optics.capture.raw import develop
 from controller.optics.transport import build_transport
-from controller.optics.transport.camera_box import CameraBox
 from controller.optics.transport.gaussians.transport import PatchTransport
-from controller.optics.transport.windows.sample_kernels import SORTS
+from controller.optics.transport.planes import CameraBox
+from controller.optics.transport.windows.profiles import SORTS
 from controller.optics.transport.windows.transport import WindowTransport
 from tests.controller.optics.transport.conftest import products, random_frames
 from tests.controller.optics.transport.sparse_shares import phase_map_shares

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.bounded.descent import IterationControl
-from controller.optics.solve.bounded.problem import Solution, SolveInput
-from controller.optics.solve.engines.processor import Processor
+from controller.optics.solve.bounded.engine import IterationControl, Processor
+from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.solve.request import SolveOptions
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport

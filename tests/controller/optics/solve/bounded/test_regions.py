@@ -15,12 +15,11 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.equations import build_problem
+from controller.optics.solve.bounded.regions import SOLVERS, BoxProblem, Regions, solve_box, solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.regions.box_solvers import SOLVERS, BoxProblem, solve_box
-from controller.optics.solve.regions.solver import Regions, solve_regions
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.camera_box import CameraBox
 from controller.optics.transport.edge_terms import EdgeTerm, with_terms
+from controller.optics.transport.planes import CameraBox
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
 
 pytestmark = pytest.mark.slow
@@ -235,7 +234,7 @@ def test_a_solver_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
     def absent(name: str) -> object:
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr("controller.optics.solve.regions.box_solvers.importlib.import_module", absent)
+    monkeypatch.setattr("controller.optics.solve.bounded.regions.importlib.import_module", absent)
     problem = BoxProblem(sp.csr_matrix(np.eye(2)), np.ones(2), np.zeros(2))
     for name in set(SOLVERS) - {"lsq_linear"}:
         with pytest.raises(UsageError) as refused:

@@ -8,9 +8,8 @@ import sys
 import pytest
 
 from controller.core.errors import UsageError
-from controller.optics.solve.engines.choice import choose_engine
-from controller.optics.solve.engines.graphics import graphics_sentence
-from controller.optics.solve.engines.processor import Processor
+from controller.optics.solve.bounded.engine import Processor
+from controller.optics.solve.engines import choose_engine, graphics_sentence
 from controller.optics.solve.gpu.device import adapters
 from controller.optics.solve.gpu.engine import GpuEngine
 
@@ -40,8 +39,8 @@ def test_without_drivers_auto_is_the_processor_and_gpu_an_error(wanted: str) -> 
     """In a process of its own, whose Vulkan has no driver: the library looks for them once."""
     code = (
         "from controller.core.errors import UsageError\n"
-        "from controller.optics.solve.engines.choice import choose_engine\n"
-        "from controller.optics.solve.engines.graphics import graphics_sentence\n"
+        "from controller.optics.solve.engines import choose_engine\n"
+        "from controller.optics.solve.engines import graphics_sentence\n"
         f"try: print(choose_engine({wanted!r}, print).name)\n"
         "except UsageError as error: print(error.code, error.remedy)\n"
         "print(graphics_sentence())\n"

@@ -4,31 +4,204 @@ The camera image is cut into regions of 16x16, each solved together with a margi
 phases take alternate rows and columns of regions; what an earlier phase has settled is held fixed in later ones. A
 region determines its own pixels; those of its margin are provisional, and its neighbours solve them again. The
 regions of a phase don't touch each other, so their order does not matter. Earlier values being fixed, the result is
-near the optimum, not at it: the global solver (``bounded``) is the default, this one is for comparison
+near the optimum, not at it: the global solver (``solver``) is the default, this one is for comparison
 (docs/decisions/0007).
+
+The equations of a region are cut out of the whole solve: the same T, camera blur and colour mixing included, and the
+same smoothness; what the pixels that are held fixed contribute stands on the right-hand side.
+
+A region is one small problem, min |A x - b|^2 for 0 <= x <= 1, of some hundred unknowns. ``lsq_linear`` is the
+reference, of the family that the paper used; ``clarabel`` (interior point) and ``osqp`` (operator splitting) are
+faster, and are imported only when asked for.
 """
 
 from __future__ import annotations
 
+import importlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.optics.solve.bounded.equations import build_problem, initial_point, objective_of
-from controller.optics.solve.bounded.problem import Problem, SolveInput
+from controller.optics.solve.bounded.equations import Problem, SolveInput, build_problem, initial_point, objective_of
 from controller.optics.solve.bounded.solver import SMOOTHNESS, check_input
-from controller.optics.solve.regions.box_solvers import BoxProblem, BoxSolver, solve_box
-from controller.optics.solve.regions.equations import Pixels, box_problem, channel_groups
 from controller.optics.transport import LightTransport
-from controller.optics.transport.camera_box import CameraBox
-from controller.optics.transport.planes import plane_frames, plane_image
+from controller.optics.transport.planes import CameraBox, plane_frames, plane_image, planes_above
+
+Pixels = npt.NDArray[np.int64]
+
+
+def channel_groups(transport: LightTransport) -> list[tuple[int, ...]]:
+    """Channels that have to be solved together: all three, or each alone where no projector mixes colours."""
+    apart = all(np.count_nonzero(mixing - np.diag(np.diag(mixing))) == 0 for mixing in transport.mixing)
+    return [(0,), (1,), (2,)] if apart else [(0, 1, 2)]
+
+
+def box_problem(
+    problem: Problem, box: CameraBox, unknown: Pixels, channels: tuple[int, ...], x: FloatImage, light: FloatImage
+) -> BoxProblem:
+    """The equations at the camera pixels of ``box`` for some projector pixels.
+
+    Parameters
+    ----------
+    unknown : (n,) rising indices of pixels of all projectors
+    channels : to be solved together; unknowns stand in the order (channel, pixel)
+    x, light : (3, pixels) current values, and (3, rows, columns) T x
+    """
+    weights = np.sqrt(problem.weights[box.window].astype(np.float64)).ravel()
+    start = x[list(channels)][:, unknown].astype(np.float64).ravel()
+    A = problem.transport.submatrix(box, unknown, channels)
+    window = (list(channels), *box.window)
+    wanted = planes_above(problem.picture[box.window], problem.black[box.window])[list(channels)]
+    missing = (wanted - light[window]).astype(np.float64).ravel()
+    data_side = missing + A @ start
+    scale = np.tile(weights, len(channels))
+    rows = np.flatnonzero(scale)
+    scale = scale[rows]
+    data = sp.diags_array(scale) @ A[rows]
+    S, smooth_side = _smoothness(problem, unknown, channels, x)
+    matrix = sp.csr_matrix(sp.vstack([data, S]))
+    return BoxProblem(matrix, np.concatenate([scale * data_side[rows], smooth_side]), start)
+
+
+def _smoothness(
+    problem: Problem, unknown: Pixels, channels: tuple[int, ...], x: FloatImage
+) -> tuple[sp.csr_matrix[np.float64], Float64]:
+    """One row alpha (p_i - p_j) for each pair of which at least one pixel is unknown (paper 2.4, eq. 3)."""
+    sizes = problem.transport.sizes
+    start = np.cumsum([0, *(rows * columns for rows, columns in sizes)])
+    owner = np.searchsorted(start, unknown, side="right") - 1
+    width = np.array([size[1] for size in problem.transport.sizes], np.int64)[owner]
+    rows, columns, values, right_hand_side, count = [], [], [], [], 0
+    for edges, step in ((problem.across, np.ones_like(width)), (problem.down, width)):
+        before = unknown - step >= start[owner]
+        pairs = np.concatenate([np.stack([unknown, unknown + step]), np.stack([unknown - step, unknown])[:, before]], 1)
+        pairs = np.unique(pairs, axis=1)
+        for index, c in enumerate(channels):
+            here = pairs[:, edges[c, pairs[0]] > 0]
+            alpha = np.sqrt(problem.strength_per_step * edges[c, here[0]].astype(np.float64))
+            known = np.zeros(alpha.size)
+            for pixel, sign in ((here[0], 1.0), (here[1], -1.0)):
+                at = np.minimum(np.searchsorted(unknown, pixel), unknown.size - 1)
+                found = unknown[at] == pixel
+                rows.append(count + np.flatnonzero(found))
+                columns.append(index * unknown.size + at[found])
+                values.append(sign * alpha[found])
+                known[~found] -= sign * alpha[~found] * x[c, pixel[~found]]
+            right_hand_side.append(known)
+            count += alpha.size
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csr_matrix(entries, shape=(count, unknown.size * len(channels))), np.concatenate(right_hand_side)
+
+
+TOLERANCE: Final = 1e-8
+OSQP_TOLERANCE: Final = 1e-5
+"""Splitting converges slowly; this is its accuracy at the usual cost."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoxProblem:
+    """``matrix`` (equations, unknowns) sparse rows; ``right_hand_side`` (equations,); ``start`` (unknowns,)."""
+
+    matrix: sp.csr_matrix[np.float64]
+    right_hand_side: Float64
+    start: Float64
+
+    def objective(self, x: Float64) -> float:
+        """|A x - b|^2."""
+        return float(np.sum((self.matrix @ x - self.right_hand_side) ** 2))
+
+
+BoxSolver: TypeAlias = Callable[[BoxProblem], Float64]
+
+
+def solve_box(solver: str, problem: BoxProblem) -> Float64:
+    """(unknowns,) in [0, 1], by the solver of that name; a plain function of plain values, to be sent anywhere.
+
+    Raises UsageError("solver-unknown"), UsageError("solver-missing") or WorkError("region-unsolved").
+    """
+    if solver not in SOLVERS:
+        raise UsageError(
+            "solver-unknown",
+            what=f"The solver {solver} for regions is unknown.",
+            remedy=f"Choose one of {', '.join(SOLVERS)}.",
+        )
+    x = SOLVERS[solver](problem)
+    if not np.isfinite(x).all():
+        raise WorkError(
+            "region-unsolved",
+            what=f"The solver {solver} found no solution for a region of {problem.start.size} unknowns.",
+            remedy="Use lsq_linear for the regions, or the global solver.",
+        )
+    return np.clip(x, 0, 1)
+
+
+def _by_lsq_linear(problem: BoxProblem) -> Float64:
+    from scipy.optimize import lsq_linear
+
+    return np.asarray(lsq_linear(problem.matrix, problem.right_hand_side, (0, 1), tol=TOLERANCE, lsmr_tol="auto").x)
+
+
+def _by_clarabel(problem: BoxProblem) -> Float64:
+    clarabel = _imported("clarabel")
+    quadratic, linear = _quadratic(problem)
+    count = linear.size
+    identity = sp.identity(count, format="csc")
+    constraints = sp.vstack([identity, -identity], format="csc")
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    # By itself it takes the plain factorisation up to some thousand unknowns, which light that mixes makes dense.
+    settings.direct_solve_method = "faer"
+    bounds = np.concatenate([np.ones(count), np.zeros(count)])
+    cones = [clarabel.NonnegativeConeT(2 * count)]
+    return np.array(clarabel.DefaultSolver(quadratic, linear, constraints, bounds, cones, settings).solve().x)
+
+
+def _by_osqp(problem: BoxProblem) -> Float64:
+    osqp = _imported("osqp")
+    quadratic, linear = _quadratic(problem)
+    count = linear.size
+    solver = osqp.OSQP()
+    solver.setup(
+        quadratic, linear, sp.identity(count, format="csc"), np.zeros(count), np.ones(count),
+        verbose=False, eps_abs=OSQP_TOLERANCE, eps_rel=OSQP_TOLERANCE, polishing=False,
+    )  # fmt: skip
+    solver.warm_start(x=problem.start)
+    return np.array(solver.solve(raise_error=False).x)
+
+
+def _quadratic(problem: BoxProblem) -> tuple[sp.csc_matrix[np.float64], Float64]:
+    """The upper triangle of A'A and -A'b, scaled so that tolerances mean the same in any unit of light."""
+    hessian = (problem.matrix.T @ problem.matrix).tocsc()
+    scale = 1 / max(float(hessian.diagonal().mean()), np.finfo(np.float64).tiny)
+    return sp.triu(hessian * scale, format="csc"), -scale * np.asarray(problem.matrix.T @ problem.right_hand_side)
+
+
+def _imported(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise UsageError(
+            "solver-missing",
+            what=f"The solver {name} is not installed ({error}).",
+            remedy=f"Install the Python package {name}, or use lsq_linear.",
+        ) from error
+
+
+SOLVERS: Final[Mapping[str, BoxSolver]] = {
+    "lsq_linear": _by_lsq_linear,
+    "clarabel": _by_clarabel,
+    "osqp": _by_osqp,
+}
+
 
 SIZE_PX: Final = 16
 OVERLAP: Final = 0.25
@@ -138,7 +311,7 @@ def solve_regions(
 
     Parameters
     ----------
-    solver : one of ``box_solvers.SOLVERS``
+    solver : one of ``SOLVERS``
     size_px, overlap : of the regions; the paper's 16 and 25 %
     progress : called after each region with the share of the work that is done
 
