@@ -1,3 +1,3 @@
-"""The hardware layer: `interfaces`, `values`, `errors`, `registry`, byte links, protocol codecs (`codecs`), and
-tests for drivers (`conformance`).
+"""The hardware layer: `interfaces`, `values`, `errors`, `notices`, `registry`, byte links, protocol codecs
+(`codecs`), and tests for drivers (`conformance`).
 """

@@ -1,14 +1,15 @@
-"""The errors of the hardware layer.
+"""The base of all errors that a person can act on, and the errors of the hardware layer.
 
 Every error carries a stable ``code`` (for logs, tests and translation), ``what`` happened in one sentence, and the
-``remedy`` in one sentence. Both sentences are for the technician, not for the programmer.
+``remedy`` in one sentence. Both sentences are for the technician, not for the programmer. The controller's errors stand
+in ``controller.core.errors``. Only the standard library is imported here: the player loads this module, too.
 """
 
 from __future__ import annotations
 
 
-class DeviceError(Exception):
-    """A device, or the connection to it, failed.
+class CodedError(Exception):
+    """An error that a person can act on: the base of ``DeviceError`` and of the controller's ``VelaturaError``.
 
     Parameters
     ----------
@@ -22,6 +23,10 @@ class DeviceError(Exception):
         self.code = code
         self.what = what
         self.remedy = remedy
+
+
+class DeviceError(CodedError):
+    """A device, or the connection to it, failed."""
 
 
 class DeviceGone(DeviceError):

@@ -14,22 +14,9 @@ from typing import Any, Final, cast
 
 from hal.deadline import Deadline
 from hal.driver_calls import Caller
-from hal.errors import DeviceError
+from hal.notices import Notice
 
 GROUP: Final = "velatura.finders"
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A problem that a person should correct: a stable ``code``, one sentence on the problem, one on what to do."""
-
-    code: str
-    what: str
-    remedy: str
-
-    @classmethod
-    def of(cls, error: DeviceError) -> Problem:
-        return cls(error.code, error.what, error.remedy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +35,7 @@ class Found:
     driver: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     identity: str = ""
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +84,7 @@ def search_bus(finder: Finder, wanted: SearchScope, deadline: Deadline) -> Seque
     return cast("Sequence[Found]", caller.call("find", finder.find, Sequence[Found], wanted, deadline))
 
 
-def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finder, ...], tuple[Problem, ...]]:
+def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finder, ...], tuple[Notice, ...]]:
     """Every installed finder (or those of the given entry points), by bus; and the problems of loading."""
     finders: dict[tuple[str, str], Finder] = {}
     problems = []
@@ -112,7 +99,7 @@ def load_finders(found: Iterable[EntryPoint] | None = None) -> tuple[tuple[Finde
             finders[loaded.bus, entry.value] = loaded
         else:
             problems.append(
-                Problem(
+                Notice.warning(
                     "finder-broken",
                     what=f"The finder {entry.name} can't be used: {loaded}.",
                     remedy="Reinstall its Python package.",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from hal.deadline import Deadline
+from hal.notices import Notice
 from hal.values import (
     CameraCapabilities,
     CameraStatus,
@@ -68,8 +69,8 @@ class Projector(Device, Protocol):
 class WatchedProjector(Projector, Protocol):
     """A projector whose driver reports answers that it could not understand."""
 
-    def troubles(self) -> list[tuple[str, str]]:
-        """Unexpected answers since the last call, each once: (stable code, one sentence). They do not stop the work."""
+    def notices(self) -> list[Notice]:
+        """Unexpected answers since the last call, each once. They do not stop the work."""
 
 
 @runtime_checkable
@@ -114,8 +115,8 @@ class WatchedCamera(Camera, Protocol):
     def status(self, *, deadline: Deadline) -> CameraStatus:
         """Battery, card and warnings as the camera answers now."""
 
-    def troubles(self) -> list[tuple[str, str]]:
-        """Corrected faults since the last call: (stable code, one sentence), for the journal."""
+    def notices(self) -> list[Notice]:
+        """Corrected faults since the last call, for the journal."""
 
 
 @runtime_checkable

@@ -8,10 +8,11 @@ from typing import Any, Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
+from hal.notices import Notice
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.library_process import CRASHED, LibraryProcess, shot_lost
 
-_MOST_NOTES: Final = 1000
+_MOST_NOTICES: Final = 1000
 _MARGIN_S: Final = 1.0
 
 
@@ -23,13 +24,13 @@ class LibraryCamera:
     """
 
     def __init__(self, module: str, library: str, *, start: tuple[Any, ...], serial: str, deadline: Deadline) -> None:
-        self._troubles: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
+        self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
         self.process = LibraryProcess(
             module,
             library,
             start=start,
             serial=serial,
-            note=lambda code, what: self._troubles.append((code, what)),
+            note=self._notices.append,
         )
         self._settings: ExposureSettings | None = None
         self._configured: int | None = None
@@ -53,8 +54,8 @@ class LibraryCamera:
         self.identity(deadline=deadline)
         return CameraStatus()
 
-    def troubles(self) -> list[tuple[str, str]]:
-        return [self._troubles.popleft() for _ in range(len(self._troubles))]
+    def notices(self) -> list[Notice]:
+        return [self._notices.popleft() for _ in range(len(self._notices))]
 
     def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
         confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)

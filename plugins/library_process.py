@@ -21,6 +21,7 @@ from typing import Any, Final, Protocol, Self
 import hal.errors
 from hal.deadline import SLICE_S, Deadline, turn
 from hal.errors import DeviceError, DeviceGone
+from hal.notices import Notice
 
 _END_S: Final = 0.7
 CRASHED: Final = "camera-library-ended"
@@ -61,12 +62,12 @@ class LibraryProcess:
     """Starts the process when it is needed, and again after it ended or was killed. One caller at a time.
 
     ``module``: whose ``main`` runs ``served``; ``library``: its name for people; ``start``: what the worker gets first
-    besides the serial number that the camera must have, "" for any; ``note`` is called with (code, sentence) after a
-    fault that was corrected. ``took_s``: what the library needed for the last request, without the way there and back.
+    besides the serial number that the camera must have, "" for any; ``note`` is called after a fault that was
+    corrected. ``took_s``: what the library needed for the last request, without the way there and back.
     """
 
     def __init__(
-        self, module: str, library: str, *, start: tuple[Any, ...], serial: str, note: Callable[[str, str], object]
+        self, module: str, library: str, *, start: tuple[Any, ...], serial: str, note: Callable[[Notice], object]
     ) -> None:
         self.took_s = 0.0
         self._module = module
@@ -93,7 +94,7 @@ class LibraryProcess:
         with turn(self._turn, deadline, partial(self._still_time, deadline)):
             answer = self._answer(name, arguments, deadline)
             if isinstance(answer, Failed) and answer.lost and repeatable:
-                self._note(answer.code, answer.what)
+                self._note(Notice.warning(answer.code, answer.what))
                 answer = self._answer(name, arguments, deadline)
             if isinstance(answer, Failed):
                 raise answer.error()

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from controller.core.text import duration, printable
-from controller.run.progress import Level, Phase, Progress, Reporter
+from controller.run.progress import Phase, Progress, Reporter
+from hal.notices import Level
 
 PLAIN_EVERY: Final = 0.25
 """Share of a step after which plain output prints another line."""

@@ -29,9 +29,10 @@ from controller.kiosk.serving import serving
 from controller.kiosk.store.accounts import FOLDER
 from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.stage.sessions.run import leave_runtime_folder, stage_lock
 from hal.errors import DeviceError
+from hal.notices import Level
 
 RETRY_S: Final = 5.0
 PORT: Final = 8377

@@ -1,32 +1,22 @@
-"""The controller's errors; the command line also handles device errors (``hal.errors``)."""
+"""The controller's errors; their base and the errors of devices are in ``hal.errors``."""
 
 from __future__ import annotations
 
 from typing import ClassVar, Final
 
+from hal.errors import CodedError
+
 SEND_DIAGNOSTICS: Final = "Export the diagnostics and send them to the maintainers."
 """What to do about the code ``crash``: an error that the program did not expect."""
 
 
-class VelaturaError(Exception):
-    """An error that a person can act on.
-
-    Parameters
-    ----------
-    code : stable, lower case with hyphens, e.g. ``"stage-key-unknown"``
-    what : one sentence on what happened
-    remedy : one sentence on what to do
+class VelaturaError(CodedError):
+    """An error of the controller that a person can act on: ``code``, ``what`` and ``remedy`` as in ``CodedError``.
 
     ``exit_code`` is what the command line returns: 1 the work failed, 2 wrong use, 3 a device failed.
     """
 
     exit_code: ClassVar[int] = 1
-
-    def __init__(self, code: str, *, what: str, remedy: str) -> None:
-        super().__init__(f"{what} {remedy}")
-        self.code = code
-        self.what = what
-        self.remedy = remedy
 
 
 class UsageError(VelaturaError):

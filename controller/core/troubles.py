@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 
 
 class TroubleCode(enum.StrEnum):
@@ -22,15 +21,3 @@ class TroubleCode(enum.StrEnum):
     SURFACE_SPREAD = "surface-spread"
     UNSTEADY_LAMP = "unsteady-lamp"
     WHITE_SEGMENT = "white-segment"
-
-
-@dataclass(frozen=True, slots=True)
-class Trouble:
-    """``sentence``: what it is, and what to do; ``projector``: whose, None for camera, object or several.
-
-    ``code``: one of ``TroubleCode``; None in what an earlier version has written
-    """
-
-    sentence: str
-    projector: str | None = None
-    code: str | None = None

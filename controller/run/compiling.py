@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
+from hal.notices import Level
 from hal.runtime.compute import can_keep_kernels, usable_cpus
 from hal.runtime.kernels import SECONDS, Compilation, are_compiled
 

@@ -20,9 +20,9 @@ from typing import Any, Final
 from controller.core.errors import WorkError
 from controller.core.storage import sha256_of, sync_folder
 from controller.run.journal_schema import JournalError, explained, opened
-from controller.run.progress import Level
 from controller.run.state_machine import Change
 from controller.run.step_id import ShotId, StepId
+from hal.notices import Level
 
 Inputs = Mapping[str, str]
 """Name of an input -> its hash (or the value itself, if it is short)."""

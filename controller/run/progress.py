@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from controller.run.time_left import TimeLeft, expected
+from hal.notices import Level
 
 
 class Phase(enum.Enum):
@@ -17,14 +18,6 @@ class Phase(enum.Enum):
     RUNNING = "running"
     DONE = "done"
     SKIPPED = "skipped"
-
-
-class Level(enum.Enum):
-    """Level of a message."""
-
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,12 @@ from controller.core.errors import VelaturaError, WorkError
 from controller.run.background import Advance, BackgroundSteps
 from controller.run.durations import measured
 from controller.run.journal import Artefact, Journal
-from controller.run.progress import Level, Reporter, Silent, Tracker
+from controller.run.progress import Reporter, Silent, Tracker
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId, input_name
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError
+from hal.notices import Level
 from hal.runtime.compute import threads_may_compute
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import WorkError
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from hal.deadline import Cancelled
+from hal.notices import Level
 from lab.simulate.incidents.script import to_json
 from lab.simulate.judge.promises import PROMISES
 from lab.simulate.life import LIFE_DAYS, Life, Outcome

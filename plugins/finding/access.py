@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from hal.escapes import escaped
-from hal.finding import Problem
+from hal.notices import Notice
 
 _PROC: Final = Path("/proc")
 
@@ -22,7 +22,7 @@ def rule_text(name: str, needle: str) -> str:
     return "\n".join(line for line in rules.splitlines() if needle in line and not line.startswith("#"))
 
 
-def forbidden(node: Path, device: str, rules: str, needle: str) -> Problem | None:
+def forbidden(node: Path, device: str, rules: str, needle: str) -> Notice | None:
     """The problem of a device file that this user may not read and write; None if there is none."""
     if os.access(node, os.R_OK | os.W_OK):
         return None
@@ -32,7 +32,7 @@ def forbidden(node: Path, device: str, rules: str, needle: str) -> Problem | Non
         return None  # it has just left
     owner, group = _user(status.st_uid), _group(status.st_gid)
     path = resources.files("firmware_configs") / "udev" / rules
-    return Problem(
+    return Notice.warning(
         "device-forbidden",
         what=f"This user ({_user(os.geteuid())}) may not open the {device} at {node}: it belongs to {owner}:{group}, "
         f"mode {status.st_mode & 0o777:04o}.",

@@ -12,7 +12,8 @@ from hal.codecs.hid import relay as hid_relay
 from hal.codecs.ptp.values import printable
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError, DeviceTimeout
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 from plugins.finding.access import forbidden, holders
 from plugins.hid.link import BACKENDS, HidHandle
 from plugins.worker_link import WorkerLink
@@ -67,9 +68,9 @@ def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
         except Cancelled:
             raise
         except DeviceTimeout as error:
-            problem = Problem.of(error)
+            problem = Notice.of(error)
         except DeviceError as error:
-            problem = Problem(
+            problem = Notice.warning(
                 "hid-not-opened",
                 f"The {what} at {node} does not answer: {error.what}",
                 "Unplug it and plug it in again.",
@@ -99,11 +100,11 @@ def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> 
         link.close()
 
 
-def _held(node: Path, what: str) -> Problem | None:
+def _held(node: Path, what: str) -> Notice | None:
     who = holders(node)
     if not who:
         return None
-    return Problem(
+    return Notice.warning(
         "hid-taken", f"The {what} at {node} is open in {', '.join(who)}.", "End that program, unless it is Velatura."
     )
 

@@ -10,8 +10,9 @@ from typing import Any, Final
 from hal.codecs.projectors.pjlink import PORT
 from hal.deadline import Deadline
 from hal.errors import DeviceError
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
 from hal.links import host_and_port
+from hal.notices import Notice
 from hal.registry import OpenContext
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.pjlink_listener import PjLinkListener
@@ -27,7 +28,7 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     try:
         answers = _searched(wanted, deadline)
     except DeviceError as error:
-        problem = Problem.of(error)
+        problem = Notice.of(error)
         return [*found, Found("network", "PJLink search", "search for projectors", problems=(problem,))]
     for host, mac in answers:
         if host in hosts:
@@ -54,12 +55,12 @@ def _tried(address: str, settings: Mapping[str, Any], wanted: SearchScope, deadl
     try:
         projector = open_pjlink_projector(table, OpenContext(wanted.stage), deadline.within(ANSWER_S))
     except DeviceError as error:
-        return dataclasses.replace(found, problems=(Problem.of(error),))
+        return dataclasses.replace(found, problems=(Notice.of(error),))
     with contextlib.closing(projector):
         try:
             identity = projector.identity(deadline=deadline.within(ANSWER_S))
         except DeviceError as error:
-            return dataclasses.replace(found, problems=(Problem.of(error),))
+            return dataclasses.replace(found, problems=(Notice.of(error),))
     return dataclasses.replace(found, what=f"PJLink projector, {identity.maker} {identity.model}")
 
 

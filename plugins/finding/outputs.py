@@ -12,7 +12,8 @@ from typing import Final
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceTimeout
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 
 PATIENCE_S: Final = 5.0
 _OUTPUT: Final = re.compile(
@@ -45,7 +46,7 @@ def parse_outputs(text: str) -> list[Found]:
     for match in _OUTPUT.finditer(text):
         name, (width, height, left, top) = printable(match[1]), match.groups()[1:]
         if width is None:
-            dark = Problem(
+            dark = Notice.warning(
                 "output-off",
                 f"Output {name} is connected, but it is switched off.",
                 f"Switch it on with xrandr --output {name} --auto, and place it beside the others.",

@@ -22,7 +22,8 @@ from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 from hal.serial_link import SerialLink
 from plugins.finding.access import forbidden, holders
 from plugins.projectors.messages import read_message
@@ -99,10 +100,10 @@ def _found(port: Port, wanted: SearchScope, profiles: Sequence[ProjectorProfile]
         return _asked(port, own, profiles, wanted.answer_s, deadline)
     except DeviceBusy as busy:
         who = ", ".join(holders(port.path))
-        held = Problem("port-taken", f"{port.name} is in use{f' by {who}' if who else ''}.", busy.remedy)
+        held = Notice.warning("port-taken", f"{port.name} is in use{f' by {who}' if who else ''}.", busy.remedy)
         return Found("serial", port.name, port.what, identity=port.name, problems=(held,))
     except DeviceError as error:
-        return Found("serial", port.name, port.what, identity=port.name, problems=(Problem.of(error),))
+        return Found("serial", port.name, port.what, identity=port.name, problems=(Notice.of(error),))
 
 
 def _asked(
@@ -127,7 +128,7 @@ def _asked(
     if own is not None and profile.name != own.name:
         table["profile"] = profile.name
         problems.append(
-            Problem(
+            Notice.warning(
                 "serial-other-profile",
                 f'The projector at {port.name} needs the profile "{profile.name}", but stage.toml has "{own.name}".',
                 f'Write profile = "{profile.name}" for {port.name} into stage.toml.',
@@ -135,7 +136,7 @@ def _asked(
         )
     elif own is not None and baud != written:
         problems.append(
-            Problem(
+            Notice.warning(
                 "serial-wrong-baud",
                 f"The projector at {port.name} answers at {baud} baud, but stage.toml has {written}.",
                 f"Write baud = {baud} for {port.name} into stage.toml, or set {written} in the projector's menu.",
@@ -157,7 +158,7 @@ def _nobody(port: Port, own: ProjectorProfile | None, heard: Heard, written: int
         code = "serial-garbage"
         what = f"A device at {port.name} answers, but no profile fits at any usual baud rate."
         remedy = "If it is a projector, write a profile for it (docs/how-to/projector-profile.md)."
-    return Found("serial", port.name, port.what, identity=port.name, problems=(Problem(code, what, remedy),))
+    return Found("serial", port.name, port.what, identity=port.name, problems=(Notice.warning(code, what, remedy),))
 
 
 def _order(

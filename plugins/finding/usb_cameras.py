@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 from plugins.finding.access import forbidden, holders, running
 from plugins.ptp.usb.bus import UsbCamera, usb_cameras
 
@@ -38,10 +39,10 @@ def _found(camera: UsbCamera) -> Found:
     return Found("usb", f"port {camera.port}", what, "camera", "ptp", table, identity, tuple(problems))
 
 
-def _held(node: Path) -> Problem | None:
+def _held(node: Path) -> Notice | None:
     who = holders(node)
     if who:
-        return Problem(
+        return Notice.warning(
             "camera-taken",
             what=f"The camera at {node} is in use by {', '.join(who)}.",
             remedy="End that program. The desktop's own: systemctl --user mask --now gvfs-gphoto2-volume-monitor, and "
@@ -49,7 +50,7 @@ def _held(node: Path) -> Problem | None:
         )
     waiting = running(*MONITORS)
     if waiting:
-        return Problem(
+        return Notice.warning(
             "camera-may-be-taken",
             what=f"{', '.join(waiting)} is running, and may claim the camera at any time.",
             remedy="End it before a run: systemctl --user mask --now gvfs-gphoto2-volume-monitor keeps the desktop's "

@@ -7,7 +7,8 @@ from typing import Final
 
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 from plugins.v4l2.nodes import identify_path, paths
 
 
@@ -23,7 +24,7 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
         except DeviceGone:
             continue  # it was just unplugged
         except DeviceError as error:
-            problems = (Problem.of(error),)
+            problems = (Notice.of(error),)
             found.append(Found("video", str(path), "video device", "camera", "v4l2", {}, str(path), problems))
             continue
         if node is not None:

@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping
 from typing import Final
 
+from hal.notices import Notice
+
 SILENT_S: Final = 60.0
 """Time before an unanswered optional query is repeated, because each costs seconds."""
 
@@ -19,7 +21,7 @@ class OptionalAnswers:
         self._silent_until_s: dict[str, float] = {}
         self._unknown: set[str] = set()
         self._noted: set[str] = set()
-        self._unreported: list[tuple[str, str]] = []
+        self._unreported: list[Notice] = []
 
     def may_ask(self, question: str) -> bool:
         """Whether to send an optional query now."""
@@ -35,7 +37,7 @@ class OptionalAnswers:
         """The answer to an optional query was not understood; ``what``: a sentence that shows it."""
         if question not in self._noted:
             lead = f"The {self._fields.get(question, question)} of the projector at {self._name} stay unknown,"
-            self._unreported.append(("projector-answer-odd", f"{lead} everything else works. {what}"))
+            self._unreported.append(Notice.warning("projector-answer-odd", f"{lead} everything else works. {what}"))
         self._noted.add(question)
         self._unknown.add(question)
 
@@ -46,7 +48,7 @@ class OptionalAnswers:
         """Whether the last answer to an optional query was understood."""
         return question not in self._unknown
 
-    def troubles(self) -> list[tuple[str, str]]:
-        """As ``hal.interfaces.WatchedProjector.troubles``."""
+    def notices(self) -> list[Notice]:
+        """As ``hal.interfaces.WatchedProjector.notices``."""
         pending, self._unreported = self._unreported, []
         return pending

@@ -14,6 +14,7 @@ from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.deadline import Deadline, turn
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.links import ByteLink, TcpLink, host_and_port
+from hal.notices import Notice
 from hal.registry import Driver, OpenContext, setting
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
@@ -144,9 +145,9 @@ class PjLinkProjector:
             if not self._accepted(reply, "move its shutter") and is_open():
                 raise talk.no_answer()
 
-    def troubles(self) -> list[tuple[str, str]]:
-        """As ``hal.interfaces.WatchedProjector.troubles``."""
-        return self._habits.troubles()
+    def notices(self) -> list[Notice]:
+        """As ``hal.interfaces.WatchedProjector.notices``."""
+        return self._habits.notices()
 
     def close(self) -> None:
         self._closed = True

@@ -12,11 +12,12 @@ from typing import Any, Final, TypeVar
 
 from hal.codecs.projectors.power_view import PowerView
 from hal.codecs.projectors.profiles import ProjectorProfile
-from hal.codecs.projectors.serial_protocol import Notice, Reply, parse_hours, parse_power
+from hal.codecs.projectors.serial_protocol import Reply, UnaskedMessage, parse_hours, parse_power
 from hal.codecs.projectors.serial_table import ADJUSTMENTS
 from hal.deadline import Deadline, turn
 from hal.errors import DeviceBusy, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
+from hal.notices import Notice
 from hal.registry import Driver, OpenContext
 from hal.serial_link import SerialLink
 from hal.transcript import Transcript
@@ -250,9 +251,9 @@ class SerialProjector:
         self._optional.understood(question)
         return parsed
 
-    def troubles(self) -> list[tuple[str, str]]:
-        """As ``hal.interfaces.WatchedProjector.troubles``."""
-        return self._optional.troubles()
+    def notices(self) -> list[Notice]:
+        """As ``hal.interfaces.WatchedProjector.notices``."""
+        return self._optional.notices()
 
     def _confirm(self, wanted: tuple[Power, ...], word: str, deadline: Deadline) -> None:
         """Wait until the power state shows the effect of a command, even if its reply was lost."""
@@ -278,7 +279,7 @@ class SerialProjector:
                 raise
             return None
 
-    def _noticed(self, notice: Notice) -> None:
+    def _noticed(self, notice: UnaskedMessage) -> None:
         if notice.power is not None:
             self._view.noticed_power(notice.power, time.monotonic())
         if notice.trouble is not None:

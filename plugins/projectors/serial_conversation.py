@@ -9,8 +9,8 @@ from typing import Final
 from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.codecs.projectors.serial_protocol import (
     Answer,
-    Notice,
     Reply,
+    UnaskedMessage,
     command_bytes,
     parse_line,
     query_bytes,
@@ -47,7 +47,7 @@ class SerialConversation:
         profile: ProjectorProfile,
         table: SerialTable,
         address: str,
-        notice: Callable[[Notice], None],
+        notice: Callable[[UnaskedMessage], None],
         slow: Callable[[], bool],
         check: str = SERIAL_CHECK,
     ) -> None:
@@ -193,7 +193,7 @@ class SerialConversation:
             except ProtocolError as error:
                 self._garbage = error
                 continue
-            if isinstance(meaning, Notice):
+            if isinstance(meaning, UnaskedMessage):
                 self._notice(meaning)
             elif meaning is Reply.NOTHING or (query is not None and meaning is Reply.ACCEPTED):
                 continue  # some models accept a query before they answer it
@@ -228,7 +228,7 @@ class SerialConversation:
             meaning = parse_line(self._table, line, sent=self._sent)
         except ProtocolError:
             return False
-        if isinstance(meaning, Notice):
+        if isinstance(meaning, UnaskedMessage):
             self._notice(meaning)
         return meaning not in (Reply.REFUSED, Reply.COOLING)
 

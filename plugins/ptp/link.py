@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from hal.codecs.ptp.values import Answer
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused
+from hal.notices import Notice
 from hal.transcript import Transcript
 
 Sink = Callable[[memoryview], object]
@@ -19,7 +20,7 @@ MOST_IN_MEMORY: Final = 32 << 20
 """Bytes of a data phase that is not streamed: 8 million object handles would fit."""
 
 
-_MOST_NOTES: Final = 10_000
+_MOST_NOTICES: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +52,18 @@ class Diary:
     """Corrected faults of a camera, for a journal; the oldest are dropped if they are not read."""
 
     def __init__(self, transcript: Transcript | None = None) -> None:
-        self._notes: deque[tuple[str, str]] = deque(maxlen=_MOST_NOTES)
+        self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
         self._transcript = transcript
 
     def add(self, code: str, what: str) -> None:
-        self._notes.append((code, what))
+        self._notices.append(Notice.warning(code, what))
         if self._transcript is not None:
             self._transcript.remark(f"{code}: {what}")
 
-    def take(self) -> list[tuple[str, str]]:
-        """(stable code, one sentence) of each since the last call, oldest first."""
+    def take(self) -> list[Notice]:
+        """Those since the last call, oldest first."""
         # No more than there are now, and one by one: another thread, which keeps the camera awake, may add to them.
-        return [self._notes.popleft() for _ in range(len(self._notes))]
+        return [self._notices.popleft() for _ in range(len(self._notices))]
 
 
 class PtpLink(Protocol):

@@ -15,6 +15,7 @@ from hal.codecs.ptp.datasets import DeviceInfo
 from hal.codecs.ptp.values import Answer, Operation
 from hal.deadline import Deadline, in_seconds, turn
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.notices import Notice
 from hal.transcript import Transcript
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.ptp.body import Body, Channel
@@ -117,7 +118,7 @@ class PtpCamera:
         """See ``hal.interfaces.WatchedCamera``."""
         return self._with_body(lambda body: body.status(deadline=deadline), deadline)
 
-    def troubles(self) -> list[tuple[str, str]]:
+    def notices(self) -> list[Notice]:
         """See ``hal.interfaces.WatchedCamera``."""
         return self._diary.take()
 

@@ -167,7 +167,7 @@ def campaign(camera: str, captures: int, seed: int, folder: Path) -> Outcome:
         driver = PtpCamera(bench.connect(), timing=TIMING, deadline=in_seconds(20))
         try:
             driver.configure(ExposureSettings(1 / 60, 100, raw=False), deadline=in_seconds(20))
-            driver.troubles()
+            driver.notices()
             for _ in range(captures):
                 _capture(driver, bench, dice, outcome, folder)
         finally:
@@ -200,7 +200,7 @@ def _capture(driver: PtpCamera, bench: Bench, dice: random.Random, outcome: Outc
         if [file.path.read_bytes() for file in files] != [right]:
             outcome.wrong.append(f"another picture than the newest after {fault or 'no fault'}")
     outcome.late_s = max(outcome.late_s, time.monotonic() - started - DEADLINE_S)
-    codes += [code for code, _ in driver.troubles()]
+    codes += [notice.code for notice in driver.notices()]
     if fault:
         used = fault == "slow_s" or bench.left(fault) == 0
         harmless = fault == "lost_events" and outcome.camera.endswith(_ASKED_FOR_ITSELF)

@@ -56,5 +56,5 @@ def test_even_grey_is_even_grey_without_a_photograph_of_it(stage: Path) -> None:
 
 def test_no_trouble_is_named_that_is_not_there(stage: Path) -> None:
     (run,) = finished_calibrations(stage)
-    named = {(TroubleCode(str(trouble.code)), trouble.projector) for trouble in read_troubles(run)}
+    named = {(TroubleCode(str(trouble.code)), trouble.about or None) for trouble in read_troubles(run)}
     assert named <= {one for one, level in possible_troubles(read_truth(stage)).items() if level}

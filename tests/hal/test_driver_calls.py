@@ -204,12 +204,12 @@ class PlainCamera:
 
 
 class Watched(PlainCamera):
-    """Tells of its troubles, in a wrong shape."""
+    """Reports its notices in a wrong shape."""
 
     def status(self, *, deadline: Deadline) -> CameraStatus:
         return CameraStatus(battery_percent=20)
 
-    def troubles(self) -> Any:
+    def notices(self) -> Any:
         return ["slow"]
 
 
@@ -221,8 +221,8 @@ def test_a_camera_has_what_its_driver_has_and_no_more() -> None:
     assert not isinstance(watched, LiveViewCamera)
     assert not isinstance(plain, Display | BundleDisplay)
     assert watched.status(deadline=in_seconds(5)).battery_percent == 20
-    with pytest.raises(DriverFault, match="troubles"):
-        watched.troubles()
+    with pytest.raises(DriverFault, match="notices"):
+        watched.notices()
 
 
 @pytest.mark.parametrize("files", [(), None, ["shot.dng"], [CapturedFile("x", "raw", 1, "")]])  # type: ignore[arg-type]

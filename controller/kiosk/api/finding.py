@@ -59,8 +59,8 @@ def findings(stage: Path, service: Service | None, *, tools: Tools | None = None
         problems.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
                                 "Delete old runs or backups. Playback continues; calibration may fail."))  # fmt: skip
     for item in _search(tools).findings:
-        problems.append(Finding("warning", printable(item.device or "bus"), printable(item.problem.what),
-                                printable(item.problem.remedy)))  # fmt: skip
+        problems.append(Finding("warning", printable(item.about or "bus"), printable(item.what),
+                                printable(item.remedy)))  # fmt: skip
     return problems
 
 

@@ -15,9 +15,10 @@ from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, JobStep
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.world import Thread, World
-from controller.run.progress import Level, Phase, Progress
+from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
+from hal.notices import Level
 
 TITLES: Final[Mapping[str, str]] = {
     "aim": "Test shots",

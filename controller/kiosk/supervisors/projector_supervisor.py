@@ -141,8 +141,8 @@ class ProjectorSupervisor:
             if guard is None:
                 return
             status = guard.status(deadline=self._deadline(ANSWER_S))
-            for code, sentence in guard.troubles():
-                self._tell(Decision(code, sentence, "", "warning"))
+            for notice in guard.notices():
+                self._tell(Decision(notice.code, notice.text, "", "warning"))
         except (DeviceError, VelaturaError) as error:
             self._silent(error)
             return

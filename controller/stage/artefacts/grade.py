@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
-from controller.core.troubles import Trouble
 from controller.run.step_id import StepId
 from controller.stage.artefacts.names import json_path, read_json, write_json
+from hal.notices import Notice
 
 PICTURE: Final = "verification.png"
 """The map of errors and their reasons, the projectors in rows of ``ACROSS``."""
@@ -119,11 +119,20 @@ def passes(run: Path, worst_grade: float) -> bool:
     return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()
 
 
-def write_troubles(run: Path, step: StepId, found: Iterable[Trouble]) -> Path:
-    """``troubles-STEP.json``; written without any, too, because an earlier try may have found some."""
-    return write_json(json_path(run, _TROUBLES, str(step)), [asdict(trouble) for trouble in found])
+def write_troubles(run: Path, step: StepId, troubles: Iterable[Notice]) -> Path:
+    """``troubles-STEP.json``; written without any, too, because an earlier try may have found some.
+
+    Each notice has a code of ``TroubleCode``, and is about a projector, or "" for camera, object or several.
+    """
+    return write_json(json_path(run, _TROUBLES, str(step)), [trouble_row(trouble) for trouble in troubles])
 
 
-def read_troubles(run: Path) -> list[Trouble]:
+def read_troubles(run: Path) -> list[Notice]:
     """Of all steps of a run, by the names of their files; none of a run of an earlier version."""
-    return [Trouble(**row) for path in sorted(run.glob(f"{_TROUBLES}-*.json")) for row in read_json(path)]
+    rows = [row for path in sorted(run.glob(f"{_TROUBLES}-*.json")) for row in read_json(path)]
+    return [Notice.warning(row.get("code") or "", row["sentence"], about=row["projector"] or "") for row in rows]
+
+
+def trouble_row(trouble: Notice) -> dict[str, str | None]:
+    """As in ``troubles-STEP.json`` and in report.json."""
+    return {"sentence": trouble.what, "projector": trouble.about or None, "code": trouble.code or None}

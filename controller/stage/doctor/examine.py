@@ -17,13 +17,14 @@ from controller.optics.solve.engines import graphics_sentence
 from controller.run.progress import Reporter
 from controller.stage.doctor.search_address import PJLINK, search_address
 from controller.stage.doctor.trying import Trying, devices_of
-from controller.stage.doctor.values import Examination, Finding
+from controller.stage.doctor.values import Examination
 from controller.stage.doctor.writing import write
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import LOCK
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
-from hal.finding import Finder, Found, Known, Problem, SearchScope, load_finders, search_bus
+from hal.finding import Finder, Found, Known, SearchScope, load_finders, search_bus
+from hal.notices import Notice
 from hal.registry import Drivers, load_drivers
 
 LONGEST_S: Final = 300.0
@@ -69,7 +70,7 @@ def examine(
         seen = replace(seen, graphics=graphics_sentence())
     if write_it:
         if wrong and checked is None:
-            raise UsageError(wrong[0].problem.code, what=wrong[0].problem.what, remedy=wrong[0].problem.remedy)
+            raise UsageError(wrong[0].code, what=wrong[0].what, remedy=wrong[0].remedy)
         seen = replace(seen, written=write(folder, None if checked is None else checked.stage, seen))
     return seen
 
@@ -88,7 +89,7 @@ def _say_what_is_sent(wanted: SearchScope, reporter: Reporter) -> None:
         reporter.say("Sending a search for projectors (PJLink, UDP port {1}) to {0}.".format(*wanted.search))
 
 
-def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]:
+def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Notice]]:
     """The stage, or the error in its stage.toml; a folder without stage.toml is not a stage yet."""
     if not (folder / FILE).exists():
         if not folder.is_dir():
@@ -101,8 +102,8 @@ def _checked(folder: Path, tools: Tools) -> tuple[Checked | None, list[Finding]]
     try:
         checked = check_stage(folder, drivers=tools.drivers)
     except (UsageError, DeviceError) as error:
-        return None, [Finding(FILE, Problem(error.code, error.what, error.remedy))]
-    return checked, [Finding(FILE, Problem.of(fault)) for fault in checked.faults]
+        return None, [Notice.of(error, about=FILE)]
+    return checked, [Notice.of(fault, about=FILE) for fault in checked.faults]
 
 
 def _known(checked: Checked | None) -> tuple[Known, ...]:
@@ -113,12 +114,12 @@ def _known(checked: Checked | None) -> tuple[Known, ...]:
 
 def _search(
     wanted: SearchScope, finders: Sequence[Finder] | None, deadline: Deadline, reporter: Reporter
-) -> tuple[list[Found], list[Finding]]:
+) -> tuple[list[Found], list[Notice]]:
     """Search all buses in parallel, because most of the time is spent waiting for answers."""
-    broken: tuple[Problem, ...] = ()
+    problems: list[Notice] = []
     if finders is None:
         finders, broken = load_finders()
-    problems = [Finding("", problem) for problem in broken]
+        problems += broken
     found: list[Found] = []
     reporter.say(f"Searching {', '.join(finder.bus for finder in finders)}.")
     with ThreadPoolExecutor(max(1, len(finders)), thread_name_prefix="doctor") as pool:
@@ -128,11 +129,11 @@ def _search(
             except Cancelled:
                 raise
             except DeviceError as error:
-                problems.append(Finding(finder.bus, Problem.of(error)))
+                problems.append(Notice.of(error, about=finder.bus))
     return found, problems
 
 
-def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Finding], tools: Tools) -> Examination:
+def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Notice], tools: Tools) -> Examination:
     """Which of them the stage has, and the problems of each."""
     known = [] if checked is None else list(devices_of(checked))
     own = {(device.driver.name, device.place) for device in known}
@@ -140,7 +141,7 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
     outputs = {output.name for output in checked.stage.tables.display.outputs} if checked is not None else set()
     new = []
     for one in found:
-        problems += [Finding(one.address, problem) for problem in one.problems]
+        problems += [replace(problem, about=one.address) for problem in one.problems]
         if not one.driver or one.kind == "display":
             continue
         # A table without an address or serial number stands for the only device of its kind.
@@ -151,11 +152,11 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[Fi
         problems += _unplugged_outputs(found, outputs)
     for plugin in (tools.drivers or load_drivers(benches=False)).broken:
         what = f"The plugin {plugin.entry_point} of {plugin.distribution} can't be used: {plugin.reason}."
-        problems.append(Finding("", Problem("plugin-broken", what, plugin.remedy)))
+        problems.append(Notice.warning("plugin-broken", what, plugin.remedy))
     return Examination(tuple(found), (), tuple(problems), tuple(new))
 
 
-def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
+def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Notice]:
     missing = []
     for device in new:
         if device.kind == "power_switch":
@@ -167,23 +168,22 @@ def _not_in_stage(new: Sequence[Found], kinds: set[str]) -> list[Finding]:
             remedy = f"If it is the one to use, write address = {device.settings.get('address', '')!r} into [camera]."
         else:
             remedy = "Add it with `velatura doctor STAGE --write`, or unplug it if it is not part of this stage."
-        missing.append(Finding(device.address, Problem("not-in-stage", f"{device.what} is not in stage.toml.", remedy)))
+        what = f"{device.what} is not in stage.toml."
+        missing.append(Notice.warning("not-in-stage", what, remedy, about=device.address))
     return missing
 
 
-def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Finding]:
+def _unplugged_outputs(found: Sequence[Found], outputs: set[str]) -> list[Notice]:
     """Outputs of stage.toml that the X server does not have; empty without an X server."""
     there = {device.address for device in found if device.kind == "display"}
     if not there:
         return []
     return [
-        Finding(
-            name,
-            Problem(
-                "output-missing",
-                f"stage.toml has an output {name}, and the X server has {', '.join(sorted(there))}.",
-                "Connect the projector and enable the output (xrandr), or correct [[display.outputs]].",
-            ),
+        Notice.warning(
+            "output-missing",
+            f"stage.toml has an output {name}, and the X server has {', '.join(sorted(there))}.",
+            "Connect the projector and enable the output (xrandr), or correct [[display.outputs]].",
+            about=name,
         )
         for name in sorted(outputs - there)
     ]
@@ -199,6 +199,8 @@ def _tried(checked: Checked, seen: Examination, deadline: Deadline, reporter: Re
     tried, findings = [], list(seen.findings)
     for one, finding in Trying(checked, deadline).each(failed):
         tried.append(one)
-        if finding is not None and finding.problem not in [known.problem for known in findings]:
+        if finding is not None and replace(finding, about="") not in [
+            replace(earlier, about="") for earlier in findings
+        ]:
             findings.append(finding)
     return replace(seen, tried=tuple(tried), findings=tuple(findings))

@@ -20,9 +20,9 @@ from controller.core.arrays import ByteImage
 from controller.core.storage import exclusive
 from controller.optics.capture.acquire import Shot
 from controller.optics.capture.raw import is_jpeg, read_jpeg_values, read_samples
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.state_machine import Machine
-from controller.stage.doctor.values import Examination, Finding
+from controller.stage.doctor.values import Examination
 from controller.stage.rig.lamp_session import lit
 from controller.stage.rig.power import light
 from controller.stage.rig.rig import Rig, RigProjector
@@ -30,7 +30,7 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.open import opened
 from controller.stage.sessions.run import LOCK
 from hal.deadline import Deadline, in_seconds
-from hal.finding import Problem
+from hal.notices import Level, Notice
 from hal.runtime.caches import temporary
 from hal.values import Presented
 
@@ -114,18 +114,18 @@ def who_shows_what(rig: Rig, folder: Path, *, deadline: Deadline) -> list[Output
     return shown
 
 
-def judge(projectors: Sequence[RigProjector], shown: Sequence[OutputOwner]) -> list[Finding]:
+def judge(projectors: Sequence[RigProjector], shown: Sequence[OutputOwner]) -> list[Notice]:
     """Problems with the cables, by output."""
     findings = []
     for projector, output in zip(projectors, shown, strict=True):
         if output.projector is None:
             what = f"The projector on output {output.output} could not be found: no shutter made the photograph darker."
             remedy = "Check that the lamp is on and the camera sees the picture, or compare the numbers yourself."
-            findings.append(Finding(output.output, Problem("output-unseen", what, remedy)))
+            findings.append(Notice.warning("output-unseen", what, remedy, about=output.output))
         elif output.projector != projector.name:
             what = f"Output {output.output} is shown by projector {output.projector}, not by {projector.name}."
             remedy = f'Swap the cables, or write output = "{output.output}" for {output.projector} into stage.toml.'
-            findings.append(Finding(output.output, Problem("output-swapped", what, remedy)))
+            findings.append(Notice.warning("output-swapped", what, remedy, about=output.output))
     return findings
 
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, cast
 
-from controller.stage.doctor.values import Finding, Tried
+from controller.stage.doctor.values import Tried
 from controller.stage.rig.lamp_faults import fatal_faults, faulty
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.recording import open_context
 from hal.deadline import Deadline
 from hal.errors import DeviceError
-from hal.finding import Problem
 from hal.interfaces import ButtonPanel, Camera, Douser, LightSensor, PowerSwitch, Projector, WatchedProjector
+from hal.notices import Notice
 from hal.registry import Driver, open_device
 from hal.values import Power
 
@@ -69,7 +69,7 @@ class Trying:
         self._deadline = deadline
         self._dark: dict[str, str] = {}
 
-    def each(self, failed: Mapping[str, Problem]) -> Iterator[tuple[Tried, Finding | None]]:
+    def each(self, failed: Mapping[str, Notice]) -> Iterator[tuple[Tried, Notice | None]]:
         """Test every device, except those whose address has ``failed`` already."""
         for device in devices_of(self._checked):
             problem = failed.get(device.place)
@@ -78,15 +78,14 @@ class Trying:
                 try:
                     answer = self._asked(device)
                 except DeviceError as error:
-                    problem = Problem.of(error)
+                    problem = Notice.of(error)
             if problem is not None and device.name in self._dark:
-                problem = Problem(
+                problem = Notice.warning(
                     "mains-off",
                     f"Projector {device.name} does not answer, and its mains relay {self._dark[device.name]} is open.",
                     "A run closes it automatically. To test it now, switch the relay on by hand (usbrelay).",
                 )
-            finding = None if problem is None else Finding(device.name, problem)
-            yield Tried(device.name, device.kind, answer), finding
+            yield Tried(device.name, device.kind, answer), problem and replace(problem, about=device.name)
 
     def _asked(self, device: Device) -> str:
         context = open_context(self._checked.stage.folder)
@@ -122,8 +121,8 @@ class Trying:
         hours = "" if status.lamp_hours is None else f", {status.lamp_hours} lamp hours"
         warned = f", {', '.join(status.faults)}" if status.faults else ""
         by_hand = "" if can.power else ", must be switched by hand"
-        notes = projector.troubles() if isinstance(projector, WatchedProjector) else []
-        return " ".join([f"{status.power.value}{hours}{warned}{by_hand}", *(f"({note})" for _, note in notes)])
+        notices = projector.notices() if isinstance(projector, WatchedProjector) else []
+        return " ".join([f"{status.power.value}{hours}{warned}{by_hand}", *(f"({notice.what})" for notice in notices)])
 
     def _relays(self, name: str, board: PowerSwitch) -> str:
         until = self._deadline.within(OPEN_S)

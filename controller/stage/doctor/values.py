@@ -6,24 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from controller.core.text import printable
-from hal.finding import Found, Problem
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A problem with the device at ``device``, or with the whole stage if that is ""."""
-
-    device: str
-    problem: Problem
-
-    def as_json(self) -> dict[str, Any]:
-        problem = self.problem
-        return {
-            "device": self.device,
-            "code": problem.code,
-            "what": printable(problem.what),
-            "remedy": printable(problem.remedy),
-        }
+from hal.finding import Found
+from hal.notices import Notice
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +21,15 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """All results. ``new``: devices that are not in stage.toml yet; ``graphics``: what this computer can solve on."""
+    """All results.
+
+    ``findings``: each about a device's place, or about the whole stage (""); ``new``: devices that are not in
+    stage.toml yet; ``graphics``: what this computer can solve on
+    """
 
     found: tuple[Found, ...]
     tried: tuple[Tried, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[Notice, ...]
     new: tuple[Found, ...]
     written: tuple[str, ...] = ()
     graphics: str = ""
@@ -67,7 +55,15 @@ class Examination:
                 for device in self.found
             ],
             "tried": [{"name": tried.name, "kind": tried.kind, "answer": tried.answer} for tried in self.tried],
-            "problems": [finding.as_json() for finding in self.findings],
+            "problems": [
+                {
+                    "device": finding.about,
+                    "code": finding.code,
+                    "what": printable(finding.what),
+                    "remedy": printable(finding.remedy),
+                }
+                for finding in self.findings
+            ],
             "written": list(self.written),
             "graphics": self.graphics,
         }
@@ -85,9 +81,8 @@ class Examination:
         if self.graphics:
             lines += ["", self.graphics]
         for number, finding in enumerate(self.findings, 1):
-            where = f"{finding.device}: " if finding.device else ""
-            lines += ["", f"{number}. {where}{finding.problem.what} [{finding.problem.code}]",
-                      f"   {finding.problem.remedy}"]  # fmt: skip
+            where = f"{finding.about}: " if finding.about else ""
+            lines += ["", f"{number}. {where}{finding.what} [{finding.code}]", f"   {finding.remedy}"]
         if self.written:
             lines += ["", *(f"Written into stage.toml: {text}." for text in self.written)]
         lines += ["", "No problems found." if self.healthy else f"Problems to correct: {len(self.findings)}."]

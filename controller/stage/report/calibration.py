@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import tzinfo
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from controller.stage.artefacts.grade import (
     read_error_maps,
     read_grade_figures,
     read_troubles,
+    trouble_row,
 )
 from controller.stage.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
@@ -121,7 +122,7 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "colours_px": {name: None if one is None else one.colours_px for name, one in pixels.items()},
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
         "verification": read_grade_figures(run),
-        "troubles": [asdict(trouble) for trouble in read_troubles(run)],
+        "troubles": [trouble_row(trouble) for trouble in read_troubles(run)],
         "steps": {str(step): seconds for step, seconds in steps.items()},
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry_figures
-from controller.stage.artefacts.grade import read_grade_figures, read_troubles
+from controller.stage.artefacts.grade import read_grade_figures, read_troubles, trouble_row
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.stage.artefacts.published import BundleFigures, has_photograph, read_photograph_of, read_playback
@@ -125,7 +125,7 @@ def _figures(
             "seconds": fitting,
         },
         "verification": read_grade_figures(run),
-        "troubles": [asdict(trouble) for trouble in read_troubles(run)],
+        "troubles": [trouble_row(trouble) for trouble in read_troubles(run)],
         "solve": {key: base[key] for key in ("seconds", "iterations", "objective", "kkt")},
         "appearances": [_appearance_figures(appearance) for appearance in judged],
         "bundle": {"bytes": bundle.bytes, "ratio": bundle.ratio},

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.interfaces import Display, LightSensor
+from hal.notices import Level
 
 ANSWER_S = 10.0
 

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from controller.run.progress import Level
 from controller.run.runner import Context
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
 from hal.interfaces import Camera, WatchedCamera
+from hal.notices import Level
 
 EVERY_S: Final = 60.0
 """Time between two queries of the camera's battery and card."""
@@ -37,8 +37,8 @@ class CameraWatch:
         """After a photograph: journal corrected faults; once a minute, ask for the camera's state."""
         if self._camera is None:
             return
-        for code, sentence in self._camera.troubles():
-            context.journal.record(code, sentence, Level.WARNING)
+        for notice in self._camera.notices():
+            context.journal.record(notice.code, notice.what, Level.WARNING)
         if self._clock() < self._next_s:
             return
         self._next_s = self._clock() + EVERY_S

@@ -11,6 +11,7 @@ from typing import Final
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError
 from hal.interfaces import AdjustedProjector, Douser, Projector, WatchedProjector
+from hal.notices import Notice
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 
 MOVE_S: Final = 25.0
@@ -21,7 +22,7 @@ class DousedProjector:
     """``hal.interfaces.WatchedProjector`` and ``AdjustedProjector``; its shutter is the douser.
 
     The douser follows every status and every switch. When it fails, the lamp can still be read and switched off: the
-    error is one of ``troubles``, and only ``switch_on`` and ``set_shutter`` raise it.
+    error is one of ``notices``, and only ``switch_on`` and ``set_shutter`` raise it.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ class DousedProjector:
         self._passes: bool | None = None
         self._wanted_off = False
         self._failed = ""
-        self._notes: list[tuple[str, str]] = []
+        self._own_notices: list[Notice] = []
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
@@ -72,9 +73,9 @@ class DousedProjector:
     def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
         self._move(closed, deadline)
 
-    def troubles(self) -> list[tuple[str, str]]:
-        own, self._notes = self._notes, []
-        return [*(self._projector.troubles() if isinstance(self._projector, WatchedProjector) else []), *own]
+    def notices(self) -> list[Notice]:
+        own, self._own_notices = self._own_notices, []
+        return [*(self._projector.notices() if isinstance(self._projector, WatchedProjector) else []), *own]
 
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
         projector = self._projector
@@ -110,7 +111,8 @@ class DousedProjector:
             raise
         except DeviceError as error:
             if error.code != self._failed:
-                self._notes.append((error.code, f"The douser of projector {self._name} fails: {error.what}"))
+                what = f"The douser of projector {self._name} fails: {error.what}"
+                self._own_notices.append(Notice.warning(error.code, what))
             self._failed = error.code
         else:
             self._failed = ""

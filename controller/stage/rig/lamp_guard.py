@@ -19,6 +19,7 @@ from controller.stage.rig.lamp_ledger import Clock, LampLedger, LampRecord, Syst
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.interfaces import AdjustedProjector, Projector, WatchedProjector
+from hal.notices import Notice
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 
 SAVE_HOURS_EVERY_S = 60.0
@@ -104,9 +105,9 @@ class LampGuard:
                 return replace(status, power=Power.ON if burns else Power.WARMING)
             return status
 
-    def troubles(self) -> list[tuple[str, str]]:
+    def notices(self) -> list[Notice]:
         """As ``hal.interfaces.WatchedProjector``; empty if the driver reports none."""
-        return [] if self._watched is None else self._watched.troubles()
+        return [] if self._watched is None else self._watched.notices()
 
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
         """As ``hal.interfaces.AdjustedProjector``; empty if the driver reads none."""

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId
@@ -16,6 +16,7 @@ from controller.stage.rig.mains_relays import open_circuits
 from controller.stage.rig.power import BY_HAND_S, light, power_down, steady
 from controller.stage.rig.rig import Rig
 from hal.errors import DeviceError
+from hal.notices import Level
 
 NEARLY_S: Final = 60.0
 """Before lamps are stable: from here on their light changes little, and what needs no more may be measured."""
@@ -85,9 +86,9 @@ def power_steps(rig: Rig, *, power_up_s: float, early: Sequence[Step] = ()) -> l
 
     def note(context: Context) -> None:
         for guard in rig.guards:
-            for code, sentence in guard.troubles():
-                context.journal.record(code, sentence, Level.WARNING)
-                context.reporter.say(sentence, Level.WARNING)
+            for notice in guard.notices():
+                context.journal.record(notice.code, notice.text, Level.WARNING)
+                context.reporter.say(notice.text, Level.WARNING)
 
     rules = [guard.capabilities.lamp_rules for guard in rig.guards]
     light_s = max(rule.warm_up_s for rule in rules) + (BY_HAND_S if any(g.by_hand for g in rig.guards) else 0.5)

@@ -15,13 +15,14 @@ from controller.bundle.signing import ANY_SIGNER, Trust, generate_key, load_publ
 from controller.config import Stage, load_stage
 from controller.config.loader import FILE
 from controller.core.errors import BundleError, UsageError
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.stage.artefacts.solved import is_solved
 from controller.stage.sessions.calibrations import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.run import stage_lock
 from controller.stage.steps.appearance.publishing import hints_ms, publish_solved
 from hal.deadline import Cancelled
+from hal.notices import Level
 
 BUNDLES = "bundles"
 """The stage's folder of installed bundles."""

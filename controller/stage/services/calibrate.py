@@ -15,7 +15,7 @@ from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.request import SolveOptions
 from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
 from controller.stage.artefacts.calibrated import Calibrated
@@ -47,6 +47,7 @@ from controller.stage.steps.calibrate.grade import verify_step
 from controller.stage.steps.capture.device_checks import device_checks
 from controller.stage.steps.modes import DotOptions, dot_options
 from hal.deadline import in_seconds
+from hal.notices import Level
 
 
 def calibrate(

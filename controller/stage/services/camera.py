@@ -18,7 +18,8 @@ from controller.optics.calibrate.camera.charuco import board_picture, calibrate_
 from controller.optics.calibrate.camera.exif import intrinsics_from_exif
 from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics, write_intrinsics
 from controller.optics.capture.raw import read_photograph
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
+from hal.notices import Level
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 

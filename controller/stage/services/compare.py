@@ -11,7 +11,7 @@ from typing import Any
 from controller.bundle.install import current
 from controller.bundle.reader import Bundle
 from controller.core.errors import UsageError
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.comparison import COMPARE, compared_in
@@ -24,6 +24,7 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.session import StageSession
 from controller.stage.sessions.time_zone import time_zone
 from controller.stage.steps.appearance.compare import compare_steps
+from hal.notices import Level
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from controller.optics.solve.reach.feasibility import exposure
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from controller.play.live.stream import TARGET
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
@@ -39,6 +39,7 @@ from controller.stage.steps.appearance.live import FrameMaker, Frames, LiveFigur
 from controller.stage.steps.appearance.live_parts import live_maps, target_px
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused
+from hal.notices import Level
 from hal.values import LiveStatus
 
 FRAMES_FILE: Final = "live.frame"

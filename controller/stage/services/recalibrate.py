@@ -10,7 +10,7 @@ from typing import Any
 
 from controller.core.errors import UsageError
 from controller.run.journal import Journal
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
@@ -33,6 +33,7 @@ from controller.stage.steps.calibrate.gate import accept, below_grade, compare_w
 from controller.stage.steps.calibrate.quick import quick_steps
 from controller.stage.steps.calibrate.single_projector import one_projector_steps
 from controller.stage.steps.modes import MODES, CalibrationMode, DotOptions
+from hal.notices import Level
 
 CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
 """The photographs of the previous check and of the grade."""

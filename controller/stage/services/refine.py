@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.config import load_stage
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_refining, remove_refined
@@ -20,6 +20,7 @@ from controller.stage.sessions.session import StageSession
 from controller.stage.steps.appearance.refining import RefineOptions, refine_steps, sentence
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
+from hal.notices import Level
 
 REFINE: Final = "refine"
 """What such runs are called; their folders' names end with it."""

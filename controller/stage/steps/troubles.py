@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from controller.core.troubles import Trouble, TroubleCode
-from controller.run.progress import Level
+from controller.core.troubles import TroubleCode
 from controller.run.runner import Context
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import write_troubles
+from hal.notices import Level, Notice
 
 
 def tell(context: Context, step: StepId, sentences: Mapping[TroubleCode, str | None]) -> Path:
@@ -17,14 +17,16 @@ def tell(context: Context, step: StepId, sentences: Mapping[TroubleCode, str | N
 
     Returns the file that keeps it, an artefact of the step.
     """
-    found = [Trouble(text, step.projector, code) for code, text in sentences.items() if text is not None]
+    found = [
+        Notice.warning(code, text, about=step.projector or "") for code, text in sentences.items() if text is not None
+    ]
     return tell_all(context, step, found)
 
 
-def tell_all(context: Context, step: StepId, found: Sequence[Trouble]) -> Path:
+def tell_all(context: Context, step: StepId, found: Sequence[Notice]) -> Path:
     """As ``tell``."""
     for trouble in found:
-        context.reporter.say(trouble.sentence, Level.WARNING)
+        context.reporter.say(trouble.what, Level.WARNING)
     return write_troubles(context.folder, step, found)
 
 

@@ -44,7 +44,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Notice:
+class UnaskedMessage:
     """A line that the projector sent unasked, with either ``power`` or ``trouble``."""
 
     power: Power | None
@@ -89,7 +89,7 @@ def rest_bytes(frame: Frame, head: bytes, *, longest: int) -> int:
 
 def parse_line(
     table: SerialTable, line: bytes, query: Query | None = None, *, sent: bytes = b""
-) -> Answer | Notice | Reply:
+) -> Answer | UnaskedMessage | Reply:
     """Read one line or frame of the projector as the answer to ``query`` (None: a command).
 
     ``line`` may have its terminator or not; ``sent``: what was sent last, to know its echo.
@@ -168,19 +168,19 @@ def _text(table: SerialTable, line: bytes, sent: bytes) -> str:
     return text
 
 
-def _notice(table: SerialTable, text: str) -> Notice:
+def _notice(table: SerialTable, text: str) -> UnaskedMessage:
     code = text.removeprefix(table.notices.prefix).strip()
     if code in table.notices.power:
-        return Notice(table.notices.power[code], None)
+        return UnaskedMessage(table.notices.power[code], None)
     if (word := table.notices.trouble.get(code)) is not None:
-        return Notice(None, word)
+        return UnaskedMessage(None, word)
     for begins, word in table.notices.trouble.items():
         if not begins.isdigit() and code.startswith(begins):
-            return Notice(None, word)
+            return UnaskedMessage(None, word)
     if not (len(code) <= 4 and code.isascii() and code.isalnum()):
         raise _garbage(text.encode("latin-1"))
     # Report a code that is not in the manual, but do not stop.
-    return Notice(None, f"notice-{code.lower()}-warning")
+    return UnaskedMessage(None, f"notice-{code.lower()}-warning")
 
 
 def _answer(table: SerialTable, query: Query, value: str, line: bytes) -> Answer | Reply:

@@ -7,7 +7,8 @@ import pytest
 
 from controller.cli import console
 from controller.core.text import duration, printable
-from controller.run.progress import Level, Phase, Progress
+from controller.run.progress import Phase, Progress
+from hal.notices import Level
 
 HOSTILE = "EP910 \x1b]0;owned\x07 [bold]\x00\n\u202e"
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from controller.run.progress import Level, Progress, Silent
+from controller.run.progress import Progress, Silent
+from hal.notices import Level
 
 
 class Listening(Silent):

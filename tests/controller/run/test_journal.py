@@ -10,9 +10,9 @@ from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.run.journal import Journal
 from controller.run.journal_schema import JournalError
-from controller.run.progress import Level
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import ShotId, StepId
+from hal.notices import Level
 
 DECODE = StepId("decode")
 WHITE = ShotId("light", "white-00", "left")

@@ -24,6 +24,7 @@ from hal.conformance import DouserConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError
 from hal.interfaces import Douser
+from hal.notices import Notice
 from hal.registry import OpenContext, load_drivers, open_device
 from hal.values import Power
 from plugins.dousers.sacn_douser import DRIVER, SacnDouser, open_sacn_douser
@@ -266,7 +267,7 @@ class TestBeforeAProjector:
         wait_for(lambda: projector.status(deadline=in_seconds(SOON)).power is Power.OFF)
         wait_for(lambda: told[-1] == ("left", False))
         assert told == [("left", True), ("left", False)] * 2
-        assert projector.troubles() == []
+        assert projector.notices() == []
 
     def test_one_that_is_lit_when_it_is_opened_keeps_its_light(self, doused: Any) -> None:
         projector, lamp, told = doused
@@ -287,8 +288,8 @@ def test_a_douser_that_fails_strikes_no_lamp_and_keeps_none_lit(open_serial: Any
         lamp.warm_now()
         for _ in range(2):
             assert projector.status(deadline=in_seconds(SOON)).power is Power.ON
-        (trouble,) = projector.troubles()
-        assert (trouble[0], "projector left" in trouble[1]) == ("douser-gone", True)
+        (notice,) = projector.notices()
+        assert (notice.code, "projector left" in notice.what) == ("douser-gone", True)
         projector.switch_off(deadline=in_seconds(SOON))
         wait_for(lambda: lamp.phase in (LampPhase.COOLING, LampPhase.STANDBY))
         projector.close()
@@ -302,7 +303,7 @@ def test_a_driver_that_does_not_open_strikes_no_lamp(open_serial: Any) -> None:
 
     projector = DousedProjector("left", pair.driver, refused)
     assert projector.status(deadline=in_seconds(SOON)).power is Power.OFF
-    assert projector.troubles() == [("made-up", "The douser of projector left fails: It is locked.")]
+    assert projector.notices() == [Notice.warning("made-up", "The douser of projector left fails: It is locked.")]
     with pytest.raises(DeviceRefused, match="locked"):
         projector.switch_on(deadline=in_seconds(SOON))
     assert pair.emulator.lamp.strikes == 0

@@ -62,7 +62,7 @@ def test_the_status_tells_battery_and_card(camera: Gphoto2Camera) -> None:
     status = camera.status(deadline=in_seconds(10))
     assert status.battery_percent == 50
     assert (status.free_bytes or 0) > 1 << 28
-    assert camera.troubles() == []
+    assert camera.notices() == []
 
 
 def test_a_camera_that_could_not_be_opened_leaves_no_process_behind() -> None:
@@ -76,7 +76,7 @@ def test_a_library_that_crashes_ends_its_process_and_the_call_is_done_again(came
     first = crash(camera)
     assert camera.identity(deadline=in_seconds(20)).model
     assert camera.process.pid not in (None, first)
-    assert [code for code, _ in camera.troubles()] == ["camera-library-ended"]
+    assert [notice.code for notice in camera.notices()] == ["camera-library-ended"]
 
 
 def test_a_crash_during_a_picture_is_reported_and_nothing_is_taken_twice(camera: Gphoto2Camera, tmp_path: Path) -> None:

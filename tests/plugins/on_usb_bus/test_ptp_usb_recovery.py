@@ -28,7 +28,7 @@ def test_what_breaks_the_connection_after_the_exposure_loses_no_picture_and_take
     rig.fault(f"camera_faults.{fault}", 1)
     assert rig.capture(tmp_path) == rig.latest()
     assert rig.exposures() == 1
-    assert rig.driver.troubles()
+    assert rig.driver.notices()
     assert rig.capture(tmp_path, "next") == rig.latest()
 
 
@@ -125,4 +125,4 @@ def test_what_is_left_in_the_middle_is_cancelled_at_the_camera(rig: Rig) -> None
 def test_noise_from_the_camera_is_never_taken_for_an_answer(rig: Rig) -> None:
     rig.fault("camera_faults.garbage", 1)
     assert rig.driver.identity(deadline=in_seconds(20)).serial
-    assert [code for code, _ in rig.driver.troubles()] == ["camera-protocol"]
+    assert [notice.code for notice in rig.driver.notices()] == ["camera-protocol"]

@@ -68,11 +68,11 @@ def test_an_optional_answer_that_means_nothing_makes_its_field_unknown_and_is_no
     assert pair.driver.capabilities.lamp_hours is (field != "LAMP")
     assert pair.driver.capabilities.errors is (field != "ERST")
     works(pair)
-    notes = pair.driver.troubles()
-    assert [code for code, _ in notes] == ["projector-answer-odd"]
-    assert pair.emulator.address in notes[0][1]
-    assert "unknown" in notes[0][1]
-    assert pair.driver.troubles() == []
+    notes = pair.driver.notices()
+    assert [notice.code for notice in notes] == ["projector-answer-odd"]
+    assert pair.emulator.address in notes[0].what
+    assert "unknown" in notes[0].what
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_blanks_and_refusals_are_understood_and_need_no_note(
 ) -> None:
     pair = open_pjlink(edit=hasty, odd=PjLinkOddities(answers={field: answer}))
     assert told(pair)[field] == means
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize("name", ["INF1", "INF2", "INFO", "SNUM", "SVER"])
@@ -166,7 +166,7 @@ def test_variants_of_the_protocol_work(open_pjlink: Any, name: str, password: st
     pair = open_pjlink(edit=hasty, odd=VARIANTS[name], password=password, settings=known)
     assert told(pair) == KNOWN
     works(pair)
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize("digits", [1, 7, 9, 16, 64])

@@ -68,9 +68,9 @@ def test_a_lamp_question_that_nobody_answers_well_costs_the_hours_and_nothing_el
         pair = open_serial(profile=profile, name=profile, board=board, edit=quick)
         switches_without_hours(pair)
         assert pair.driver.identity(deadline=in_seconds(SOON)).maker
-        notes = [text for code, text in pair.driver.troubles() if code == "projector-answer-odd"]
+        notes = [notice.what for notice in pair.driver.notices() if notice.code == "projector-answer-odd"]
         assert len([text for text in notes if "lamp hours" in text]) <= 1
-        assert pair.driver.troubles() == []
+        assert pair.driver.notices() == []
 
     each(LAMP_QUESTION, works)
 
@@ -93,9 +93,9 @@ def test_a_silent_lamp_question_is_noted_once_and_not_asked_again_and_again(open
     assert len(boards[0].heard) == asked
     assert time.monotonic() - started < 3.0
     assert not pair.driver.capabilities.lamp_hours
-    ((code, text),) = pair.driver.troubles()
-    assert code == "projector-answer-odd"
-    assert "lamp hours" in text
+    (notice,) = pair.driver.notices()
+    assert notice.code == "projector-answer-odd"
+    assert "lamp hours" in notice.what
 
 
 @pytest.mark.parametrize("left_s", [0.5, 0.8, 1.2])
@@ -134,7 +134,7 @@ def test_a_sanyo_with_any_number_of_lamps_tells_the_hours_of_the_first(open_seri
     pair = open_serial(profile="sanyo", board=partial(SanyoBoard, lamps=lamps))
     pair.emulator.lamp.warm_now()
     assert status(pair).lamp_hours == 1200
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize("code", [b"00003", b"00004", b"00005", b"00007", b"00009", b"00012"])
@@ -142,7 +142,7 @@ def test_a_christie_without_lamps_refuses_their_hours_by_any_number(open_serial:
     refusal = b'(65535 00000 ERR%s "LPH: Unknown request")' % code
     pair = open_serial(profile="christie", board=odd("christie", {b"(LPH?)": refusal}), edit=quick)
     switches_without_hours(pair)
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize("code", [*range(4, 10), *range(101, 119)])

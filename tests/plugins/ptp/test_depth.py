@@ -174,7 +174,7 @@ def test_a_target_that_flips_silently_loses_no_picture_and_is_set_again(flavour:
             assert rig.emulator.exposures == number + 1
         assert rig.emulator.pictures_on_card == 0
         assert rig.driver.status(deadline=in_seconds(20)).warnings == ("target-changed",)
-        assert "camera-target-changed" in [code for code, _ in rig.driver.troubles()]
+        assert "camera-target-changed" in [notice.code for notice in rig.driver.notices()]
 
 
 @pytest.mark.parametrize("flavour", ["eos-new", "eos-old"])
@@ -212,15 +212,15 @@ def test_mended_faults_are_told_for_the_journal_once(tmp_path: Path) -> None:
         rig.capture(tmp_path)
         rig.emulator.faults.drop_in_transfer = 1
         rig.capture(tmp_path)
-        told = [code for code, _ in rig.driver.troubles()]
+        told = [notice.code for notice in rig.driver.notices()]
         assert told == ["camera-busy", "camera-disconnected"]
-        assert rig.driver.troubles() == []
+        assert rig.driver.notices() == []
 
 
 def test_a_target_that_is_never_confirmed_costs_a_note_and_not_the_camera(tmp_path: Path) -> None:
     faults = CameraFaults(unconfirmed=frozenset({0xD11C}))
     with eos(faults) as rig:
-        notes = [code for code, _ in rig.driver.troubles()]
+        notes = [notice.code for notice in rig.driver.notices()]
         assert notes == ["camera-not-confirmed"]
         assert rig.capture(tmp_path, "shot") == rig.latest()
 
@@ -235,15 +235,15 @@ def test_a_body_that_refuses_to_hear_of_the_computers_space_is_used_with_a_note(
     with eos(CameraFaults(space_refused=True)) as rig:
         assert rig.capture(tmp_path, "one") == rig.latest()
         assert rig.capture(tmp_path, "two") == rig.latest()
-        assert [code for code, _ in rig.driver.troubles()] == ["camera-space-refused"]
+        assert [notice.code for notice in rig.driver.notices()] == ["camera-space-refused"]
 
 
 def test_a_body_that_is_not_ready_at_the_start_of_live_view_is_no_trouble() -> None:
     with running("eos-new") as rig:
-        rig.driver.troubles()
+        rig.driver.notices()
         assert rig.driver.live_view(deadline=in_seconds(20)).startswith(b"\xff\xd8")
         assert rig.emulator.body.answered[0x9153] > 1, "it was not ready at first"
-        assert rig.driver.troubles() == []
+        assert rig.driver.notices() == []
 
 
 @contextlib.contextmanager

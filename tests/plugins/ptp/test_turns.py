@@ -148,4 +148,4 @@ def test_a_note_that_comes_while_the_others_are_taken_is_told_the_next_time() ->
         sys.settrace(former)
     told += diary.take()
     assert added > 0
-    assert [what for _, what in told] == [f"note {number}" for number in range(1, added + 1)]
+    assert [notice.what for notice in told] == [f"note {number}" for number in range(1, added + 1)]

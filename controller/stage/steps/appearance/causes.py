@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 
 from controller.optics.solve.result.common_causes import Cause, CommonCauses, common_causes
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.solved import Refining, write_causes
+from hal.notices import Level
 
 
 def causes_step(calibrated: Calibrated, names: Sequence[str], photographs: int, *, after: Sequence[StepId]) -> Step:

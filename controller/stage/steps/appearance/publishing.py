@@ -18,13 +18,14 @@ from controller.config import load_stage
 from controller.config.loader import FILE
 from controller.core.errors import BundleError
 from controller.core.storage import sha256_of
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.published import BUNDLE, BundleFigures
 from controller.stage.artefacts.solved import is_solved, read_solved
+from hal.notices import Level
 
 METADATA = ("title", "mode", "exposure", "reachable_share", "fine_detail")
 """Figures of the solve that a bundle contains; all are the same in a repeated solve."""

@@ -30,7 +30,6 @@ from controller.optics.solve.result.refinement import (
     trusted_pixels,
     without_flicker,
 )
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
@@ -45,6 +44,7 @@ from controller.stage.steps.appearance.exposure_times import brightest, speeds
 from controller.stage.steps.appearance.photographing import take_bracket
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.capture.photographs import frames_digest
+from hal.notices import Level
 from hal.runtime.memory import free_bytes
 
 WORSE: Final = "the last correction was no better"

@@ -19,13 +19,13 @@ from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, 
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.targets.values import Target
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.solved import RequestedTarget, Solved, SolvedBase
 from controller.stage.steps import costs
+from hal.notices import Level
 from hal.runtime.memory import free_bytes
 
 BASE = StepId(StepKind.BASE)

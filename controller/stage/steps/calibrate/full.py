@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.core.errors import CalibrationError
-from controller.core.troubles import Trouble, TroubleCode
+from controller.core.troubles import TroubleCode
 from controller.optics.calibrate.correspondence.colour_alignment import (
     colour_shifts,
     colour_sizes,
@@ -41,6 +41,7 @@ from controller.stage.steps.calibrate.projector_glare import lens_troubles
 from controller.stage.steps.capture.camera import camera_step
 from controller.stage.steps.capture.patterns import capture_steps, code_step, light_step
 from controller.stage.steps.troubles import tell, tell_all
+from hal.notices import Notice
 
 
 def calibration_steps(
@@ -196,6 +197,6 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
     troubles = lens_troubles(context, rig.projectors, found.geometry)
     for name, lens in zip(names, found.geometry.projectors, strict=True):
         if (text := bent(name, lens)) is not None:
-            troubles.append(Trouble(text, name, TroubleCode.LENS_DISTORTION))
+            troubles.append(Notice.warning(TroubleCode.LENS_DISTORTION, text, about=name))
     said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
     return [*write_geometry(context.folder, names, found), said]

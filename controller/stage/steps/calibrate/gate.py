@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.errors import CalibrationError
-from controller.run.progress import Level, Reporter
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import (
@@ -22,6 +22,7 @@ from controller.stage.artefacts.grade import (
     worst_of,
     write_accepted,
 )
+from hal.notices import Level
 
 WORSE: Final = 1.25
 """Warn about a calibration this many times worse than the previous one, even if its grade is sufficient."""

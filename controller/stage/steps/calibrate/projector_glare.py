@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.core.troubles import Trouble, TroubleCode
+from controller.core.troubles import TroubleCode
 from controller.optics.calibrate.photometry.glare import spread_by_lens
 from controller.optics.calibrate.photometry.projector_glare import DarkPart, lens_veils, projector_glare
 from controller.optics.calibrate.values import Geometry
@@ -21,12 +21,13 @@ from controller.stage.artefacts.pattern_plans import PlanUsed
 from controller.stage.artefacts.photographs import Developed
 from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.rig.rig import RigProjector
+from hal.notices import Notice
 
 COARSE_BITS: Final = 4
 """Of each axis of the code; finer stripes leave few places dark."""
 
 
-def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry: Geometry) -> list[Trouble]:
+def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry: Geometry) -> list[Notice]:
     """A trouble for each projector that has a veil; none where the code was shown in colours, or not at all."""
     stride = stride_of(geometry.points_m.shape)
     lights = [Light.read(context.folder, projector.name) for projector in projectors]
@@ -37,7 +38,7 @@ def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry
         parts = list(_dark_parts(context, projector, thinned(lights[n].black, stride), stride))
         glare = projector_glare(whites, n, parts, depth_m)
         if (said := lens_veils(projector.name, glare.sure)) is not None:
-            found.append(Trouble(said, projector.name, TroubleCode.PROJECTOR_GLARE))
+            found.append(Notice.warning(TroubleCode.PROJECTOR_GLARE, said, about=projector.name))
     return found
 
 

@@ -23,7 +23,6 @@ from controller.optics.calibrate.verify.drift import Drift, ProjectorDrift
 from controller.optics.calibrate.verify.drift_report import advice, sentences
 from controller.optics.calibrate.verify.homography_update import update_positions, update_radiometry
 from controller.run.journal import Journal
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
@@ -38,6 +37,7 @@ from controller.stage.steps import costs
 from controller.stage.steps.calibrate.drift import drift_steps
 from controller.stage.steps.calibrate.grade import verification_photographs_step, verify_step
 from controller.stage.steps.capture.photographs import Planned, take_all
+from hal.notices import Level
 
 
 class Reuse(enum.Enum):

@@ -13,10 +13,10 @@ from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.capture.linear_files import is_linear
 from controller.optics.capture.raw import is_jpeg, read_jpeg_values, read_mosaic, read_samples
 from controller.optics.solve.memory_need import calibration_peak_bytes, check_memory, planned_size, solve_peak_bytes
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
+from hal.notices import Level
 from hal.runtime.memory import free_bytes
 
 Size = tuple[int, int]

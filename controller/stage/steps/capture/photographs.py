@@ -15,7 +15,6 @@ from controller.core.arrays import ByteImage
 from controller.optics.capture.acquire import LastShown, Shot
 from controller.optics.capture.latency import CHANGED_FRAMES, LONGEST_S, changed_share, fingerprint, same_picture
 from controller.optics.capture.profile import CameraProfile, load_profile, true_exposure
-from controller.run.progress import Level
 from controller.run.runner import Context
 from controller.run.step_id import ShotId
 from controller.stage.artefacts.camera import longest_wait_s, raise_delay
@@ -32,6 +31,7 @@ from controller.stage.rig.camera_watch import CameraWatch
 from controller.stage.rig.rig import Rig
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
+from hal.notices import Level
 
 MORE_DELAY_S = 0.1
 CHECK_LAMPS_EVERY_S = 30.0

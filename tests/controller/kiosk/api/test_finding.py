@@ -14,7 +14,8 @@ from controller.kiosk.api.finding import find, findings, try_device
 from controller.stage.doctor.examine import Tools
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone
-from hal.finding import Finder, Found, Problem, SearchScope
+from hal.finding import Finder, Found, SearchScope
+from hal.notices import Notice
 from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity
 from tests.controller.stage.rig.rig_model import ModelCamera
@@ -123,7 +124,7 @@ def test_a_device_that_vanishes_or_is_in_use_is_told_in_words(tmp_path: Path) ->
 
 
 def test_what_is_wrong_on_a_bus_is_told_in_harmless_words_without_a_service(tmp_path: Path) -> None:
-    problem = Problem("no-rights", f"No rights for {HOSTILE}.", "Install the udev rules.")
+    problem = Notice.warning("no-rights", f"No rights for {HOSTILE}.", "Install the udev rules.")
     (found,) = findings(tmp_path, None, tools=Bus(camera(problems=(problem,))).tools)
     assert found.level == "warning"
     assert found.what.isprintable()

@@ -76,7 +76,7 @@ def test_a_menu_of_a_serial_projector(open_serial: Any, command: bytes, named: s
     assert compared(before, now) == [named]
     assert compared(before, dark) == []
     assert len(unknown(Inventory(1.0, "run", before), Inventory(2.0, "", dark))) == 3
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_menus_of_other_families(
         assert board.feed(command)
     told = [f"The {kind} of projector left was {old}, and is now {new}." for kind, old, new in batched(named)]
     assert sorted(compared(before, adjusted(pair))) == sorted(told)
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 def batched(names: tuple[str, ...]) -> list[tuple[str, ...]]:
@@ -113,7 +113,7 @@ def batched(names: tuple[str, ...]) -> list[tuple[str, ...]]:
 def test_a_serial_projector_whose_model_has_no_such_menu_says_nothing(open_serial: Any) -> None:
     pair = lit(open_serial(profile="benq", board=lambda lamp: BenqBoard(lamp, BenqQuirks(menus=False)), edit=hasty))
     assert pair.driver.adjustments(deadline=in_seconds(SOON)) == {}
-    assert pair.driver.troubles() == []
+    assert pair.driver.notices() == []
 
 
 def test_input_firmware_and_body_of_a_projector_on_the_network(open_pjlink: Any) -> None:

@@ -13,9 +13,10 @@ from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, JobRunner, run_name
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.run.progress import Level, Phase, Progress
+from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled
 from hal.errors import DeviceGone
+from hal.notices import Level
 
 
 def well(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:

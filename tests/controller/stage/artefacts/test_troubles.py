@@ -7,12 +7,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
-from controller.core.troubles import Trouble, TroubleCode
-from controller.run.progress import Level
+from controller.core.troubles import TroubleCode
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import read_troubles, write_troubles
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.steps.troubles import tell
+from hal.notices import Level, Notice
 
 if TYPE_CHECKING:
     from controller.run.runner import Context
@@ -40,7 +40,11 @@ def test_troubles_of_all_steps_are_read_back(tmp_path: Path) -> None:
     assert all(path.parent == tmp_path for path in paths)
     assert len(paths) == 2
     assert said.all == [("Hot.", Level.WARNING), ("Bent.", Level.WARNING), ("Blue.", Level.WARNING)]
-    wanted = [Trouble("Hot.", None, hot), Trouble("Bent.", "left", panels), Trouble("Blue.", "left", fringes)]
+    wanted = [
+        Notice.warning(hot, "Hot."),
+        Notice.warning(panels, "Bent.", about="left"),
+        Notice.warning(fringes, "Blue.", about="left"),
+    ]
     assert read_troubles(tmp_path) == wanted
 
 
@@ -59,10 +63,10 @@ def test_runs_of_earlier_versions_have_none(tmp_path: Path) -> None:
 
 def test_what_an_earlier_version_found_has_no_code(tmp_path: Path) -> None:
     (tmp_path / "troubles-camera.json").write_text('[{"sentence": "Hot.", "projector": null}]')
-    assert read_troubles(tmp_path) == [Trouble("Hot.")]
+    assert read_troubles(tmp_path) == [Notice.warning("", "Hot.")]
 
 
 def test_projectors_whose_names_differ_keep_their_own(tmp_path: Path) -> None:
     for name in ("a", "A", "a b", "a%20b", "ä"):
-        write_troubles(tmp_path, StepId(StepKind.PIXELS, name), [Trouble(f"of {name}", name)])
-    assert {one.projector for one in read_troubles(tmp_path)} == {"a", "A", "a b", "a%20b", "ä"}
+        write_troubles(tmp_path, StepId(StepKind.PIXELS, name), [Notice.warning("", f"of {name}", about=name)])
+    assert {trouble.about for trouble in read_troubles(tmp_path)} == {"a", "A", "a b", "a%20b", "ä"}

@@ -116,7 +116,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
 
 
 def codes(seen: Examination) -> list[str]:
-    return [finding.problem.code for finding in seen.findings]
+    return [finding.code for finding in seen.findings]
 
 
 def on_bus(*found: Found) -> Finder:
@@ -205,7 +205,7 @@ def test_a_relay_board_is_never_added_by_guess(hall: Hall) -> None:
     before = (hall.folder / "stage.toml").read_text()
     seen = hall.examine(write=True)
     assert codes(seen) == ["not-in-stage"]
-    assert "with the projector of each relay" in seen.findings[0].problem.remedy
+    assert "with the projector of each relay" in seen.findings[0].remedy
     assert seen.written == ()
     assert (hall.folder / "stage.toml").read_text() == before
 
@@ -279,7 +279,7 @@ def test_a_driver_that_raises_anything_is_named_and_everything_else_is_still_tol
     hall.plug("left")
     seen = hall.examine()
     assert "driver-fault" in codes(seen)
-    fault = next(finding.problem for finding in seen.findings if finding.problem.code == "driver-fault")
+    fault = next(finding for finding in seen.findings if finding.code == "driver-fault")
     for word in ("'model'", "camera", call, "ZeroDivisionError"):
         assert word in fault.what
     assert "1200 lamp hours" in str(seen.tried[0].answer), "the projector was tried too"
@@ -292,7 +292,7 @@ def test_two_drivers_of_one_name_are_a_problem_and_nothing_else_is_lost(hall: Ha
     hall.plug("left")
     seen = hall.examine()
     assert codes(seen) == ["plugin-broken", "plugin-broken"]
-    assert seen.findings[0].problem.remedy == "Uninstall one."
+    assert seen.findings[0].remedy == "Uninstall one."
     assert len(seen.tried) == 2
 
 
@@ -302,7 +302,7 @@ def test_a_finder_that_raises_or_finds_nonsense_stops_no_other(hall: Hall, found
     hall.others = [Finder("odd bus", found)]
     seen = hall.examine()
     assert codes(seen) == ["driver-fault"]
-    assert "odd bus" in seen.findings[0].problem.what
+    assert "odd bus" in seen.findings[0].what
     assert len(seen.found) == 1
 
 

@@ -99,16 +99,16 @@ def test_right_cables_are_no_problem(tmp_path: Path) -> None:
 def test_swapped_cables_are_named_on_both_outputs(tmp_path: Path) -> None:
     _, rig = hall(tmp_path, cables={"P1": "right", "P2": "left"})
     findings = judge(rig.projectors, who_shows_what(rig, tmp_path, deadline=in_seconds(20)))
-    assert [one.problem.code for one in findings] == ["output-swapped", "output-swapped"]
-    assert "Output P1 is shown by projector right, not by left" in findings[0].problem.what
-    assert 'output = "P1" for right' in findings[0].problem.remedy
+    assert [one.code for one in findings] == ["output-swapped", "output-swapped"]
+    assert "Output P1 is shown by projector right, not by left" in findings[0].what
+    assert 'output = "P1" for right' in findings[0].remedy
 
 
 def test_a_projector_that_shows_nothing_is_not_guessed(tmp_path: Path) -> None:
     room, rig = hall(tmp_path)
     room.lamps["right"].go_dark()
     findings = judge(rig.projectors, who_shows_what(rig, tmp_path, deadline=in_seconds(20)))
-    assert [(one.device, one.problem.code) for one in findings] == [("P2", "output-unseen")]
+    assert [(one.about, one.code) for one in findings] == [("P2", "output-unseen")]
 
 
 def test_a_shutter_is_opened_again_when_the_camera_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

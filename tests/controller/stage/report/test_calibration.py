@@ -16,7 +16,7 @@ import pytest
 from controller.bundle.export import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
-from controller.core.troubles import Trouble, TroubleCode
+from controller.core.troubles import TroubleCode
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration
@@ -24,6 +24,7 @@ from controller.stage.artefacts.grade import ErrorMaps, write_grade, write_troub
 from controller.stage.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
 from controller.stage.report import plots
 from controller.stage.report.calibration import StageDescription, resolution_px, size_px, write_calibration_report
+from hal.notices import Notice
 
 NAMES = ("left", "<b>right</b>")
 ASKED = StageDescription("A <script>stage</script>", NAMES, 8.0)
@@ -92,7 +93,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(runs, "20260102-100000-quick", (2.5, 3.5))
     made = write_run(runs, "20260103-100000-calibrate", (9.0, 4.0))
     write_run(runs, "20260104-100000-calibrate", (1.0, 1.0))
-    write_troubles(made, StepId("pixels", "left"), [Trouble(BLUE, "left", TroubleCode.PANEL_ALIGNMENT)])
+    write_troubles(made, StepId("pixels", "left"), [Notice.warning(TroubleCode.PANEL_ALIGNMENT, BLUE, about="left")])
     write_calibration_report(made, ASKED)
     return made
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from controller.run.journal import Journal
-from controller.run.progress import Level, Progress
+from controller.run.progress import Progress
 from controller.run.runner import Context
 from controller.stage.rig.camera_watch import EVERY_S, CameraWatch
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceTimeout
+from hal.notices import Level, Notice
 from hal.values import CameraStatus
 from tests.controller.stage.rig.rig_model import ModelCamera
 
@@ -22,12 +23,12 @@ from tests.controller.stage.rig.rig_model import ModelCamera
 class TellingCamera(ModelCamera):
     """A camera with a list of mended faults, and a state."""
 
-    mended: list[tuple[str, str]] = field(default_factory=list)
+    mended: list[Notice] = field(default_factory=list)
     state: CameraStatus = field(default_factory=CameraStatus)
     silent: DeviceError | None = None
     asked: int = 0
 
-    def troubles(self) -> list[tuple[str, str]]:
+    def notices(self) -> list[Notice]:
         told, self.mended = self.mended, []
         return told
 
@@ -64,10 +65,12 @@ def codes(context: Context) -> list[str]:
 
 
 def test_every_mended_fault_is_journalled_once(context: Context) -> None:
-    camera = TellingCamera(mended=[("camera-busy", "It was busy."), ("camera-usb-back", "It came back.")])
+    camera = TellingCamera(
+        mended=[Notice.warning("camera-busy", "It was busy."), Notice.warning("camera-usb-back", "It came back.")]
+    )
     watch = CameraWatch(camera)
     watch.check(context)
-    camera.mended.append(("camera-busy", "It was busy again."))
+    camera.mended.append(Notice.warning("camera-busy", "It was busy again."))
     watch.check(context)
     assert codes(context) == ["camera-busy", "camera-usb-back", "camera-busy"]
     assert context.journal.events()[-1].text == "It was busy again."

@@ -12,11 +12,12 @@ import pytest
 
 from controller.core.errors import UsageError
 from controller.run.journal import Journal
-from controller.run.progress import Level, Silent
+from controller.run.progress import Silent
 from controller.stage.artefacts.kinds import CALIBRATED
 from controller.stage.services.compare import installed, photograph
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
+from hal.notices import Level
 from tests.controller.stage.services.test_calibrate import write
 from tests.controller.stage.steps.appearance.test_publishing import publish, solve
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.run.progress import Level, Reporter, Silent
+from controller.run.progress import Reporter, Silent
 from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_refining, write_refined
@@ -22,6 +22,7 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.session import MakeSteps, StageSession
 from hal.deadline import Cancelled
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
+from hal.notices import Level
 from tests.controller.stage.rig.rig_model import ModelRig
 from tests.controller.stage.services.test_calibrate import write
 from tests.controller.stage.steps.appearance.test_publishing import OUTPUTS, solve

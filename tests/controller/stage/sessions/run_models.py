@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from controller.run.journal import Journal
-from controller.run.progress import Level, Progress
+from controller.run.progress import Progress
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
@@ -17,6 +17,7 @@ from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, PluginError
+from hal.notices import Level, Notice
 from hal.registry import Driver, Drivers, OpenContext
 from hal.values import DeviceIdentity, LampRules, Power, ProjectorCapabilities, ProjectorStatus
 from tests.controller.stage.rig.rig_model import ModelCamera, ModelDisplay
@@ -86,9 +87,9 @@ class OddLamp(QuickLamp):
 
     untold: tuple[str, ...] = ()
 
-    def troubles(self) -> list[tuple[str, str]]:
+    def notices(self) -> list[Notice]:
         told, self.untold = self.untold, ()
-        return [("projector-answer-odd", text) for text in told]
+        return [Notice.warning("projector-answer-odd", text) for text in told]
 
 
 class Told:

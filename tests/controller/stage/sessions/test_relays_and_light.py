@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from controller.core.errors import UsageError
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.ambient_light import AmbientLightLimit, dark_after
@@ -18,6 +17,7 @@ from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceRefused
+from hal.notices import Level
 from hal.registry import Driver, Drivers
 from hal.values import DeviceIdentity
 from tests.controller.stage.rig.lamp_model import World, soon

@@ -13,7 +13,6 @@ import pytest
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import exclusive, runtime_folder, runtime_path
 from controller.run.journal import Journal
-from controller.run.progress import Level
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
@@ -23,6 +22,7 @@ from controller.stage.sessions.run import LOCK, unfinished_run
 from controller.stage.sessions.session import OwnSession
 from hal.deadline import Cancelled
 from hal.errors import DeviceError, DeviceGone, DriverFault
+from hal.notices import Level
 from tests.controller.stage.sessions.run_models import STAGE, Models
 
 

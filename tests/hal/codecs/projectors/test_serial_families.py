@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import (
     Answer,
-    Notice,
     Reply,
+    UnaskedMessage,
     command_bytes,
     head_bytes,
     parse_hours,
@@ -82,7 +82,7 @@ def test_every_command_of_nec_bears_the_sum_of_its_bytes() -> None:
         ("christie", "power", b"(PWR!010)", Answer("cooling")),
         ("christie", "power", b'(65535 00000 ERR00005 "PWR: Too Few Parameters")', Reply.REFUSED),
         ("christie", "power", b'(65535 00000 FYI00000 "(SST+LAMP?001) Lamp Hours = 1:00 (h:m)")', Reply.NOTHING),
-        ("christie", "power", b'(65535 00000 ERR00000 "System Error: Lamp")', Notice(None, "system-error")),
+        ("christie", "power", b'(65535 00000 ERR00000 "System Error: Lamp")', UnaskedMessage(None, "system-error")),
         ("nec", "power", summed(NEC_STATUS), Answer("on")),
         ("nec", "lamp_hours", summed(NEC_HOURS), Answer("5400000")),
         ("nec", "model", summed(NEC_HOURS), Answer("NP-PA500U")),
@@ -150,4 +150,4 @@ def test_no_line_ends_in_anything_but_a_meaning_or_a_protocol_error(
     except ProtocolError as error:
         assert error.theirs  # noqa: PT017 - whether it raises at all depends on the line
         return
-    assert isinstance(meaning, Answer | Notice | Reply)
+    assert isinstance(meaning, Answer | UnaskedMessage | Reply)

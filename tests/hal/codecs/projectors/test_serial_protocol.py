@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import (
     Answer,
-    Notice,
     Reply,
+    UnaskedMessage,
     command_bytes,
     parse_hours,
     parse_line,
@@ -51,10 +51,10 @@ def test_commands_are_the_bytes_of_the_manual() -> None:
         (b"\nOK1\r", Answer("on")),
         (b"P\r", Reply.ACCEPTED),
         (b"F\r", Reply.REFUSED),
-        (b"INFO1\r", Notice(Power.WARMING, None)),
-        (b"INFO 2\r", Notice(Power.COOLING, None)),
-        (b"INFO7\r", Notice(None, "over-temperature")),
-        (b"INFO5\r", Notice(None, "notice-5-warning")),
+        (b"INFO1\r", UnaskedMessage(Power.WARMING, None)),
+        (b"INFO 2\r", UnaskedMessage(Power.COOLING, None)),
+        (b"INFO7\r", UnaskedMessage(None, "over-temperature")),
+        (b"INFO5\r", UnaskedMessage(None, "notice-5-warning")),
     ],
 )
 def test_lines_mean_what_the_manual_says(line: bytes, meaning: object) -> None:
@@ -93,7 +93,7 @@ def test_no_line_ends_in_anything_but_a_meaning_or_a_protocol_error(line: bytes,
         meaning = parse_line(TABLE, line, query)  # type: ignore[arg-type]
     except ProtocolError:
         return
-    assert isinstance(meaning, Answer | Notice | Reply)
+    assert isinstance(meaning, Answer | UnaskedMessage | Reply)
 
 
 @given(st.integers(0, 99_999))

@@ -11,12 +11,13 @@ import pytest
 
 from controller.optics.solve.result.common_causes import Cause, CommonCauses
 from controller.run.journal import Journal
-from controller.run.progress import Level, Silent
+from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import Refining
 from controller.stage.steps.appearance.causes import causes_step, sentences
 from hal.deadline import in_seconds
+from hal.notices import Level
 
 NAMES = ("left", "right")
 CAUSES = 3 * 2 + 2 + 1 + 3 + 1

@@ -15,7 +15,7 @@ from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER
 from controller.core.errors import UsageError
 from controller.run.journal import Journal
-from controller.run.progress import Level, Reporter, Silent
+from controller.run.progress import Reporter, Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.solved import Solved
 from controller.stage.steps.appearance.publishing import (
@@ -27,6 +27,7 @@ from controller.stage.steps.appearance.publishing import (
 )
 from controller.stage.steps.appearance.thumbnails import LONGEST_PX, thumbnail
 from hal.deadline import in_seconds
+from hal.notices import Level
 
 OUTPUTS = {"left": ("P1", (10, 8)), "right": ("P2", (12, 9))}
 NAMES = ("20260101-120000-calibrate", "20260102-120000-calibrate")

@@ -20,7 +20,7 @@ from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
 from controller.optics.solve.result.metrics import compare
 from controller.optics.transport import build_transport
 from controller.run.journal import Journal
-from controller.run.progress import Level, Silent
+from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import (
@@ -36,6 +36,7 @@ from controller.stage.steps.appearance.refining import RefineOptions, refine_ste
 from controller.stage.steps.appearance.solving import device_frames
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone
+from hal.notices import Level
 from hal.values import CapturedFile, FileKind
 from plugins.emulated.optics.dng import PictureFacts, dng
 from tests.controller.optics.solve.conftest import plane_calibration

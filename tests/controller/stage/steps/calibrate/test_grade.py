@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import CalibrationError
-from controller.run.progress import Level, Silent
+from controller.run.progress import Silent
 from controller.stage.artefacts.grade import graded, passes
 from controller.stage.steps.calibrate.gate import compare_with_last, require
+from hal.notices import Level
 
 
 class Heard(Silent):

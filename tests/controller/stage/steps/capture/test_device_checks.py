@@ -15,10 +15,11 @@ from controller.core.errors import VelaturaError
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.capture.raw import read_photograph, read_samples
 from controller.run.journal import Journal
-from controller.run.progress import Level, Silent
+from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.steps.capture.device_checks import device_checks
 from hal.deadline import Deadline, in_seconds
+from hal.notices import Level
 from hal.values import CapturedFile, FileKind
 from plugins.emulated.optics.dng import PictureFacts, dng
 from tests.controller.stage.rig.rig_model import ModelCamera, ModelRig
