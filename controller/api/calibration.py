@@ -13,11 +13,9 @@ import numpy.typing as npt
 from controller.api.captures import CaptureSet
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.correspondence import decode as correspondence_decode
-from controller.optics.calibrate.correspondence.colour_alignment import colour_shifts, colours_apart
-from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
+from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces, colour_shifts, colours_apart
 from controller.optics.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
-from controller.optics.calibrate.photometry.direct_light import tell_direct_light
-from controller.optics.calibrate.photometry.radiometry import measure_radiometry
+from controller.optics.calibrate.photometry.radiometry import measure_radiometry, tell_direct_light
 from controller.optics.calibrate.photometry.separation import sinusoid_contrast
 from controller.optics.calibrate.photometry.waveform import coarse_waves
 from controller.optics.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry

@@ -14,8 +14,7 @@ from controller.bundle.export import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.mesh.export import write_glb, write_ply
-from controller.optics.calibrate.mesh.grid_mesh import grid_mesh
+from controller.optics.calibrate.mesh import grid_mesh, write_glb, write_ply
 from controller.optics.calibrate.values import Geometry
 from controller.optics.capture.linear_files import exr_bytes
 from controller.optics.capture.raw import SRGB_TO_XYZ

@@ -71,7 +71,7 @@ class Radiometry:
     ``mixing`` (3, 3) float64: camera channel (row) by projector channel (column), each row summing to 1, so that
     white is white; the strength of the light is in the projector's white image
     ``segment``: share of white that a white segment makes, of what red, green and blue have in common; 0 without one
-    ``paint`` (3, 3, 3) float64: mixing that depends on the paint (``photometry.paint_mixing``): camera channel,
+    ``paint`` (3, 3, 3) float64: mixing that depends on the paint (``photometry.tile_fit``): camera channel,
         projector channel, camera channel of white; its sum over projector channels is 1 where both camera channels
         are the same, and else 0. None where one mixing holds for all paints
     """
@@ -114,7 +114,7 @@ class ProjectorCalibration:
     ``phase_map``: None where metapixels are all that is known
     ``indirect`` like ``white``: what reached the camera by way of other surfaces, and is not in ``white``; None where
     there is none to speak of
-    ``stripes`` (patterns, blocks, 3): of ``transport.indirect_stripes.dark_light``; None where not measured
+    ``stripes`` (patterns, blocks, 3): of ``transport.indirect.stripes.dark_light``; None where not measured
     ``spread``: of light under the surface; None where none was seen
     """
 

@@ -16,8 +16,7 @@ import numpy.typing as npt
 from controller.core.arrays import FloatImage, Mask, save_arrays
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.mesh.blender import TO_BLENDER, margin_px, places_in_rendering
-from controller.optics.calibrate.mesh.grid_mesh import Mesh, grid_mesh
+from controller.optics.calibrate.mesh import TO_BLENDER, Mesh, grid_mesh, margin_px, places_in_rendering
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.relight import smooth_normals
 from controller.optics.solve.targets.values import Target

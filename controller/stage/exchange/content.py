@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from controller.core.arrays import ByteImage, Float64, FloatImage
-from controller.optics.calibrate.mesh.grid_mesh import Mesh, grid_mesh
-from controller.optics.calibrate.metapixels.initial_estimate import project
+from controller.optics.calibrate.mesh import Mesh, grid_mesh
+from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import CameraBox

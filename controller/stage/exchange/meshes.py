@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.mesh.blender import scene_script
-from controller.optics.calibrate.mesh.export import View, write_glb, write_ply
+from controller.optics.calibrate.mesh import View, scene_script, write_glb, write_ply
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.usd import pose_matrix
 

@@ -14,9 +14,13 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.core.files import read_picture_bytes
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.camera.charuco import board_picture, calibrate_views, find_corners
-from controller.optics.calibrate.camera.exif import intrinsics_from_exif
-from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics, write_intrinsics
+from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics, write_intrinsics
+from controller.optics.calibrate.geometry.lenses import (
+    board_picture,
+    calibrate_views,
+    find_corners,
+    intrinsics_from_exif,
+)
 from controller.optics.capture.raw import read_photograph
 from controller.run.progress import Reporter
 from hal.notices import Level

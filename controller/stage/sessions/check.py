@@ -43,9 +43,8 @@ class Checked:
 
         Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
         """
-        from controller.optics.calibrate.camera.intrinsics import read_intrinsics
-        from controller.optics.calibrate.geometry.metric_scale import MeasuredDistance
-        from controller.optics.calibrate.geometry.values import CameraPrior
+        from controller.optics.calibrate.geometry.intrinsics import read_intrinsics
+        from controller.optics.calibrate.geometry.values import CameraPrior, MeasuredDistance
 
         table: CameraTable = self.stage.tables.camera
         measured = self.stage.tables.object.distances

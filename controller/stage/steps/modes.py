@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 from controller.core.errors import UsageError
-from controller.optics.capture.dots import LEAST_SPACING_PX, PAPER_SPACING_PX
+from controller.optics.capture.patterns import LEAST_SPACING_PX, PAPER_SPACING_PX
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.kinds import StepKind

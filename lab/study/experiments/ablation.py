@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 from controller.core.arrays import FloatImage
-from controller.optics.calibrate.metapixels.quadrilateral import quadrilateral_weights
 from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
 from controller.optics.calibrate.values import Calibration, Metapixels
 from controller.optics.solve.bounded.equations import appearance_weights
@@ -16,6 +15,7 @@ from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.gaussians.patches import patches_of_weights
 from controller.stage.report.pictures import crop_around
 from controller.stage.steps.calibrate.dots import CLEAR_GAIN
+from lab.study.experiments.quadrilateral import quadrilateral_weights
 from lab.study.output.drawing import LabelledPicture, detail, screen, strip
 from lab.study.subject.measuring import Variant, better, photograph_variants, quality_table, unbounded_inverse
 from lab.study.subject.subject import ReachableTarget, Shares, Subject

@@ -11,14 +11,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage, load_arrays, save_arrays
-from controller.optics.calibrate.metapixels.from_dots import fit_dots
-from controller.optics.calibrate.metapixels.initial_estimate import (
+from controller.optics.calibrate.metapixels.from_dots import (
+    fit_dots,
     initial_metapixels,
     modelled_correspondence,
     where_missing,
 )
 from controller.optics.calibrate.values import Metapixels, PhaseMap
-from controller.optics.capture.dots import DotPattern, dot_patterns
+from controller.optics.capture.patterns import DotPattern, dot_patterns
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_correspondence, read_phase_map

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import Float64
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.mesh.export import ply_bytes
+from controller.optics.calibrate.mesh import ply_bytes
 
 
 @dataclass(frozen=True, slots=True)

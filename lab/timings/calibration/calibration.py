@@ -15,8 +15,8 @@ import numpy as np
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
 from controller.demo.stage import DEFAULT_ROOM
+from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.decode import decode
-from controller.optics.calibrate.correspondence.opposites import completed
 from controller.optics.calibrate.metapixels.from_phase import fit_metapixels
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration, read_captures

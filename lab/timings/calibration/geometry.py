@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.core.arrays import Float64
 from controller.core.errors import VelaturaError
-from controller.optics.calibrate.camera.intrinsics import read_intrinsics
+from controller.optics.calibrate.geometry.intrinsics import read_intrinsics
 from controller.optics.calibrate.geometry.self_calibration import reconstruct
 from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction
 from controller.optics.calibrate.values import Correspondence

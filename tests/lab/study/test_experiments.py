@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from controller.optics.calibrate.values import PhaseMap
-from controller.optics.capture.dots import dot_patterns
+from controller.optics.capture.patterns import dot_patterns
 from lab.study.catalogue import EXPERIMENTS, SCENES
 from lab.study.experiments import ablation, earlier, live
 from lab.study.experiments.earlier import feathered

@@ -1,3 +1,1 @@
-"""Which projector coordinate each camera pixel sees: Gray code and phase shift. Entry: `decode.decode`,
-`phase_map`.
-"""
+"""Which projector coordinate each camera pixel sees: Gray code and phase shift. Entry: `decode.decode`, `phase_map`."""

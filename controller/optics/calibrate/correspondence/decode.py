@@ -18,10 +18,9 @@ import numpy.typing as npt
 from controller.core.arrays import FloatImage, Mask, array_in_file, strips
 from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
-from controller.optics.calibrate.correspondence.captures import Captures, grey
-from controller.optics.calibrate.correspondence.codes import read_code
-from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
-from controller.optics.calibrate.correspondence.opposites import step_variance
+from controller.optics.calibrate.correspondence.captures import Captures, grey, step_variance
+from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces
+from controller.optics.calibrate.correspondence.gray_code import read_code
 from controller.optics.calibrate.correspondence.phase_shift import CODED, CONTRADICTED, FINE, WAVES, locate_pixel
 from controller.optics.calibrate.correspondence.smoothing import correct_for_paint, fit_planes
 from controller.optics.calibrate.values import Correspondence

@@ -1,1 +1,1 @@
-"""Poses and surface points without a known target. Entry: `self_calibration.reconstruct`."""
+"""Poses and surface points without a known target (`self_calibration.reconstruct`); `lenses`, `intrinsics`."""

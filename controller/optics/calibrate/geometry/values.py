@@ -1,14 +1,116 @@
-"""What the geometry starts from and what it gives."""
+"""What the geometry starts from and what it gives; metres from what a technician measures with a tape."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
 
 from controller.core.arrays import Float64, FloatImage
-from controller.core.errors import UsageError
-from controller.optics.calibrate.geometry.metric_scale import MeasuredDistance
+from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.values import Geometry
+
+NEAREST_SHARE: Final = 0.001
+"""Of the known points; the very nearest point may be wrong."""
+REACH_PX: Final = 3
+"""How far from a given picture point a known point of the object may lie."""
+MOST_SIGMAS: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredDistance:
+    """Two points of the object in the camera's picture (x, y), how far apart they are, and how sure that is."""
+
+    from_px: tuple[float, float]
+    to_px: tuple[float, float]
+    distance_m: float
+    sigma_m: float = 0.001
+
+    def __post_init__(self) -> None:
+        """Raises UsageError("distance-invalid")."""
+        if not (0 < self.distance_m < math.inf and 0 < self.sigma_m < math.inf):
+            raise UsageError(
+                "distance-invalid",
+                what=f"A distance of {self.distance_m} m +- {self.sigma_m} m between two points is not possible.",
+                remedy="Measure it in metres, and give distance_m and sigma_m above 0.",
+            )
+
+
+def nearest_distance(points: FloatImage) -> float:
+    """Distance from the camera to the nearest point of (rows, columns, 3), but for the nearest thousandth of them."""
+    distance = np.linalg.norm(points[np.isfinite(points[..., 2])].astype(np.float64), axis=1)
+    return float(np.quantile(distance, NEAREST_SHARE))
+
+
+def metres_per_unit(
+    points: FloatImage,
+    distance_m: float | None,
+    distance_rel_sigma: float,
+    between: Sequence[MeasuredDistance],
+) -> tuple[float, float]:
+    """Metres in one unit of ``points`` (rows, columns, 3), and its relative standard deviation.
+
+    ``distance_m`` is from the camera to the nearest visible point of the object. All that was measured counts by
+    its certainty; with nothing measured, the nearest point is put at 1 m, with an infinite deviation.
+
+    Raises
+    ------
+    CalibrationError  "distance-point-unknown" (a point of the picture where the object is not known),
+        "distances-contradict" (no scale fits all that was measured)
+    """
+    nearest = nearest_distance(points)
+    logs, sigmas, names = [], [], []
+    if distance_m is not None:
+        logs.append(math.log(distance_m / nearest))
+        sigmas.append(distance_rel_sigma)
+        names.append("distance_m of the camera")
+    for own in between:
+        apart = float(np.linalg.norm(_point_at(points, own.from_px) - _point_at(points, own.to_px)))
+        if not apart > 1e-4 * nearest:
+            raise _unknown(own.to_px, "is the same as the other end of its distance")
+        logs.append(math.log(own.distance_m / apart))
+        sigmas.append(own.sigma_m / own.distance_m)
+        names.append(f"the {own.distance_m:g} m from {own.from_px} to {own.to_px}")
+    if not logs:
+        return 1.0 / nearest, math.inf
+    weights = 1.0 / np.square(sigmas)
+    mean = float(np.sum(weights * logs) / np.sum(weights))
+    off = np.abs(np.asarray(logs) - mean) / np.hypot(sigmas, 0.002)
+    worst = int(np.argmax(off))
+    if off[worst] > MOST_SIGMAS:
+        raise CalibrationError(
+            "distances-contradict",
+            what=f"The measured distances contradict each other: {names[worst]} is off by "
+            f"{100 * abs(math.expm1(logs[worst] - mean)):.1f} %.",
+            remedy="Measure again: distance_m from the front of the lens to the nearest visible point, the others "
+            "between the points in stage.toml.",
+        )
+    return math.exp(mean), float(np.sum(weights) ** -0.5)
+
+
+def _point_at(points: FloatImage, px: tuple[float, float]) -> FloatImage:
+    """The median of the known points next to a point of the picture."""
+    rows, columns = points.shape[:2]
+    x, y = round(px[0]), round(px[1])
+    if not (0 <= x < columns and 0 <= y < rows):
+        raise _unknown(px, f"is not in the camera's picture of {columns} x {rows} pixels")
+    for reach in range(1, REACH_PX + 1):
+        patch = points[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].reshape(-1, 3)
+        known = patch[np.isfinite(patch[:, 2])]
+        if len(known):
+            return np.asarray(np.median(known, axis=0))
+    raise _unknown(px, "shows no known point of the object")
+
+
+def _unknown(px: tuple[float, float], problem: str) -> CalibrationError:
+    return CalibrationError(
+        "distance-point-unknown",
+        what=f"A distance was measured to the picture point {px}, which {problem}.",
+        remedy="Choose points on the object that the projectors light and the camera sees, away from edges.",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.jit import compiled
 from controller.optics.calibrate.correspondence.captures import Captures, grey
-from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
-from controller.optics.calibrate.correspondence.inverse_map import cells_of
+from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces
+from controller.optics.calibrate.correspondence.phase_map import cells_of
 from controller.optics.calibrate.photometry.surface_spread import contrast_left
 from controller.optics.calibrate.values import Correspondence, SurfaceSpread
 from controller.optics.capture.patterns import BLUR_FREQUENCIES, PERIOD_PX, PatternPlan

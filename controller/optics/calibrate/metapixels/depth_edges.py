@@ -16,7 +16,7 @@ import numpy.typing as npt
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
-from controller.optics.calibrate.correspondence.inverse_map import cells_of
+from controller.optics.calibrate.correspondence.phase_map import cells_of
 from controller.optics.calibrate.metapixels.regularize import typical_spacing_px
 from controller.optics.calibrate.values import Correspondence, Metapixels
 

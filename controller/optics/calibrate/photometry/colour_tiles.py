@@ -12,8 +12,7 @@ import numpy.typing as npt
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.optics.calibrate.correspondence.captures import Captures, coloured, lit_pixels
-from controller.optics.calibrate.correspondence.codes import read_code
-from controller.optics.calibrate.correspondence.gray_code import Cells
+from controller.optics.calibrate.correspondence.gray_code import Cells, read_code
 from controller.optics.calibrate.values import Radiometry
 from controller.optics.capture.pattern_frames import tile_levels
 from controller.optics.capture.patterns import TILE_MARGIN, PatternKind, PatternPlan, cells_of_frame

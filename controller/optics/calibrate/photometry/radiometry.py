@@ -2,22 +2,27 @@
 
 Every tile of a picture shows a triple of device values of its own, so that two photographs hold some hundreds to
 thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Where colours
-depend on the paint, the tiles tell that, too (``paint_mixing``). ``tile_fit`` fits all of it.
+depend on the paint, the tiles tell that, too. ``tile_fit`` fits all of it. The share of indirect light and the response
+in direct light alone follow from each other (``tell_direct_light``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.correspondence.captures import Captures, coloured
 from controller.optics.calibrate.correspondence.gray_code import Cells
 from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
+from controller.optics.calibrate.photometry.separation import SinusoidContrast, indirect_share, shown_contrast
 from controller.optics.calibrate.photometry.tile_fit import evened, fit_tiles, with_paint
-from controller.optics.calibrate.values import Radiometry
+from controller.optics.calibrate.photometry.waveform import Wave, held_to
+from controller.optics.calibrate.values import Radiometry, SurfaceSpread
 from controller.optics.capture.patterns import PatternPlan
 from controller.optics.capture.profile import CameraNoise
 
@@ -136,3 +141,48 @@ def white_segment(name: str, share: float) -> str | None:
         f"Projector {name} adds white light of its own: {100 * share:.0f} % of its white is not the sum of red, green "
         f"and blue. {REMEDY} If it can't be switched off, Velatura calculates with it; bright colours are then darker."
     )
+
+
+PASSES: Final = 2
+
+
+def tell_direct_light(
+    captures: Captures,
+    plan: PatternPlan,
+    seen: SinusoidContrast,
+    waves: tuple[Wave, ...],
+    *,
+    start: Radiometry,
+    shown_with: Float64,
+    white: FloatImage,
+    projector_px: FloatImage,
+    spread: SurfaceSpread | None = None,
+    noise: CameraNoise | None = None,
+    code: tuple[Cells, Cells] | None = None,
+    advance: Callable[[float], None] = lambda share: None,
+) -> tuple[FloatImage, Radiometry, RadiometryReport]:
+    """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1, its response and mixing in direct
+    light, and a report on their measurement.
+
+    Parameters
+    ----------
+    captures, noise, code : as for ``measure_radiometry``
+    seen, waves : what the sinusoids show, of ``sinusoid_contrast`` and ``coarse_waves``
+    start : response and mixing in direct and indirect light together
+    shown_with : (3, 256) the response by which the sinusoids were encoded
+    white, projector_px, spread : as for ``indirect_share``
+    advance : told what part of the work is done, 0 to 1
+
+    Raises what ``measure_radiometry`` raises.
+    """
+    radiometry = start
+    near: Float64 | None = None
+    for number in range(PASSES):
+        advance(number / PASSES)
+        linearity = shown_contrast(radiometry, shown_with)
+        share = indirect_share(seen, white, projector_px, linearity=linearity, spread=spread)
+        known = KnownIndirect(share * white, radiometry)
+        tiles, report = measure_radiometry(captures, plan, indirect=known, noise=noise, code=code)
+        radiometry = held_to(waves, tiles, shown_with, share, white, near)
+        near = radiometry.response
+    return share, radiometry, report

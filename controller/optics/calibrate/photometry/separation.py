@@ -3,6 +3,10 @@
 Light that arrives by way of other surfaces is a mean over much of the projector's picture, so a sinusoid does not
 modulate it. What contrast the coarse sinusoid lacks is therefore indirect light, apart from what blur takes; the fine
 sinusoids, which lose the same share by indirect light but far more by blur, tell how much that is.
+
+The steps of each sinusoid add up to a white image. All that a projector shows is white times something that is known
+well, so the noise of its white image is in every frame that is solved. Three steps hold half as much light again as one
+photograph of white, so their sums make it less noisy. They also tell how steady the lamp is.
 """
 
 from __future__ import annotations
@@ -19,14 +23,90 @@ from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import gaussian_blur
 from controller.core.jit import compiled
-from controller.optics.calibrate.correspondence.captures import Captures, coloured
+from controller.optics.calibrate.correspondence.captures import Captures, coloured, lit_pixels, step_variance
 from controller.optics.calibrate.correspondence.decode import FINE_TO_COARSE
-from controller.optics.calibrate.correspondence.opposites import step_variance
-from controller.optics.calibrate.photometry.averaged_white import WhiteSums
 from controller.optics.calibrate.photometry.surface_spread import FINE_FREQUENCY, contrast_left
 from controller.optics.calibrate.values import Radiometry, SurfaceSpread
 from controller.optics.capture.patterns import PERIOD_PX, PHASE_STEPS, Pattern, PatternPlan
 from controller.optics.capture.profile import CameraNoise
+
+NAMED: Final = 0.002
+"""Standard deviation from which flicker is named; steady lamps are measured with 0.0009 at most."""
+
+
+def lamp_flicker(strengths: Float64 | None) -> float:
+    """Standard deviation of a lamp's light from one photograph to the next, relative.
+
+    ``strengths`` (sinusoids, steps): of ``separation.SinusoidContrast``; 0 where they are not known. Compared are the
+    steps of a sinusoid: what all of them have in common, an error of the response does, too.
+    """
+    if strengths is None or strengths.shape[1] < 2:
+        return 0.0
+    off = strengths - strengths.mean(axis=1, keepdims=True)
+    return float(np.sqrt(np.sum(off**2) / (off.size - len(off))))
+
+
+def unsteady(name: str, flicker: float) -> str | None:
+    """What a technician should know of ``lamp_flicker``; None where the lamp is steady."""
+    if flicker < NAMED:
+        return None
+    return (
+        f"The light of projector {name} is not steady: it differs by {100 * flicker:.1f} % (standard deviation) from "
+        "one photograph to the next. Patterns are corrected for that; white images and brightness stay uncertain by as "
+        "much. Let the lamp warm up longer, switch its automatic and dynamic lamp modes off, and calibrate again."
+    )
+
+
+NOISE_AROUND: Final = (15, 15)
+"""Camera pixels over which the noise of both is measured."""
+FEWEST: Final = 2
+"""Sums: fewer do not tell their noise."""
+FEWEST_PIXELS: Final = 1_000
+"""Lit ones: fewer do not tell how bright the sums are."""
+
+
+class WhiteSums:
+    """White images (rows, columns, 3) from the steps of sinusoids, NaN where not known; their mean and their noise."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._total: FloatImage | None = None
+        self._squares: FloatImage | None = None
+
+    def add(self, image: FloatImage) -> None:
+        """One more, of the same lamp strength as the others."""
+        self._count += 1
+        if self._total is None or self._squares is None:
+            self._total, self._squares = image.copy(), image * image
+            return
+        self._total += image
+        self._squares += image * image
+
+    def averaged(self, white: FloatImage) -> FloatImage:
+        """``white`` (rows, columns, 3) less black, NaN where not known, with less noise, as bright as it was.
+
+        Both are weighted by the noise that is measured around each pixel. ``white`` itself where the sums do not help.
+        """
+        if self._total is None or self._squares is None or self._count < FEWEST:
+            return white
+        mean = self._total / np.float32(self._count)
+        variance = np.maximum(self._squares - self._total * mean, 0) / np.float32(self._count * (self._count - 1))
+        lit = np.flatnonzero((lit_pixels(white) & channels.finite(mean)).ravel())
+        if lit.size < FEWEST_PIXELS:
+            return white
+        some = lit[:: max(1, lit.size // SOME_PIXELS)]
+        # the response by which steps are shown is not known well yet: their mean light differs by channel
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = white.reshape(-1, 3)[some] / mean.reshape(-1, 3)[some]
+        mean *= np.median(ratio, axis=0).astype(np.float32)
+        apart = white - mean
+        own, other = (
+            cv2.boxFilter(channels.total(np.nan_to_num(one)), -1, NOISE_AROUND) for one in (variance, apart * apart)
+        )
+        share = np.divide(own, other, out=np.ones_like(own), where=other > own)[..., None]
+        averaged = mean + share * apart
+        return np.where(np.isfinite(averaged), np.maximum(averaged, 0), white).astype(np.float32)
+
 
 COARSE: Final = ("phase-x", "phase-y")
 FINE: Final = ("blur-x", "blur-y")

@@ -2,6 +2,15 @@
 
 Mixing and responses are fitted in turns, each with the other held, until neither changes; tiles that do not fit are
 left out. A lamp is never equally strong in two photographs; the tiles that show full channels tell how strong it was.
+
+How much of each colour of a projector the camera sees depends on the paint, because paint and lamps have spectra.
+Reflectances of paint are nearly a sum of three (Maloney 1986). Then what a camera channel sees of a projector channel
+is a sum of what the three camera channels see of white there: W_k r becomes the sum over j of W_j B_kj r. One B of 27
+numbers holds for all paints of a stage, and the colour tiles tell it: each shows another colour on another paint.
+
+What surfaces throw back depends on the tiles around. What is known of it is the share of white, which is as bright
+everywhere as the picture is on the mean. The difference changes slowly from one tile to the next and a tile's levels
+do not: so neighbours tell how much of a tile's residual it is (a Gaussian process).
 """
 
 from __future__ import annotations
@@ -9,15 +18,136 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
+from typing import Final
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import Float64
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.photometry.colour_tiles import TileMeasurements
-from controller.optics.calibrate.photometry.paint_mixing import fit_paint_mixing, paint_light
-from controller.optics.calibrate.photometry.uneven_light import own_weight, uneven_light
+from controller.optics.calibrate.photometry.colour_tiles import DOUBT, TileMeasurements
 from controller.optics.calibrate.values import Radiometry
+
+UNEVEN: Final = 0.3
+"""Standard deviation of a tile's indirect light from what is known of it, relative, as far as neighbours share it."""
+ALIKE_TILES: Final = 1.5
+"""Standard deviation of the Gaussian by which tiles are alike, in tiles."""
+OWN: Final = 0.05
+"""Standard deviation of a tile's own part, relative."""
+LEAST_KEPT: Final = 1e-3
+REACH: Final = 6.0
+"""Standard deviations beyond which tiles are not alike."""
+UNEVEN_CONVERGED: Final = 1e-7
+MOST_TURNS: Final = 1000
+
+
+def own_weight(tiles: TileMeasurements) -> Float64:
+    """(tiles, 3) inverse variance of the measurements where neighbours tell the rest of the indirect light."""
+    variance = 1 / tiles.weight + (OWN**2 - DOUBT**2) * tiles.indirect**2
+    return np.asarray(1 / np.maximum(variance, 1e-12), np.float64)
+
+
+def uneven_light(tiles: TileMeasurements, residual: Float64, weight: Float64) -> Float64:
+    """(tiles, 3): the part of ``residual`` (tiles, 3) that is indirect light which neighbouring tiles share.
+
+    ``weight`` (tiles, 3): inverse variance of each tile's own part; 0 for what does not count
+    """
+    found = np.zeros_like(residual)
+    for photograph in range(int(tiles.photograph.max(initial=-1)) + 1):
+        own = np.flatnonzero(tiles.photograph == photograph)
+        variance = 1 / np.maximum(weight[own], LEAST_KEPT * tiles.weight[own])
+        shared = _Shared(tiles.place[own], UNEVEN * tiles.indirect[own])
+        found[own] = shared.times(_solved(shared, variance, residual[own]))
+    return found
+
+
+class _Shared:
+    """The covariance (tiles, tiles) of each channel, as a filter of the tiles' grid: 8,100 tiles make a big matrix."""
+
+    def __init__(self, place: npt.NDArray[np.int64], strength: Float64) -> None:
+        self._place, self._strength = (place[:, 0], place[:, 1]), strength
+        self._size = (*(place.max(axis=0, initial=0) + 1), 3)
+        reach = np.arange(-int(REACH * ALIKE_TILES), int(REACH * ALIKE_TILES) + 1)
+        self._alike = np.exp(-(reach**2) / (2 * ALIKE_TILES**2))
+        self.variance = strength**2
+
+    def times(self, values: Float64) -> Float64:
+        """``values`` (tiles, 3) of each channel times its covariance."""
+        grid = np.zeros(self._size)
+        grid[self._place] = values * self._strength
+        around = cv2.sepFilter2D(grid, cv2.CV_64F, self._alike, self._alike, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(around[self._place] * self._strength, np.float64)
+
+
+def _solved(shared: _Shared, variance: Float64, residual: Float64) -> Float64:
+    """x of each channel in (shared + variance) x = residual, by conjugate gradients."""
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    shape, size = residual.shape, residual.size
+    scale = (1 / (variance + shared.variance)).ravel()
+
+    def whole(x: Float64) -> Float64:
+        values = x.reshape(shape)
+        return (shared.times(values) + variance * values).ravel()
+
+    found, _ = cg(
+        LinearOperator((size, size), matvec=whole, dtype=np.float64),
+        residual.ravel(),
+        rtol=UNEVEN_CONVERGED,
+        maxiter=MOST_TURNS,
+        M=LinearOperator((size, size), matvec=lambda x: scale * x, dtype=np.float64),
+    )
+    return np.asarray(found.reshape(shape), np.float64)
+
+
+LIKELY: Final = 0.3
+"""Standard deviation of its numbers before tiles are looked at."""
+LIKELY_NOISE: Final = 0.01
+"""Of a tile of mean weight, beside that."""
+FAINTEST: Final = 0.02
+"""Of the brightest of a paint's colours: less is taken for so much, because the quotient would be noise."""
+
+
+def colour_of(white: Float64) -> Float64:
+    """(..., 3, 3): ``white`` (..., 3) of channel j over that of channel k, at [k, j]."""
+    floor = FAINTEST * white.max(axis=-1, keepdims=True)
+    safe = np.maximum(white, np.maximum(floor, 1e-30))
+    return np.asarray(safe[..., None, :] / safe[..., :, None], np.float64)
+
+
+def fit_paint_mixing(tiles: TileMeasurements, shown: Float64, weight: Float64, mixing: Float64) -> Float64:
+    """B (3, 3, 3): camera channel, projector channel, camera channel of white.
+
+    Parameters
+    ----------
+    tiles : ``ratio`` without stray light of other tiles
+    shown : (tiles, 3) light of each projector channel
+    weight : (tiles, 3) of each measurement
+    mixing : (3, 3) of all paints together, which B is near to where nothing else is known
+    """
+    quotient = colour_of(tiles.white)
+    found = np.zeros((3, 3, 3))
+    others = shown[:, :2] - shown[:, 2:]
+    for channel in range(3):
+        root = np.sqrt(weight[:, channel])
+        parts = [others * quotient[:, channel, j, None] for j in range(3)]
+        equations = np.concatenate(parts, axis=1) * root[:, None]
+        before = np.zeros(6)
+        before[2 * channel : 2 * channel + 2] = mixing[channel, :2]
+        left = (tiles.ratio[:, channel] - shown[:, 2]) * root - equations @ before
+        prior = np.eye(6) * np.sqrt(weight[:, channel].mean()) * LIKELY_NOISE / LIKELY
+        solved = np.linalg.lstsq(np.concatenate([equations, prior]), np.concatenate([left, np.zeros(6)]), rcond=None)[0]
+        two = (before + solved).reshape(3, 2).T  # projector channel, channel of white
+        found[channel, :2] = two
+        found[channel, 2] = (np.arange(3) == channel) - two.sum(axis=0)
+    return found
+
+
+def paint_light(tiles: TileMeasurements, shown: Float64, paint: Float64) -> Float64:
+    """(tiles, 3): light over white by B."""
+    return np.asarray(np.einsum("tkj,kcj,tc->tk", colour_of(tiles.white), paint, shown))
+
 
 KNOTS = 16
 FIRST_GAMMA = 2.2

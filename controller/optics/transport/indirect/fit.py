@@ -16,8 +16,8 @@ import numpy as np
 
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask, strips, summed
-from controller.optics.calibrate.photometry.paint_mixing import colour_of
 from controller.optics.calibrate.photometry.surface_spread import typical_spread
+from controller.optics.calibrate.photometry.tile_fit import colour_of
 from controller.optics.calibrate.values import Calibration, ProjectorCalibration, Radiometry
 from controller.optics.capture.patterns import plan_patterns
 from controller.optics.transport.indirect.blocks import down, parted, up

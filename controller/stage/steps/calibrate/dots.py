@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.arrays import FloatImage
-from controller.optics.calibrate.metapixels.from_dots import DotReport, fit_dots
-from controller.optics.calibrate.metapixels.initial_estimate import (
+from controller.optics.calibrate.metapixels.from_dots import (
+    DotReport,
+    fit_dots,
     initial_metapixels,
     modelled_correspondence,
     where_missing,
@@ -18,7 +19,7 @@ from controller.optics.calibrate.metapixels.initial_estimate import (
 from controller.optics.calibrate.metapixels.pixel_status import pixel_status, status_counts
 from controller.optics.calibrate.metapixels.regularize import regularize
 from controller.optics.calibrate.values import Metapixels
-from controller.optics.capture.dots import DotPattern, dot_frame, dot_patterns
+from controller.optics.capture.patterns import DotPattern, dot_frame, dot_patterns
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_correspondence

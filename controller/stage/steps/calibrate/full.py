@@ -10,17 +10,17 @@ import numpy as np
 
 from controller.core.errors import CalibrationError
 from controller.core.troubles import TroubleCode
+from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.colour_alignment import (
+    ColourPlaces,
     colour_shifts,
     colour_sizes,
     colours_apart,
     fringed,
     misaligned,
 )
-from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
 from controller.optics.calibrate.correspondence.decode import decode
-from controller.optics.calibrate.correspondence.opposites import completed
-from controller.optics.calibrate.geometry.lens import bent
+from controller.optics.calibrate.geometry.lenses import bent
 from controller.optics.calibrate.geometry.self_calibration import reconstruct
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels

@@ -11,7 +11,7 @@ from controller.bundle.export import png
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.troubles import TroubleCode
 from controller.optics.calibrate.photometry.glare import veiled, veiling_glare
-from controller.optics.calibrate.photometry.gloss import gloss_strength, glossy
+from controller.optics.calibrate.photometry.reflectance import gloss_strength, glossy
 from controller.optics.calibrate.photometry.surface_spread import spreading, typical_spread
 from controller.optics.calibrate.values import ProjectorCalibration
 from controller.optics.calibrate.verify.error_attribution import (

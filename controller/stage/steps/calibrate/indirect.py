@@ -10,12 +10,15 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.core.troubles import TroubleCode
-from controller.optics.calibrate.correspondence.opposites import completed
+from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.photometry.colour_tiles import tile_code
-from controller.optics.calibrate.photometry.direct_light import tell_direct_light
-from controller.optics.calibrate.photometry.lamp_light import lamp_flicker, unsteady
-from controller.optics.calibrate.photometry.radiometry import painted
-from controller.optics.calibrate.photometry.separation import indirect_figures, sinusoid_contrast
+from controller.optics.calibrate.photometry.radiometry import painted, tell_direct_light
+from controller.optics.calibrate.photometry.separation import (
+    indirect_figures,
+    lamp_flicker,
+    sinusoid_contrast,
+    unsteady,
+)
 from controller.optics.calibrate.photometry.waveform import Wave, coarse_waves
 from controller.optics.transport.indirect.stripes import dark_light
 from controller.run.runner import Context, Step

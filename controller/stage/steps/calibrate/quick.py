@@ -19,9 +19,8 @@ import numpy as np
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.verify.drift import Drift, ProjectorDrift
+from controller.optics.calibrate.verify.drift import Drift, ProjectorDrift, update_positions, update_radiometry
 from controller.optics.calibrate.verify.drift_report import advice, sentences
-from controller.optics.calibrate.verify.homography_update import update_positions, update_radiometry
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId

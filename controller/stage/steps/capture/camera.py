@@ -25,9 +25,8 @@ from controller.optics.capture.linearity import (
     find_hot,
     true_exposures,
 )
-from controller.optics.capture.noise import measure_noise
 from controller.optics.capture.pixel_response import response_spread, some_rows
-from controller.optics.capture.profile import CameraProfile
+from controller.optics.capture.profile import CameraProfile, measure_noise
 from controller.optics.capture.raw import RawMosaic, is_jpeg, read_jpeg_values, read_mosaic, read_photograph
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId

@@ -15,7 +15,7 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import WorkError
 from controller.optics.calibrate.metapixels.from_dots import largest_sigma_px, peak_share
 from controller.optics.calibrate.values import Metapixels
-from controller.optics.capture.dots import PAPER_SPACING_PX, dot_spacing
+from controller.optics.capture.patterns import PAPER_SPACING_PX, dot_spacing
 from controller.run.runner import Context
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.photographs import PhotographSet, Taken, captured, codes_of

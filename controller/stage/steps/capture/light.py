@@ -16,7 +16,7 @@ import numpy as np
 from controller.core import channels
 from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
-from controller.optics.calibrate.correspondence.coloured_code import decode_colours
+from controller.optics.calibrate.correspondence.gray_code import decode_colours
 from controller.optics.calibrate.correspondence.known_map import MapCheck, check_map
 from controller.optics.capture.pattern_frames import device_frame
 from controller.optics.capture.patterns import Code, Pattern, PatternKind, PatternPlan, plan_patterns

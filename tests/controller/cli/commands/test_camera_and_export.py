@@ -14,7 +14,7 @@ import trimesh
 
 from controller.__main__ import run
 from controller.core.arrays import save_arrays
-from controller.optics.calibrate.camera.charuco import find_corners
+from controller.optics.calibrate.geometry.lenses import find_corners
 from controller.stage.artefacts.projectors import Light
 from controller.stage.exchange.formats import FORMATS, Format
 from tests.docs.synthetic_data import write_full_run, write_run

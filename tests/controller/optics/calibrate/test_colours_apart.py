@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64, FloatImage
-from controller.optics.calibrate.correspondence.colour_alignment import ColourShifts, colour_shifts, colours_apart
-from controller.optics.calibrate.correspondence.colour_places import ColourPlaces
+from controller.optics.calibrate.correspondence.colour_alignment import (
+    ColourPlaces,
+    ColourShifts,
+    colour_shifts,
+    colours_apart,
+)
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.correspondence.coloured_code import decode_colours
+from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.decode import decode
-from controller.optics.calibrate.correspondence.gray_code import decode_cells
+from controller.optics.calibrate.correspondence.gray_code import decode_cells, decode_colours
 from controller.optics.calibrate.correspondence.known_map import check_map
-from controller.optics.calibrate.correspondence.opposites import completed
 from controller.optics.calibrate.metapixels.blur import measure_blur
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry
 from controller.optics.calibrate.photometry.separation import indirect_share, sinusoid_contrast

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.optics.capture.dots import dot_frame, dot_patterns, dot_spacing
+from controller.optics.capture.patterns import dot_frame, dot_patterns, dot_spacing
 
 
 @settings(max_examples=20, deadline=None)

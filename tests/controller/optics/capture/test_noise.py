@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import FloatImage
-from controller.optics.capture.noise import measure_noise
+from controller.optics.capture.profile import measure_noise
 from tests.controller.optics.capture.sensor_model import SensorModel, textured
 
 

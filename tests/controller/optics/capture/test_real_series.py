@@ -18,7 +18,7 @@ from controller.optics.capture.brackets import merge_brackets
 from controller.optics.capture.demosaic import SensorLevels
 from controller.optics.capture.jpeg_response import measure_response
 from controller.optics.capture.linearity import RawExposure, check_series
-from controller.optics.capture.noise import measure_noise
+from controller.optics.capture.profile import measure_noise
 
 LEVELS = SensorLevels(np.array([[0, 1], [1, 2]]), np.zeros((2, 2)), np.full((2, 2), 255.0), np.full((2, 2), 250.0))
 """8-bit samples, made smaller: what lies near a clipped one holds some of its light."""

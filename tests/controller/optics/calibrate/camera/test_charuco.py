@@ -12,9 +12,15 @@ import numpy.typing as npt
 import pytest
 
 from controller.core.errors import CalibrationError, UsageError, WorkError
-from controller.optics.calibrate.camera.charuco import SQUARES, BoardView, board_picture, calibrate_views, find_corners
-from controller.optics.calibrate.camera.exif import intrinsics_from_exif
-from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics, read_intrinsics, write_intrinsics
+from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics, read_intrinsics, write_intrinsics
+from controller.optics.calibrate.geometry.lenses import (
+    SQUARES,
+    BoardView,
+    board_picture,
+    calibrate_views,
+    find_corners,
+    intrinsics_from_exif,
+)
 
 Grey = npt.NDArray[np.uint8]
 SIZE = (776, 520)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.optics.calibrate.correspondence.bayer_pattern import PATTERNS, find_bayer_pattern
+from controller.optics.calibrate.metapixels.from_phase import PATTERNS, find_bayer_pattern
 from controller.optics.capture.raw import develop
 
 

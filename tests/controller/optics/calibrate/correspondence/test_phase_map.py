@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.optics.calibrate.correspondence.inverse_map import invert_map
-from controller.optics.calibrate.correspondence.phase_map import FARTHEST_PX, LEAST_VARIANCE_PX2, make_phase_map
+from controller.optics.calibrate.correspondence.phase_map import (
+    FARTHEST_PX,
+    LEAST_VARIANCE_PX2,
+    invert_map,
+    make_phase_map,
+)
 from controller.optics.calibrate.correspondence.smoothing import fit_curved
 from controller.optics.calibrate.values import Correspondence, PhaseMap
 

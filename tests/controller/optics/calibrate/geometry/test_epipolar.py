@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64
-from controller.optics.calibrate.geometry.epipolar import epipolar_distance_px, fundamental
+from controller.optics.calibrate.geometry.pose_initialisation import epipolar_distance_px, fundamental
 
 CAMERA = """
 372,76 263,108 372,112 862,119 271,133 328,173 718,206 317,224 310,245 642,253 408,281 328,317 779,317 458,346

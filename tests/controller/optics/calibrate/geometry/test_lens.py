@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from controller.optics.calibrate.geometry.lens import NAMED_PX, bend_px, bent
+from controller.optics.calibrate.geometry.lenses import NAMED_PX, bend_px, bent
 from controller.optics.calibrate.values import Pinhole
 
 SIZE = (1400, 1050)

@@ -15,7 +15,7 @@ from controller.optics.calibrate.geometry.self_calibration import (
     parameter_names,
     reconstruct,
 )
-from controller.optics.calibrate.metapixels.initial_estimate import project
+from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Correspondence
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,8 @@ import numpy.typing as npt
 import pytest
 
 from controller.core.errors import CalibrationError, UsageError
-from controller.optics.calibrate.geometry.metric_scale import MeasuredDistance, metres_per_unit
 from controller.optics.calibrate.geometry.self_calibration import reconstruct
-from controller.optics.calibrate.geometry.values import CameraPrior
+from controller.optics.calibrate.geometry.values import CameraPrior, MeasuredDistance, metres_per_unit
 from controller.optics.calibrate.values import Correspondence
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from controller.optics.calibrate.geometry.surface_fit import fit_patches, whole_pixels
+from controller.optics.calibrate.geometry.surface_points import fit_patches, whole_pixels
 
 FOCAL = 300.0
 

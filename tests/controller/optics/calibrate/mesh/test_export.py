@@ -14,9 +14,7 @@ import pytest
 import trimesh
 
 from controller.core.errors import UsageError
-from controller.optics.calibrate.mesh.blender import bend_picture, margin_px, scene_script
-from controller.optics.calibrate.mesh.export import write_glb
-from controller.optics.calibrate.mesh.grid_mesh import Mesh, grid_mesh
+from controller.optics.calibrate.mesh import Mesh, bend_picture, grid_mesh, margin_px, scene_script, write_glb
 from controller.optics.calibrate.values import Geometry, Pinhole
 
 Array = npt.NDArray[np.float64]

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.optics.calibrate.mesh.export import ply_bytes, write_ply
-from controller.optics.calibrate.mesh.grid_mesh import Mesh, grid_mesh
+from controller.optics.calibrate.mesh import Mesh, grid_mesh, ply_bytes, write_ply
 from controller.optics.calibrate.values import Geometry, Pinhole
 
 

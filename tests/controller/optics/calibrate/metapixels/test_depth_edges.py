@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.metapixels.depth_edges import edge_frame, edge_patterns, edge_pixels, measure_shares
-from controller.optics.calibrate.metapixels.initial_estimate import initial_metapixels
+from controller.optics.calibrate.metapixels.from_dots import initial_metapixels
 from controller.optics.capture.patterns import plan_patterns
 from tests.controller.optics.calibrate.simulator import Scene, Stage, photographed
 

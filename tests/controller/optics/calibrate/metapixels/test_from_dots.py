@@ -15,9 +15,15 @@ from scipy.optimize import least_squares
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.correspondence.decode import decode
-from controller.optics.calibrate.metapixels.from_dots import WIDEST_CUT, fit_dots, largest_sigma_px, peak_share
+from controller.optics.calibrate.metapixels.from_dots import (
+    WIDEST_CUT,
+    fit_dots,
+    initial_metapixels,
+    largest_sigma_px,
+    modelled_correspondence,
+    peak_share,
+)
 from controller.optics.calibrate.metapixels.gaussian_fit import PARAMETERS, fit_gaussian
-from controller.optics.calibrate.metapixels.initial_estimate import initial_metapixels, modelled_correspondence
 from controller.optics.calibrate.values import (
     Calibration,
     Geometry,
@@ -26,8 +32,7 @@ from controller.optics.calibrate.values import (
     ProjectorCalibration,
     Radiometry,
 )
-from controller.optics.capture.dots import dot_frame, dot_patterns
-from controller.optics.capture.patterns import plan_patterns
+from controller.optics.capture.patterns import dot_frame, dot_patterns, plan_patterns
 from controller.optics.transport import build_transport
 from tests.controller.optics.calibrate.simulator import Scene, Stage, photographed
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64, Mask
-from controller.optics.calibrate.metapixels.heap import pop, rebuild, update
-from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
+from controller.optics.calibrate.metapixels.regularize import fill_holes, pop, rebuild, regularize, update
 from controller.optics.calibrate.values import Metapixels
 from tests.controller.optics.calibrate.simulator import Scene
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import FloatImage
-from controller.optics.calibrate.photometry.averaged_white import WhiteSums
+from controller.optics.calibrate.photometry.separation import WhiteSums
 
 SHAPE = (60, 80, 3)
 COUNT = 4

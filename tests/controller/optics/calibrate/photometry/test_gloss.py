@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64
-from controller.optics.calibrate.photometry.gloss import gloss_strength, glossy
+from controller.optics.calibrate.photometry.reflectance import gloss_strength, glossy
 from controller.optics.calibrate.values import Calibration, Geometry, Pinhole
 from tests.controller.optics.solve.conftest import plane_calibration
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64, FloatImage
-from controller.optics.calibrate.photometry.lamp_light import lamp_flicker, unsteady
-from controller.optics.calibrate.photometry.separation import sinusoid_contrast
+from controller.optics.calibrate.photometry.separation import lamp_flicker, sinusoid_contrast, unsteady
 from controller.optics.capture.patterns import plan_patterns
 
 SIZE = (96, 72)

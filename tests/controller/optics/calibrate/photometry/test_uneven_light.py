@@ -8,7 +8,7 @@ from scipy.linalg import solve
 
 from controller.core.arrays import Float64
 from controller.optics.calibrate.photometry.colour_tiles import TileMeasurements
-from controller.optics.calibrate.photometry.uneven_light import ALIKE_TILES, OWN, UNEVEN, uneven_light
+from controller.optics.calibrate.photometry.tile_fit import ALIKE_TILES, OWN, UNEVEN, uneven_light
 
 
 @pytest.mark.parametrize(("rows", "columns", "seed"), [(1, 1, 0), (1, 40, 1), (14, 18, 2), (30, 25, 3)])

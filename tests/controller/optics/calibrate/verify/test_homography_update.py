@@ -8,7 +8,7 @@ import pytest
 
 from controller.core.arrays import Float64
 from controller.optics.calibrate.values import Radiometry
-from controller.optics.calibrate.verify.homography_update import update_positions, update_radiometry
+from controller.optics.calibrate.verify.drift import update_positions, update_radiometry
 from tests.controller.optics.calibrate.spectra import colours
 
 ROWS, COLUMNS = 40, 60

@@ -10,10 +10,10 @@ import pytest
 import scipy.sparse as sp
 
 from controller.core.errors import UsageError
-from controller.optics.calibrate.metapixels.quadrilateral import quadrilateral_weights
 from controller.optics.calibrate.values import Calibration, Metapixels
 from controller.optics.transport import build_transport
 from controller.optics.transport.gaussians.patches import patches_of_weights
+from lab.study.experiments.quadrilateral import quadrilateral_weights
 from tests.controller.optics.transport.conftest import random_frames
 from tests.controller.optics.transport.sparse_shares import gaussian_weights, normalised, predicted
 

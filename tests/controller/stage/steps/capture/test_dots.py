@@ -15,7 +15,7 @@ import pytest
 
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError, WorkError
-from controller.optics.capture.dots import dot_frame, dot_patterns
+from controller.optics.capture.patterns import dot_frame, dot_patterns
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Context

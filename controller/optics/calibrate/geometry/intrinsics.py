@@ -15,8 +15,7 @@ from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.geometry.metric_scale import MeasuredDistance
-from controller.optics.calibrate.geometry.values import CameraPrior
+from controller.optics.calibrate.geometry.values import CameraPrior, MeasuredDistance
 
 FILE: Final = "camera-intrinsics.toml"
 PARAMETERS: Final = ("log_focal", "cx_px", "cy_px", "k1")

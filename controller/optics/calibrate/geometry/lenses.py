@@ -1,22 +1,30 @@
-"""The camera's lens from a handful of photographs of a printed ChArUco board (Zhang 2000; OpenCV's detector).
+"""Lenses: the camera's own from a printed ChArUco board or from EXIF data, and how far a projector's bends its picture.
 
-The board's size on paper does not matter: a focal length in pixels follows from angles alone.
+A handful of photographs of the board is enough (Zhang 2000; OpenCV's detector); its size on paper does not matter,
+because a focal length in pixels follows from angles alone. What photographs say of themselves (EXIF 2.32) is the
+fallback.
 """
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, UnidentifiedImageError
 
 from controller.core.arrays import Float64
-from controller.core.errors import CalibrationError
-from controller.optics.calibrate.camera.intrinsics import CameraIntrinsics
+from controller.core.errors import CalibrationError, WorkError
+from controller.core.files import require_regular
+from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics
+from controller.optics.calibrate.values import Pinhole
 
 SQUARES: Final = (11, 8)
 MARKER_SHARE: Final = 0.75
@@ -188,3 +196,94 @@ def _tilt_degrees(turns: Sequence[Float64]) -> float:
     normals = [cv2.Rodrigues(turn)[0][:, 2] for turn in turns]
     largest = min(float(a @ b) for a, b in combinations(normals, 2))
     return float(np.degrees(np.arccos(np.clip(largest, -1.0, 1.0))))
+
+
+FOCAL_REL_SIGMA: Final = 0.03
+"""Lenses report whole millimetres, and their focal length changes with focus."""
+CENTRE_SHARE: Final = 0.005
+K1_SIGMA: Final = 0.05
+FULL_FRAME_DIAGONAL_MM: Final = 43.267
+_EXIF, _FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003
+_PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
+_MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+
+def intrinsics_from_exif(path: Path) -> CameraIntrinsics:
+    """Read a JPEG, a TIFF or a RAW file built on TIFF (CR2, NEF, ARW, DNG).
+
+    Raises WorkError("photograph-unreadable"), CalibrationError("camera-focal-length-unknown").
+    """
+    try:
+        require_regular(path)
+        with warnings.catch_warnings(), Image.open(path) as picture:
+            # No pixel of it is decoded, so however many it has does no harm.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            tags = dict(picture.getexif().get_ifd(_EXIF))
+            size = picture.size
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise WorkError(
+            "photograph-unreadable",
+            what=f"{path.name} has unreadable EXIF data.",
+            remedy="Give a JPEG or RAW file as it came from the camera.",
+        ) from error
+    width, height = _number(tags.get(_WIDTH)) or size[0], _number(tags.get(_HEIGHT)) or size[1]
+    focal_px = _focal_px(tags, math.hypot(width, height))
+    if focal_px is None:
+        raise CalibrationError(
+            "camera-focal-length-unknown",
+            what=f"{path.name} does not contain both the focal length and the sensor's size.",
+            remedy="Photograph the board of `velatura camera board`, or give focal_length_px in stage.toml.",
+        )
+    sigmas = np.array([FOCAL_REL_SIGMA, CENTRE_SHARE * width, CENTRE_SHARE * width, K1_SIGMA])
+    return CameraIntrinsics(
+        size_px=(int(width), int(height)),
+        focal_px=focal_px,
+        centre_px=((width - 1) / 2, (height - 1) / 2),
+        k1=0.0,
+        covariance=np.diag(sigmas**2),
+        method="exif",
+        views=1,
+    )
+
+
+def _focal_px(tags: dict[int, object], diagonal_px: float) -> float | None:
+    focal_mm, per_unit = _number(tags.get(_FOCAL_MM)), _number(tags.get(_PLANE_X))
+    unit = _number(tags.get(_PLANE_UNIT)) or 2.0
+    if focal_mm and per_unit and unit in _MM_PER_UNIT:
+        return focal_mm * per_unit / _MM_PER_UNIT[int(unit)]
+    focal_35mm = _number(tags.get(_FOCAL_35MM))
+    return None if focal_35mm is None else focal_35mm / FULL_FRAME_DIAGONAL_MM * diagonal_px
+
+
+def _number(value: object) -> float | None:
+    """A number above 0, or None; rational tags with a denominator of 0 are not numbers."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < math.inf else None
+
+
+NAMED_PX: Final = 0.5
+"""At the farthest corner: less is not seen."""
+
+
+def bend_px(lens: Pinhole) -> float:
+    """Pixels by which distortion displaces the corner that it displaces most."""
+    width, height = lens.size_px
+    corners = np.array([(x, y) for x in (0, width) for y in (0, height)], np.float64)
+    focal = lens.matrix[[0, 1], [0, 1]]
+    squared = np.sum(((corners - lens.matrix[:2, 2]) / focal) ** 2, axis=1)
+    k1, k2 = lens.distortion
+    return float(np.max(np.abs(k1 * squared + k2 * squared**2) * np.sqrt(squared)) * focal.mean())
+
+
+def bent(name: str, lens: Pinhole) -> str | None:
+    """What a technician should know of a projector's lens; None where its picture is as good as straight."""
+    by_px = bend_px(lens)
+    if by_px < NAMED_PX:
+        return None
+    return (
+        f"The lens of projector {name} bends its picture, by up to {by_px:.1f} pixels at a corner. The geometry takes "
+        "that into account. Nothing has to be done."
+    )

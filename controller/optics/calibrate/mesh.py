@@ -1,4 +1,7 @@
-"""A script that sets up the calibrated stage in Blender 4: the object, the camera, and the projectors as cameras.
+"""The reconstructed surface as a mesh: PLY and glTF files, and a script that sets up the stage in Blender 4.
+
+A mesh is the camera's pixel grid, cut where the depth jumps. PLY is the Stanford polygon format 1.0, binary and
+little-endian; glTF is version 2.0.
 
 Blender's cameras have no radial distortion. The script therefore renders a margin around the picture, and
 ``bend_picture`` brings a rendered picture into the calibrated camera's own.
@@ -6,15 +9,174 @@ Blender's cameras have no radial distortion. The script therefore renders a marg
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import Float64, FloatImage
+from controller.core.errors import UsageError
+from controller.core.storage import stream_atomically
 from controller.optics.calibrate.values import Geometry, Pinhole
+
+STEEPEST = 6.0
+"""Edges longer than this many times a pixel's width on the object, seen head-on, join two different surfaces."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangles with outward normals, counter-clockwise seen from the camera's side.
+
+    ``vertices_m``, ``normals`` (vertices, 3) float32; ``triangles`` (triangles, 3) int32;
+    ``camera_px`` (vertices, 2) float32: where the camera sees each vertex, its texture coordinate
+    """
+
+    vertices_m: FloatImage
+    normals: FloatImage
+    triangles: npt.NDArray[np.int32]
+    camera_px: FloatImage
+
+
+def grid_mesh(geometry: Geometry, *, step: int = 1) -> Mesh:
+    """Join adjacent camera pixels into triangles where all three corners are known and lie on one surface.
+
+    ``step``: use every n-th pixel in both directions. Vertices that no triangle uses are left out.
+    """
+    points = geometry.points_m[::step, ::step]
+    rows, columns = points.shape[:2]
+    index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    # image rows run downwards, so this order turns counter-clockwise towards the camera
+    corners = np.concatenate([np.stack(t, axis=2).reshape(-1, 3) for t in ((a, c, b), (b, c, d))])
+    flat = points.reshape(-1, 3)
+    reach = STEEPEST * step / float(geometry.camera.matrix[0, 0])
+    keep = _joined(flat, corners, reach) & np.isfinite(geometry.normals[::step, ::step].reshape(-1, 3)[corners, 0]).all(
+        axis=1
+    )
+    corners = corners[keep]
+    used, renumbered = np.unique(corners, return_inverse=True)
+    y, x = np.divmod(used, columns)
+    return Mesh(
+        vertices_m=flat[used],
+        normals=geometry.normals[::step, ::step].reshape(-1, 3)[used],
+        triangles=renumbered.reshape(-1, 3).astype(np.int32),
+        camera_px=np.stack([x, y], axis=1).astype(np.float32) * step,
+    )
+
+
+def _joined(points: FloatImage, corners: npt.NDArray[np.int32], reach: float) -> npt.NDArray[np.bool_]:
+    """Whether all three edges of each triangle are at most ``reach`` times as long as it is far away."""
+    keep = np.isfinite(points[corners, 2]).all(axis=1)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        start, end = points[corners[:, first]], points[corners[:, second]]
+        with np.errstate(invalid="ignore"):
+            keep &= np.linalg.norm(end - start, axis=1) <= reach * np.minimum(start[:, 2], end[:, 2])
+    return np.asarray(keep)
+
+
+OBJECT = "object"
+"""The mesh's name in glTF files and in Blender."""
+
+
+class View(NamedTuple):
+    """A node of a glTF file without a mesh: ``matrix`` (4, 4) its pose, ``extras`` what it says of itself."""
+
+    name: str
+    matrix: npt.NDArray[np.float64]
+    extras: Mapping[str, object]
+
+
+def write_ply(path: Path, mesh: Mesh, colours: npt.NDArray[np.uint8] | None = None) -> None:
+    """Write vertices in metres (camera frame: x right, y down, z forward), normals, triangles, and colours if given.
+
+    ``colours`` (vertices, 3). Raises UsageError("mesh-empty", "mesh-colours-wrong-size"), WorkError("no-space").
+    """
+    _require_triangles(mesh)
+    if colours is not None and colours.shape != mesh.vertices_m.shape:
+        raise UsageError(
+            "mesh-colours-wrong-size",
+            what=f"The colours have shape {colours.shape}, but the vertices have shape {mesh.vertices_m.shape}.",
+            remedy="Give one red, green and blue value for each vertex.",
+        )
+    data = ply_bytes(mesh.vertices_m, mesh.triangles, normals=mesh.normals, colours=colours)
+    stream_atomically(path, lambda file: file.write(data))
+
+
+def ply_bytes(
+    vertices: npt.NDArray[np.floating],
+    triangles: npt.NDArray[np.integer],
+    *,
+    normals: npt.NDArray[np.floating] | None = None,
+    colours: npt.NDArray[np.uint8] | None = None,
+) -> bytes:
+    """A mesh as a PLY file, binary and little-endian: float32 x, y, z, then nx, ny, nz and red, green, blue, alpha.
+
+    ``vertices``, ``normals`` (n, 3); ``triangles`` (m, 3) indices of vertices; ``colours`` (n, 3), written opaque
+    """
+    trimesh: Any = importlib.import_module("trimesh")  # its functions carry no types
+    opaque = None if colours is None else np.column_stack([colours, np.full(len(colours), 255, np.uint8)])
+    mesh = trimesh.Trimesh(vertices, triangles, vertex_normals=normals, vertex_colors=opaque, process=False)
+    data: bytes = mesh.export(file_type="ply", encoding="binary", vertex_normal=normals is not None)
+    return data
+
+
+def write_glb(
+    path: Path,
+    mesh: Mesh,
+    size_px: tuple[int, int],
+    texture: npt.NDArray[np.uint8] | None = None,
+    views: Sequence[View] = (),
+) -> None:
+    """Write vertices in metres, normals, triangles and texture coordinates as one binary glTF file.
+
+    glTF's y points up and its cameras look along -z: its frame is the camera's, turned half round x. The texture
+    coordinates are places in the camera's picture of ``size_px`` (width, height), so any picture of the camera fits;
+    ``texture`` (rows, columns, 3) sRGB is put into the file. Raises as ``write_ply``, without colours.
+    """
+    from PIL import Image
+
+    trimesh: Any = importlib.import_module("trimesh")  # its functions carry no types
+    _require_triangles(mesh)
+    turned = np.array([1.0, -1.0, -1.0])
+    # a pixel's middle lies half a pixel inside the picture, whose lower left corner is (0, 0)
+    across = (mesh.camera_px.astype(np.float64) + 0.5) / np.asarray(size_px)
+    material = trimesh.visual.material.PBRMaterial(
+        name="object",
+        baseColorTexture=None if texture is None else Image.fromarray(texture),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
+    )
+    uv = np.stack([across[:, 0], 1.0 - across[:, 1]], axis=1)
+    whole = trimesh.Trimesh(
+        vertices=mesh.vertices_m * turned,
+        faces=mesh.triangles,
+        vertex_normals=mesh.normals * turned,
+        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+        process=False,
+    )
+    scene = trimesh.Scene()
+    scene.add_geometry(whole, node_name=OBJECT, geom_name=OBJECT)
+    for view in views:
+        scene.graph.update(frame_to=view.name, matrix=view.matrix, metadata=dict(view.extras))
+    data: bytes = scene.export(file_type="glb", include_normals=True)
+    stream_atomically(path, lambda file: file.write(data))
+
+
+def _require_triangles(mesh: Mesh) -> None:
+    if len(mesh.triangles) == 0:
+        raise UsageError(
+            "mesh-empty",
+            what="The reconstructed object has no triangle to write.",
+            remedy="Calibrate again with the object in the camera's view and in focus.",
+        )
+
 
 TO_BLENDER: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From the camera's frame (x right, y down, z forward) to Blender's world (x right, y forward, z up)."""

@@ -9,10 +9,10 @@ import pytest
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.metapixels.from_phase import fit_metapixels
-from controller.optics.calibrate.metapixels.quadrilateral import quadrilateral_corners, quadrilateral_weights
 from controller.optics.calibrate.values import Metapixels
 from controller.optics.capture.pattern_frames import frame
 from controller.optics.capture.patterns import PatternKind, plan_patterns
+from lab.study.experiments.quadrilateral import quadrilateral_corners, quadrilateral_weights
 from tests.controller.optics.calibrate.simulator import Scene, Stage, photographed
 from tests.controller.optics.transport.sparse_shares import gaussian_weights, normalised, predicted
 

@@ -1,3 +1,0 @@
-"""The reconstructed surface as a mesh: `grid_mesh`, PLY and OBJ files (`export`), a scene for Blender
-(`blender`).
-"""
