@@ -2,20 +2,23 @@
 becomes a ``DeviceError``.
 
 Our drivers use ``hal.errors``. One of another author may raise anything or never return, but must not end the program
-or block other devices: above all, no lamp may stay on because of it.
+or block other devices: above all, no lamp may stay on because of it. Such a driver is not type-checked, either: what it
+returns is checked against the annotations of ``hal.interfaces`` (``mismatch``).
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import inspect
+import math
 import time
-from collections.abc import Callable, Mapping
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, Final, get_type_hints
+from typing import Any, Final, Union, cast, get_args, get_origin, get_type_hints
 
-from hal.annotations import mismatch
 from hal.deadline import Deadline, Stop
 from hal.errors import DeviceError, DriverFault
 from hal.interfaces import (
@@ -33,6 +36,70 @@ from hal.interfaces import (
     WatchedProjector,
 )
 from hal.runtime.call_threads import CallThreads, LeftBehind
+
+
+def mismatch(value: object, annotation: Any) -> str:
+    """The problem with ``value``, e.g. ``"power is a str, not a Power"``; "" if there is none.
+
+    Knows classes, dataclasses (field by field), unions, ``list``, ``tuple``, ``Sequence``, ``Mapping``, ``Callable``
+    and ``Any``. An ``int`` is accepted as a ``float``, a ``bool`` as neither; numbers must be finite.
+    """
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        problems = [mismatch(value, choice) for choice in arguments]
+        return "" if "" in problems else problems[0]
+    if origin is not None:
+        return _generic(value, origin, arguments)
+    return "" if annotation is Any else _of_class(value, type(None) if annotation is None else annotation)
+
+
+def _generic(value: object, origin: type, arguments: tuple[Any, ...]) -> str:
+    if not isinstance(value, origin) or (origin is Sequence and isinstance(value, str | bytes)):
+        return _not_a(value, origin.__name__.lower())
+    if origin is tuple:
+        return _tuple(cast("tuple[Any, ...]", value), arguments)
+    if isinstance(value, Mapping):
+        return _first(mismatch(key, arguments[0]) or mismatch(value[key], arguments[1]) for key in value)
+    return _first(mismatch(item, arguments[0]) for item in value) if isinstance(value, Sequence) else ""
+
+
+def _of_class(value: object, wanted: type) -> str:
+    accepted: tuple[type, ...] = (int, float) if wanted is float else (wanted,)
+    if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
+        return _not_a(value, wanted.__name__)
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{value} is not a finite number"
+    if dataclasses.is_dataclass(wanted):
+        for name, hint in field_types(wanted).items():
+            if problem := mismatch(getattr(value, name), hint):
+                return f"{name}: {problem}"
+    return ""
+
+
+def _tuple(value: tuple[Any, ...], arguments: tuple[Any, ...]) -> str:
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return _first(mismatch(item, arguments[0]) for item in value)
+    if len(value) != len(arguments):
+        return f"a tuple of {len(value)}, not of {len(arguments)}"
+    return _first(mismatch(item, hint) for item, hint in zip(value, arguments, strict=True))
+
+
+@functools.cache
+def field_types(kind: type) -> dict[str, Any]:
+    """The type of each field of a dataclass, by name."""
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _first(problems: Iterable[str]) -> str:
+    return next((problem for problem in problems if problem), "")
+
+
+def _not_a(value: object, wanted: str) -> str:
+    if value is None:
+        return f"nothing (None) instead of a {wanted}"
+    return f"a {type(value).__name__} instead of a {wanted}"
+
 
 GRACE_S: Final = 6.0
 """A call may end so much later than its deadline or cancellation; then it is left behind."""

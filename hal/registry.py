@@ -10,12 +10,11 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final
 
-from hal.annotations import mismatch
 from hal.deadline import Deadline
-from hal.driver_calls import Caller, closed_quietly
+from hal.driver_calls import Caller, closed_quietly, mismatch
 from hal.errors import PluginError
 from hal.escapes import toml_value
-from hal.tape.recorder import Tape
+from hal.tape import Tape
 from hal.transcript import Transcript
 
 GROUP = "velatura.devices"

@@ -1,4 +1,5 @@
-"""Libraries in C that may crash or hang, in a process of their own: the controller's side, and the process' loop.
+"""Libraries in C that may crash or hang, in a process of their own: the controller's side, and the process' loop
+with a worker that keeps one device open.
 
 A request is (name of a method of the worker, its arguments). The answer is ``Failed``, or (result, the device's serial
 number, seconds that the library took).
@@ -12,15 +13,17 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 import hal.errors
 from hal.deadline import SLICE_S, Deadline, turn
-from hal.errors import DeviceError, DeviceGone
+from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 from hal.notices import Notice
 
 _END_S: Final = 0.7
@@ -196,3 +199,62 @@ def served(make: Callable[..., LibraryWorker]) -> int:
 def _kill(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     process.wait()
+
+
+class Closable(Protocol):
+    """What a library opens."""
+
+    def close(self) -> None: ...
+
+
+Device = TypeVar("Device", bound=Closable)
+
+
+class DeviceWorker(ABC, Generic[Device]):
+    """Its public methods are the requests. The device is opened at the first of them, and again when it was lost.
+
+    ``_serial``: the serial number that the device must have, "" for any
+    """
+
+    def __init__(self, serial: str) -> None:
+        self._serial = serial
+        self._device: Device | None = None
+
+    @abstractmethod
+    def _open_device(self) -> Device:
+        """The device, just opened."""
+
+    def _prepare(self, device: Device) -> None:
+        """Make an opened device ready for requests; it is closed if this raises."""
+
+    def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
+        """The result of a request. Raises DeviceError: a library's own errors are translated here."""
+        return getattr(self, name)(*arguments)
+
+    def answer(self, name: str, arguments: tuple[Any, ...]) -> Answer:
+        """Do a request. A lost device is closed, so that the next request opens it again."""
+        began_s = time.monotonic()
+        try:
+            result = self._do(name, arguments)
+        except DeviceError as error:
+            lost = isinstance(error, DeviceGone | DeviceTimeout) and self._device is not None
+            if lost:
+                self.close()
+            return Failed.of(error, lost=lost)
+        return result, self._serial, time.monotonic() - began_s
+
+    def close(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            device.close()
+
+    def _open(self) -> Device:
+        if self._device is None:
+            device = self._open_device()
+            try:
+                self._prepare(device)
+            except BaseException:
+                device.close()
+                raise
+            self._device = device
+        return self._device

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.arrays import as_image
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically

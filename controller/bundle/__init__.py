@@ -1,1 +1,1 @@
-"""Bundles, the files that a kiosk plays: `format`, `writer`, `reader`, `signing`, `install`, `export`."""
+"""Bundles, the files that a kiosk plays: `format`, `writer`, `reader`, `signing`, `install`, `describe`."""

@@ -19,7 +19,7 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.operations.fields import Field, parse
 from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
 from controller.panel.context import Panel
-from hal.annotations import field_types
+from hal.driver_calls import field_types
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)

@@ -12,14 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.bundle.fallback import CountedStart
-from controller.bundle.install import CURRENT
+from controller.bundle.install import CURRENT, CountedStart
 from controller.bundle.signing import Trust, load_public_key
 from controller.core.errors import UsageError, VelaturaError
-from controller.play.control.commands import Commands
+from controller.play.control.commands import SUFFIX, Commands, SavedRequest
 from controller.play.control.notify import log
 from controller.play.control.protocol import MAX_RATE_HZ, Suggested
-from controller.play.control.resume import SUFFIX, SavedRequest
 from controller.play.control.server import Server
 from controller.play.display.outputs import MemoryOutput, Output
 from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_where

@@ -11,8 +11,7 @@ from typing import Final
 
 from controller.bundle.reader import Bundle
 from controller.core.errors import BundleError, VelaturaError
-from controller.play.frames import FrameSet, OutputSize
-from controller.play.tiles import Tiles
+from controller.play.frames import FrameSet, OutputSize, Tiles
 
 CACHE_BYTES: Final = 64 * 1024 * 1024
 _FEWEST_SETS: Final = 3

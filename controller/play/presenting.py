@@ -1,16 +1,153 @@
-"""Makes sets of frames visible at their deadlines, and knows how evenly that went."""
+"""Makes sets of frames visible at their deadlines, and knows how evenly that went.
+
+In it: the grid of moments at which pictures change, precise waiting, and what is presented next (a set of frames, or an
+appearance once it is decoded, at once or faded in).
+"""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
 
+import numpy as np
+
+from controller.core.errors import VelaturaError
 from controller.play.display.mixing import mix_sets
 from controller.play.display.outputs import Output
 from controller.play.frames import FrameSet, OutputSize
-from controller.play.pacing import Grid, Intervals, sleep_until
-from controller.play.pending_presentation import PendingPresentation, PresentedSet
+
+_SHORTEST_S: Final = 1e-5
+_CLASS: Final = 5e-4
+"""Logarithm of the ratio between the intervals of neighbouring classes."""
+_CLASSES: Final = 58_000
+
+
+class Grid:
+    """Moments k / rate on the monotonic clock, k whole: deadlines that never drift."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+
+    def after(self, moment_s: float) -> int:
+        """The first tick that is not before ``moment_s``."""
+        return math.ceil(moment_s * self.rate_hz)
+
+    def at_s(self, tick: int) -> float:
+        return tick / self.rate_hz
+
+    def ticks(self, seconds: float) -> int:
+        """How many ticks last about ``seconds``; at least one."""
+        return max(1, round(seconds * self.rate_hz))
+
+
+def sleep_until(moment_s: float) -> None:
+    """Sleep until a monotonic moment; return at once if it has passed."""
+    left_s = moment_s - time.monotonic()
+    if left_s > 0:
+        time.sleep(left_s)
+
+
+class Intervals:
+    """The intervals between presentations of one sequence, counted in classes of 0.05 % from 10 us to a year.
+
+    However many there are, they take no more memory than these classes.
+    """
+
+    def __init__(self) -> None:
+        # Written to, so that all of it is there from the beginning and nothing seems to grow later.
+        self._counts = np.full(_CLASSES, 0, np.uint32)
+        self._passed = np.full(_CLASSES, 0, np.uint64)
+        self._last_s: float | None = None
+        # A client may ask for the status ten thousand times a second, and adding up all classes takes 50 us.
+        self._found: dict[float, float | None] = {}
+
+    def presented(self, moment_s: float) -> None:
+        if self._last_s is not None:
+            self.add(moment_s - self._last_s)
+        self._last_s = moment_s
+
+    def add(self, seconds: float) -> None:
+        ratio = max(seconds, _SHORTEST_S) / _SHORTEST_S
+        self._counts[min(_CLASSES - 1, int(math.log(ratio) / _CLASS))] += 1
+        self._found.clear()
+
+    def percentile(self, percent: float) -> float | None:
+        """The interval that ``percent`` of all do not exceed (nearest rank), or None before the second picture."""
+        if percent not in self._found:
+            self._found[percent] = self._percentile(percent)
+        return self._found[percent]
+
+    def _percentile(self, percent: float) -> float | None:
+        passed = np.cumsum(self._counts, dtype=np.uint64, out=self._passed)
+        if not passed[-1]:
+            return None
+        rank = max(1, math.ceil(percent / 100 * int(passed[-1])))
+        return _SHORTEST_S * math.exp(_CLASS * (int(np.searchsorted(passed, rank)) + 0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class PresentedSet:
+    """A set became visible: the player's count of sets, and the moment in monotonic seconds."""
+
+    sequence: int
+    at_s: float
+
+
+ResultCallback: TypeAlias = Callable[[PresentedSet | VelaturaError], None]
+"""Called once with the result of a request: presented, or the reason why not."""
+
+
+@dataclass(slots=True)
+class PendingPresentation:
+    """What is presented next, at a tick of the grid.
+
+    ``frames`` None: the appearance is taken from the cache once it is decoded. ``fade_s``: it comes in over what is
+    shown, in ``steps``, the first at ``begun_tick``; ``share`` of it is shown already. ``paced``: it is one of a
+    sequence, whose intervals are measured. ``prepare``: makes the output ready where that does not take ``frames``.
+    """
+
+    showing: str
+    appearance: str | None
+    frames: FrameSet | None
+    tick: int
+    on_result: ResultCallback | None
+    fade_s: float = 0.0
+    paced: bool = False
+    prepare: Callable[[], None] | None = None
+    begun_tick: int | None = None
+    steps: int = 1
+    share: float = 0.0
+
+    def begin(self, steps: int) -> None:
+        """The first step is presented at ``tick``."""
+        self.begun_tick, self.steps = self.tick, steps
+
+    def delay(self, tick: int) -> None:
+        """It begins at ``tick`` after all."""
+        self.tick = tick
+        self.begun_tick = None if self.begun_tick is None else tick
+
+    def step(self, next_tick: int) -> bool:
+        """Its step of ``tick`` is shown. Whether that was the last; else the next is not before ``next_tick``."""
+        self.share = self.next_share
+        if self.share >= 1:
+            return True
+        self.tick = min(self.first_tick + self.steps - 1, max(self.tick + 1, next_tick))
+        return False
+
+    @property
+    def first_tick(self) -> int:
+        """When its first step is or was presented."""
+        return self.tick if self.begun_tick is None else self.begun_tick
+
+    @property
+    def next_share(self) -> float:
+        """How much of it is shown at ``tick``: by the clock, so a slow machine leaves out steps and not time."""
+        return 1.0 if self.begun_tick is None else min(1.0, (self.tick - self.begun_tick + 1) / self.steps)
+
 
 _EARLY_S: Final = 0.0005
 _FORGET: Final = 0.9

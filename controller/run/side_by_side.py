@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final, TypeVar
 
-from hal.runtime.compute import threads_may_compute, usable_cpus
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes, threads_may_compute, usable_cpus
 
 T = TypeVar("T")
 MOST_MEMORY: Final = 0.5

@@ -11,13 +11,15 @@ gives an opened device and closes it afterwards. The device may be in any health
 attributes are the tests' time limits; increase them for a slow device. Only this part of ``hal`` needs pytest.
 """
 
-from hal.conformance.button_panel import ButtonPanelConformance
 from hal.conformance.camera import CameraConformance
-from hal.conformance.device import DeviceConformance
+from hal.conformance.device import (
+    ButtonPanelConformance,
+    DeviceConformance,
+    DouserConformance,
+    LightSensorConformance,
+    PowerSwitchConformance,
+)
 from hal.conformance.display import BundleDisplayConformance, DisplayConformance
-from hal.conformance.douser import DouserConformance
-from hal.conformance.light_sensor import LightSensorConformance
-from hal.conformance.power_switch import PowerSwitchConformance
 from hal.conformance.projector import ProjectorConformance
 
 __all__ = [

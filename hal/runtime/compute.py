@@ -1,4 +1,4 @@
-"""Compiled numeric code on this machine: its CPUs, how its threads wait, and its folder.
+"""Compiled numeric code on this machine: its CPUs, the memory that it may use, how its threads wait, and its folder.
 
 Shared by the controller and the emulated bench, whose kernels are compiled by numba. Importing this module loads
 only the standard library and changes nothing.
@@ -13,12 +13,35 @@ import importlib
 import math
 import os
 import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from hal.runtime.caches import cache_folder, temporary
-from hal.runtime.control_groups import GROUPS, MEMBERSHIP, groups_of
+
+GROUPS: Final = Path("/sys/fs/cgroup")
+"""Where control groups are mounted, version 1 or 2."""
+MEMBERSHIP: Final = Path("/proc/self/cgroup")
+"""The file that names this process's groups."""
+
+
+def groups_of(controller: str, groups: Path = GROUPS, membership: Path = MEMBERSHIP) -> Iterator[Path]:
+    """The folders of this process's groups, and of each group above, that may limit ``controller`` ("cpu", ...)."""
+    try:
+        lines = membership.read_text().splitlines()
+    except OSError:
+        return
+    for controllers, name in (line.split(":", 2)[1:] for line in lines if line.count(":") >= 2):
+        if controllers and controller not in controllers.split(","):
+            continue
+        mount = groups if not controllers else groups / controllers
+        path = mount / name.lstrip("/")
+        for group in (path, *path.parents):
+            if not group.is_relative_to(mount):
+                break
+            yield group
+
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("controller", "plugins", "hal", "lab", "tests")
@@ -201,3 +224,41 @@ def _quota_of(group: Path) -> float | None:
         return float(quota) / float(period) if quota != "max" and float(quota) > 0 else None
     except (OSError, ValueError, ZeroDivisionError):
         return None
+
+
+MEMINFO: Final = Path("/proc/meminfo")
+_LIMITS: Final = (
+    ("memory.max", "memory.current", ("inactive_file", "active_file")),
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
+)
+"""Of version 2 and 1: the limit, what is used, and what of it the system can take back."""
+
+
+def free_bytes(groups: Path = GROUPS, membership: Path = MEMBERSHIP, meminfo: Path = MEMINFO) -> int | None:
+    """Bytes that can be had without swapping: of the machine, or of the tightest control group; None: not known."""
+    found = [_of_group(group) for group in groups_of("memory", groups, membership)]
+    known = [value for value in (_of_machine(meminfo), *found) if value is not None]
+    return max(min(known), 0) if known else None
+
+
+def _of_machine(meminfo: Path) -> int | None:
+    try:
+        rows = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
+        return int(rows["MemAvailable"].split()[0]) * 1024
+    except (OSError, ValueError, KeyError, IndexError):
+        return None
+
+
+def _of_group(group: Path) -> int | None:
+    """Its limit less what is used; files in the system's cache do not count, since they make room."""
+    for limit, used, reclaimable in _LIMITS:
+        try:
+            most = (group / limit).read_text().strip()
+            if most == "max":
+                return None
+            rows = dict(line.split(" ", 1) for line in (group / "memory.stat").read_text().splitlines())
+            cached = sum(int(rows.get(name, 0)) for name in reclaimable)
+            return int(most) - int((group / used).read_text()) + cached
+        except (OSError, ValueError):
+            continue
+    return None

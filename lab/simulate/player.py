@@ -8,12 +8,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from controller.bundle.fallback import MOST_FAILED_STARTS, CountedStart
 from controller.bundle.format import Index
-from controller.bundle.install import CURRENT
+from controller.bundle.install import CURRENT, MOST_FAILED_STARTS, CountedStart, Starts
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER, Trust, load_public_key
-from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError, WorkError
 from controller.play.control import protocol
 from controller.play.control.launch import PlayerSettings

@@ -16,8 +16,7 @@ from hal.errors import DeviceGone, PluginError
 from hal.links import host_and_port
 from hal.registry import Driver, OpenContext, setting
 from hal.values import DeviceIdentity
-from plugins.dousers.stream import joined, left
-from plugins.dousers.target import Target
+from plugins.dousers.stream import Target, joined, left
 
 PORT: Final = 5568
 MULTICAST: Final = "multicast"

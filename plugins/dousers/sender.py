@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from sacn import DataPacket
 
-from plugins.dousers.target import Target
+from plugins.dousers.stream import Target
 
 REPEATS: Final = 3
 """Packets of every change, and of the end (E1.31, 6.2.6 and 6.6.2)."""

@@ -7,13 +7,29 @@ import json
 import subprocess
 import sys
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import IO, Final
 
 from hal.deadline import SLICE_S, Deadline, turn
 from hal.errors import DeviceGone
-from plugins.dousers.target import Target
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where the stream goes. ``multicast``: to the universe's group; then ``interface`` is an own IPv4 address or "".
+
+    ``identity``: the source's 16 bytes, in hex, the same after a restart.
+    """
+
+    host: str
+    port: int
+    universe: int
+    priority: int
+    multicast: bool
+    interface: str
+    identity: str
+
 
 _END_S: Final = 0.7
 _STARTED_S: Final = 5.0

@@ -19,7 +19,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from hal.runtime.files import read_text
-from hal.tape.reading import read_tape
+from hal.tape import read_tape
 from plugins.emulated.bench_output import OutputLines
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera

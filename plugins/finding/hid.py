@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from hal.codecs.hid import light as hid_light
-from hal.codecs.hid import relay as hid_relay
+from hal.codecs import hid as hid_reports
 from hal.codecs.ptp.values import printable
 from hal.deadline import Cancelled, Deadline
 from hal.errors import DeviceError, DeviceTimeout
@@ -51,10 +50,12 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
 def _found(entry: Mapping[str, Any], deadline: Deadline) -> Found | None:
     numbers = (entry["vendor_id"], entry["product_id"])
     product, serial = (printable(str(entry[key] or "")[:60]) for key in ("product_string", "serial_number"))
-    channels = hid_relay.channels_of(product) if numbers == (hid_relay.VENDOR, hid_relay.PRODUCT) else None
+    channels = (
+        hid_reports.channels_of(product) if numbers == (hid_reports.RELAY_VENDOR, hid_reports.RELAY_PRODUCT) else None
+    )
     if channels is not None:
         kind, driver, what = "power_switch", "usb-relay", f"relay board with {channels} relays"
-    elif numbers == (hid_light.VENDOR, hid_light.PRODUCT):
+    elif numbers == (hid_reports.LIGHT_SENSOR_VENDOR, hid_reports.LIGHT_SENSOR_PRODUCT):
         kind, driver, what = "light_sensor", "colorhug-als", "ambient light sensor"
     elif numbers[0] == ELGATO:
         kind, driver, what = "button_panel", "stream-deck", f"key panel, {product}"
@@ -89,7 +90,9 @@ def _relay_serial(name: str, path: bytes, channels: int, deadline: Deadline) -> 
         handle: HidHandle = hidapi.device()
         handle.open_path(path)
         try:
-            return hid_relay.parse_state(handle.get_feature_report(0, hid_relay.REPORT_LENGTH), channels).serial
+            return hid_reports.parse_state(
+                handle.get_feature_report(0, hid_reports.RELAY_REPORT_LENGTH), channels
+            ).serial
         finally:
             handle.close()
 

@@ -26,9 +26,9 @@ from hal.finding import Finder, Found, SearchScope
 from hal.notices import Notice
 from hal.serial_link import SerialLink
 from plugins.finding.access import forbidden, holders
-from plugins.projectors.messages import read_message
 from plugins.projectors.network.device_server import is_url
 from plugins.projectors.profile_files import load_profile, shipped_profiles
+from plugins.projectors.serial_conversation import read_message
 
 RULES: Final = "70-velatura-serial.rules"
 WRITE_S: Final = 1.0

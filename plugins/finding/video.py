@@ -9,7 +9,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone
 from hal.finding import Finder, Found, SearchScope
 from hal.notices import Notice
-from plugins.v4l2.nodes import identify_path, paths
+from plugins.v4l2.kernel import identify_path, paths
 
 
 def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:

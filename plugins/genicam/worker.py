@@ -9,11 +9,10 @@ from typing import Final
 
 from hal.errors import DeviceBusy, DeviceRefused, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
+from plugins.camera_files import PendingFile, commit_all
 from plugins.genicam.aravis import AravisCamera, Frame
-from plugins.library_process import served
-from plugins.library_worker import DeviceWorker
+from plugins.library_process import DeviceWorker, served
 from plugins.ptp.body import nearest, no_such_file
-from plugins.ptp.files import PendingFile, commit_all
 from plugins.raw_file import Levels, PixelFormat, best_format, encoded, pixel_format
 
 _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))

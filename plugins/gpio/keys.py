@@ -15,8 +15,7 @@ from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceRefused
 from hal.registry import Driver, OpenContext
 from hal.values import TECHNICIAN_KEYS, DeviceIdentity, PanelCapabilities
-from plugins.gpio.lines import Lines, check_chip, opened
-from plugins.gpio.settings import EXPLAINED, KeySettings, key_settings
+from plugins.gpio.lines import EXPLAINED, KeySettings, Lines, check_chip, key_settings, opened
 from plugins.worker_link import NotOpened, WorkerLink
 
 _SLICE_S: Final = 0.1

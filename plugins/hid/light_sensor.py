@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from hal.codecs.hid.light import (
-    PRODUCT,
+from hal.codecs.hid import (
+    LIGHT_SENSOR_PRODUCT,
+    LIGHT_SENSOR_REPORT,
+    LIGHT_SENSOR_VENDOR,
     READING_LENGTH,
-    REPORT,
     SETTINGS_LENGTH,
     USABLE,
-    VENDOR,
     LightReading,
     SensorSettings,
     parse_reading,
@@ -23,7 +23,7 @@ from hal.registry import Driver, OpenContext, setting
 from hal.values import DeviceIdentity
 from plugins.hid.link import HidKind, HidLink, OpenHid
 
-_KIND: Final = HidKind(name="light sensor", vendor=VENDOR, product=PRODUCT)
+_KIND: Final = HidKind(name="light sensor", vendor=LIGHT_SENSOR_VENDOR, product=LIGHT_SENSOR_PRODUCT)
 _SETTLE_S: Final = 0.05
 
 
@@ -41,7 +41,7 @@ class ColorHugLightSensor:
     def identity(self, *, deadline: Deadline) -> DeviceIdentity:
         def query(sensor: OpenHid) -> DeviceIdentity:
             # Read its settings, so that an answer never comes from an unplugged sensor.
-            parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
+            parse_settings(sensor.handle.get_feature_report(LIGHT_SENSOR_REPORT, SETTINGS_LENGTH))
             return DeviceIdentity(sensor.found.maker, sensor.found.product, sensor.serial)
 
         return self._link.call(query, deadline=deadline)
@@ -67,10 +67,10 @@ class ColorHugLightSensor:
 
 def _read(sensor: OpenHid) -> LightReading:
     wanted = SensorSettings()
-    now = parse_settings(sensor.handle.get_feature_report(REPORT, SETTINGS_LENGTH))
+    now = parse_settings(sensor.handle.get_feature_report(LIGHT_SENSOR_REPORT, SETTINGS_LENGTH))
     if now.power != wanted.power:  # also after it was plugged in again
         sensor.handle.send_feature_report(wanted.pack())
-    return parse_reading(sensor.handle.get_input_report(REPORT, READING_LENGTH))
+    return parse_reading(sensor.handle.get_input_report(LIGHT_SENSOR_REPORT, READING_LENGTH))
 
 
 def _not_ready(reading: LightReading) -> DeviceBusy:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from hal.codecs.hid.relay import PRODUCT, REPORT_LENGTH, VENDOR, RelayState, channels_of, parse_state, switch_report
+from hal.codecs.hid import (
+    RELAY_PRODUCT,
+    RELAY_REPORT_LENGTH,
+    RELAY_VENDOR,
+    RelayState,
+    channels_of,
+    parse_state,
+    switch_report,
+)
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.registry import Driver, OpenContext, setting
@@ -14,13 +22,13 @@ from plugins.hid.link import HidFound, HidHandle, HidKind, HidLink, OpenHid
 
 
 def _state(handle: HidHandle, found: HidFound) -> RelayState:
-    return parse_state(handle.get_feature_report(0, REPORT_LENGTH), channels_of(found.product) or 0)
+    return parse_state(handle.get_feature_report(0, RELAY_REPORT_LENGTH), channels_of(found.product) or 0)
 
 
 _KIND: Final = HidKind(
     name="relay board",
-    vendor=VENDOR,
-    product=PRODUCT,
+    vendor=RELAY_VENDOR,
+    product=RELAY_PRODUCT,
     suits=lambda found: channels_of(found.product) is not None,
     serial_of=lambda handle, found: _state(handle, found).serial,
 )

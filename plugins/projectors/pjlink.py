@@ -18,8 +18,7 @@ from hal.notices import Notice
 from hal.registry import Driver, OpenContext, setting
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
-from plugins.projectors.pjlink_conversation import PjLinkConversation
-from plugins.projectors.pjlink_habits import Habits
+from plugins.projectors.pjlink_conversation import Habits, PjLinkConversation
 from plugins.projectors.profile_files import load_profile
 
 

@@ -1,20 +1,60 @@
-"""PJLink over one connection: greeting, password, queries and commands."""
+"""PJLink over one connection: greeting, password, queries and commands; what a projector does in its own way is learned
+while it is open (``Habits``).
+"""
 
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable
 from typing import Final, TypeVar
 
 from hal.codecs.projectors import pjlink
-from hal.codecs.projectors.pjlink import Failure, PjClass
-from hal.codecs.projectors.pjlink_udp import is_notification
+from hal.codecs.projectors.pjlink import Failure, PjClass, is_notification
 from hal.codecs.projectors.profiles import Timing
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
 from hal.values import Power
-from plugins.projectors.pjlink_habits import Habits
+from plugins.projectors.optional_answers import OptionalAnswers
+
+_FIELDS: Final = {
+    "INST": "inputs",
+    "LAMP": "lamp hours",
+    "ERST": "faults",
+    "CLSS": "extras of PJLink class 2",
+    "INF1": "maker",
+    "INF2": "model",
+    "INFO": "firmware",
+    "SVER": "firmware",
+    "SNUM": "serial number",
+}
+
+
+class Habits(OptionalAnswers):
+    """For one projector. ``name``: its name for the technician, for notes.
+
+    ``slow``: it starts, cools, or did not answer, so the next query has to wait: users report projectors that hang
+    when asked often while they start. ``closes``: it closes the connection after each answer. ``second_level``: it
+    checks the password by SHA-256; None until MD5 was refused. ``mute``: the kind of AVMT that it accepts.
+    """
+
+    def __init__(self, name: str, timing: Timing) -> None:
+        self.slow = True
+        self.closes = False
+        self.second_level: bool | None = None
+        self.mute = "1"
+        super().__init__(name, _FIELDS)
+        self._timing = timing
+        self._asked_at_s = -1e9
+
+    def wait(self, deadline: Deadline) -> None:
+        """Wait until the next query may be sent."""
+        interval_s = self._timing.boot_interval_s if self.slow else self._timing.interval_s
+        while (wait_s := self._asked_at_s + interval_s - time.monotonic()) > 0 and not deadline.passed:
+            deadline.sleep(wait_s)
+        self._asked_at_s = time.monotonic()
+
 
 T = TypeVar("T")
 _PADDED_LINE: Final = 8 * pjlink.LONGEST_LINE

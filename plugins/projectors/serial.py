@@ -24,8 +24,8 @@ from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 from plugins.projectors.network.device_server import open_url
 from plugins.projectors.optional_answers import OptionalAnswers
+from plugins.projectors.profile_files import checked_address, read_settings, reported_powers, serial_table
 from plugins.projectors.serial_conversation import COOLS, SERIAL_CHECK, SerialConversation
-from plugins.projectors.serial_settings import checked_address, read_settings, reported_powers, serial_table
 
 T = TypeVar("T")
 _FIELDS: Final = {"lamp_hours": "lamp hours"}

@@ -1,4 +1,6 @@
-"""Communication with a serial projector: one query at a time, and never an old answer for a new query."""
+"""Communication with a serial projector: one query at a time, and never an old answer for a new query. A message is a
+line, a counted frame or a JSON object, as the projector's table says.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +10,51 @@ from typing import Final
 
 from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.codecs.projectors.serial_protocol import (
+    OBJECT_END,
     Answer,
     Reply,
     UnaskedMessage,
     command_bytes,
+    head_bytes,
+    is_complete,
     parse_line,
     query_bytes,
+    rest_bytes,
 )
-from hal.codecs.projectors.serial_table import Query, SerialTable
+from hal.codecs.projectors.serial_table import Frame, Query, SerialTable
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
-from plugins.projectors.messages import read_message
+
+
+def read_message(link: ByteLink, table: SerialTable, deadline: Deadline) -> bytes:
+    """The next message. Raises what the link raises, and ProtocolError for one that can't be of this family."""
+    if table.frame is not None:
+        return _framed(link, table.frame, table.longest_answer, deadline)
+    return _object(link, table, deadline) if table.json else _ended(link, table, deadline)
+
+
+def _framed(link: ByteLink, frame: Frame, longest: int, deadline: Deadline) -> bytes:
+    head = link.read_exactly(head_bytes(frame), deadline=deadline)
+    return head + link.read_exactly(rest_bytes(frame, head, longest=longest), deadline=deadline)
+
+
+def _object(link: ByteLink, table: SerialTable, deadline: Deadline) -> bytes:
+    """A JSON object, up to the brace that closes it."""
+    data = link.read_until(OBJECT_END, limit=table.longest_answer, deadline=deadline)
+    while not is_complete(data) and len(data) < table.longest_answer:
+        data += link.read_until(OBJECT_END, limit=table.longest_answer - len(data), deadline=deadline)
+    return data
+
+
+def _ended(link: ByteLink, table: SerialTable, deadline: Deadline) -> bytes:
+    """A line up to its terminator; a terminator in quotes does not end the line."""
+    quote = table.quirks.quote.encode("latin-1")
+    line = link.read_until(table.terminator, limit=table.longest_answer, deadline=deadline)
+    while quote and line.count(quote) % 2 and len(line) < table.longest_answer:
+        line += link.read_until(table.terminator, limit=table.longest_answer - len(line), deadline=deadline)
+    return line
+
 
 REAPPEAR_S: Final = 4.0
 """Time to wait for an unplugged port: USB adapters need a second or two to come back."""

@@ -12,7 +12,7 @@ from hal.codecs.ptp.values import Operation, Property, broken, parse_handles
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
-from plugins.ptp.files import PendingFile, kind_of
+from plugins.camera_files import PendingFile, kind_of
 from plugins.ptp.link import MOST_IN_MEMORY, Diary, PtpLink, Reply, Sink, camera_busy, refused
 from plugins.ptp.shot import Picture, Shot, Timing
 

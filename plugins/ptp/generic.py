@@ -8,8 +8,8 @@ from hal.codecs.ptp.datasets import DeviceInfo, Form, PropertyDescription, pack_
 from hal.codecs.ptp.values import RAW_FORMATS, Answer, EventCode, Format, Operation, Property, broken
 from hal.deadline import Deadline
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
+from plugins.camera_files import PendingFile
 from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
-from plugins.ptp.files import PendingFile
 from plugins.ptp.link import LinkEvent, Reply, camera_busy, card_full, refused
 from plugins.ptp.shot import Picture, Shot
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from hal.codecs.ptp import nikon
+from hal.codecs.ptp import makers
 from hal.codecs.ptp.datasets import DeviceInfo, PropertyDescription
 from hal.codecs.ptp.values import Operation, Property
 from hal.deadline import Deadline
@@ -50,7 +50,7 @@ class NikonBody(GenericBody):
         known = set(self._info.properties)
         if self._channel.has(Operation.NIKON_VENDOR_PROPERTIES):
             reply = self._channel.once(Operation.NIKON_VENDOR_PROPERTIES, deadline=deadline)
-            known.update(nikon.parse_codes(reply.data) if reply.ok else ())
+            known.update(makers.parse_nikon_codes(reply.data) if reply.ok else ())
         super().prepare(deadline=deadline)
         if Property.COMPRESSION in known:
             self._formats = self._describe(Property.COMPRESSION, deadline)
@@ -70,7 +70,7 @@ class NikonBody(GenericBody):
     def exposure_s(self, *, deadline: Deadline) -> float:
         if self._shutter is None:
             return super().exposure_s(deadline=deadline)
-        return nikon.seconds(self._read(self._shutter, deadline)) or 30.0
+        return makers.nikon_seconds(self._read(self._shutter, deadline)) or 30.0
 
     def press(self, shot: Shot, wanted: int, deadline: Deadline) -> Reply:
         self.end_live_view(deadline=deadline)
@@ -87,7 +87,7 @@ class NikonBody(GenericBody):
         if self._channel.has(Operation.NIKON_GET_EVENT):
             reply = self._channel.once(Operation.NIKON_GET_EVENT, deadline=deadline, note_busy=False)
             if reply.ok:
-                found += [LinkEvent(code, (parameter,)) for code, parameter in nikon.parse_events(reply.data)]
+                found += [LinkEvent(code, (parameter,)) for code, parameter in makers.parse_nikon_events(reply.data)]
         return found
 
     def wait(self, deadline: Deadline) -> None:
@@ -103,7 +103,7 @@ class NikonBody(GenericBody):
         while True:
             reply = self._channel.once(Operation.NIKON_GET_VIEW, deadline=deadline, note_busy=False)
             if reply.ok:
-                return nikon.parse_view(reply.data)
+                return makers.parse_nikon_view(reply.data)
             if not reply.busy:
                 raise refused(reply, "show live view")
             if until.passed:
@@ -129,14 +129,18 @@ class NikonBody(GenericBody):
         if self._formats is None:
             return None if raw else 0
         able = self._formats.numbers()
-        wanted: tuple[int, ...] = nikon.JPEGS
+        wanted: tuple[int, ...] = makers.NIKON_JPEGS
         if raw:
-            wanted = (*nikon.RAW_AND_JPEG, nikon.RAW) if self._both else (nikon.RAW, *nikon.RAW_AND_JPEG)
+            wanted = (
+                (*makers.NIKON_RAW_AND_JPEG, makers.NIKON_RAW)
+                if self._both
+                else (makers.NIKON_RAW, *makers.NIKON_RAW_AND_JPEG)
+            )
         return next((value for value in wanted if value in able), None)
 
     def _times(self) -> Mapping[float, int]:
         numbers = () if self._shutter is None or not self._shutter.writable else self._shutter.numbers()
-        return {round(time_s, 6): value for value in numbers if (time_s := nikon.seconds(value)) is not None}
+        return {round(time_s, 6): value for value in numbers if (time_s := makers.nikon_seconds(value)) is not None}
 
     def _allowed(self, code: Property) -> list[float]:
         if code is Property.EXPOSURE_TIME and self._shutter is not None:
@@ -149,4 +153,4 @@ class NikonBody(GenericBody):
         wanted = self._times()[value]
         if self._read(self._shutter, deadline) != wanted:
             self._set(self._shutter, wanted, deadline)
-        return round(nikon.seconds(self._read(self._shutter, deadline)) or value, 6)
+        return round(makers.nikon_seconds(self._read(self._shutter, deadline)) or value, 6)

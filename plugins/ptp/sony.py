@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from hal.codecs.ptp import sony
+from hal.codecs.ptp import makers
 from hal.codecs.ptp.datasets import ObjectInfo, PropertyDescription, pack_value
-from hal.codecs.ptp.sony import SonyProperty
+from hal.codecs.ptp.makers import SonyProperty
 from hal.codecs.ptp.values import Operation, broken
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
+from plugins.camera_files import PendingFile, kind_of
 from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
-from plugins.ptp.files import PendingFile, kind_of
 from plugins.ptp.link import Reply, camera_busy, refused
 from plugins.ptp.shot import Picture, Shot
 
@@ -49,13 +49,13 @@ class SonyBody:
             self._connect(phase, deadline)
         ready = deadline.within(self._channel.timing.busy_s)
         while True:
-            reply = self._channel.once(Operation.SONY_DEVICE_INFO, sony.PROTOCOL, 1, deadline=deadline)
+            reply = self._channel.once(Operation.SONY_DEVICE_INFO, makers.SONY_PROTOCOL, 1, deadline=deadline)
             if reply.ok and reply.data:
                 break
             if ready.passed:
                 raise camera_busy("say what it can do")
             ready.sleep(_POLL_S)
-        if int.from_bytes(reply.data[:2], "little") < sony.PROTOCOL:
+        if int.from_bytes(reply.data[:2], "little") < makers.SONY_PROTOCOL:
             raise DeviceRefused(
                 "camera-protocol-old",
                 what="This Sony camera has an old remote protocol, whose settings change only step by step.",
@@ -85,7 +85,7 @@ class SonyBody:
 
     def exposure_s(self, *, deadline: Deadline) -> float:
         self._refresh(deadline)
-        return sony.seconds(self._number(SonyProperty.SHUTTER)) or 30.0
+        return makers.sony_seconds(self._number(SonyProperty.SHUTTER)) or 30.0
 
     def release(self, shot: Shot, *, deadline: Deadline) -> None:
         give_up = self._channel.patience(deadline)
@@ -143,21 +143,21 @@ class SonyBody:
 
     def _refresh(self, deadline: Deadline) -> None:
         reply = self._channel.request(Operation.SONY_GET_ALL_PROPERTIES, doing="report its settings", deadline=deadline)
-        self._known = sony.parse_properties(reply.data)
+        self._known = makers.parse_sony_properties(reply.data)
 
     def _waiting(self, deadline: Deadline) -> bool:
         self._channel.link.events()
         self._refresh(deadline)
-        return bool(self._number(SonyProperty.OBJECT_IN_MEMORY) & sony.IN_MEMORY)
+        return bool(self._number(SonyProperty.OBJECT_IN_MEMORY) & makers.SONY_IN_MEMORY)
 
     def _picture(self, deadline: Deadline) -> Picture | None:
         reply = self._channel.request(
-            Operation.GET_OBJECT_INFO, sony.MEMORY_HANDLE, doing="describe its picture", deadline=deadline
+            Operation.GET_OBJECT_INFO, makers.SONY_MEMORY_HANDLE, doing="describe its picture", deadline=deadline
         )
         info = ObjectInfo.parse(reply.data)
         if kind_of(info.format, info.filename) is None:
             return None
-        return Picture(sony.MEMORY_HANDLE, info.format, info.size, info.filename, waiting=True)
+        return Picture(makers.SONY_MEMORY_HANDLE, info.format, info.size, info.filename, waiting=True)
 
     def _forget_old_pictures(self, deadline: Deadline) -> None:
         """A picture of an earlier shot would be taken for this one's; only fetching removes it."""
@@ -166,7 +166,7 @@ class SonyBody:
                 return
             self._picture(deadline)
             self._channel.request(
-                Operation.GET_OBJECT, sony.MEMORY_HANDLE, doing="forget an old picture", sink=len, most=1 << 30,
+                Operation.GET_OBJECT, makers.SONY_MEMORY_HANDLE, doing="forget an old picture", sink=len, most=1 << 30,
                 patience_s=deadline.left_s(), deadline=deadline,
             )  # fmt: skip
         raise camera_busy("forget its old pictures")
@@ -174,18 +174,18 @@ class SonyBody:
     def _press(self, shot: Shot, deadline: Deadline) -> Reply:
         """Press half, then fully, and let go in every case."""
         try:
-            half = self._button(SonyProperty.HALF_PRESS, sony.DOWN, deadline)
+            half = self._button(SonyProperty.HALF_PRESS, makers.BUTTON_DOWN, deadline)
             if not half.ok:
                 return half
             shot.fire()
-            return self._button(SonyProperty.FULL_PRESS, sony.DOWN, deadline)
+            return self._button(SonyProperty.FULL_PRESS, makers.BUTTON_DOWN, deadline)
         finally:
             self._let_go(in_seconds(_LET_GO_S))
 
     def _let_go(self, deadline: Deadline) -> None:
         for button in (SonyProperty.FULL_PRESS, SonyProperty.HALF_PRESS):
             if not self._channel.link.broken:
-                self._button(button, sony.UP, deadline)
+                self._button(button, makers.BUTTON_UP, deadline)
 
     def _button(self, button: SonyProperty, position: int, deadline: Deadline) -> Reply:
         data = pack_value(_U16, position)
@@ -219,16 +219,16 @@ class SonyBody:
 
     def _times(self) -> dict[float, int]:
         values = self._numbers(SonyProperty.SHUTTER)
-        return {round(time_s, 6): value for value in values if (time_s := sony.seconds(value)) is not None}
+        return {round(time_s, 6): value for value in values if (time_s := makers.sony_seconds(value)) is not None}
 
     def _isos(self) -> dict[int, int]:
-        return {iso: value for value in self._numbers(SonyProperty.ISO) if (iso := sony.iso(value)) is not None}
+        return {iso: value for value in self._numbers(SonyProperty.ISO) if (iso := makers.sony_iso(value)) is not None}
 
     def _apertures(self) -> dict[float, int]:
         return {round(value * _APERTURE_STEP, 2): value for value in self._numbers(SonyProperty.F_NUMBER) if value > 0}
 
     def _format(self, *, raw: bool) -> tuple[SonyProperty, int] | None:
-        for code, kinds in sony.FORMATS.items():
+        for code, kinds in makers.SONY_FORMATS.items():
             able = self._numbers(code)
             for value in kinds[raw]:
                 if value in able:

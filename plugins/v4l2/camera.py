@@ -8,7 +8,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.registry import Driver, OpenContext
 from plugins.library_camera import LibraryCamera
-from plugins.v4l2.settings import EXPLAINED, VideoSettings, video_settings
+from plugins.v4l2.formats import EXPLAINED, VideoSettings, video_settings
 
 
 class VideoCamera(LibraryCamera):

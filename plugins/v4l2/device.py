@@ -14,7 +14,7 @@ from typing import Final
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from plugins.v4l2 import kernel
 from plugins.v4l2.formats import COMPRESSED, VideoFormat, code_of, is_complete_jpeg, number_of
-from plugins.v4l2.nodes import VideoNode, identify
+from plugins.v4l2.kernel import VideoNode, identify
 
 _BUFFERS: Final = 4
 _GOING_S: Final = 0.5

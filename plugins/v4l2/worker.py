@@ -8,16 +8,14 @@ from typing import Final
 
 from hal.errors import DeviceRefused, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
-from plugins.library_process import served
-from plugins.library_worker import DeviceWorker
+from plugins.camera_files import PendingFile, commit_all
+from plugins.library_process import DeviceWorker, served
 from plugins.ptp.body import nearest, no_such_file
-from plugins.ptp.files import PendingFile, commit_all
 from plugins.raw_file import encoded
 from plugins.v4l2 import kernel
 from plugins.v4l2.device import VideoDevice
-from plugins.v4l2.formats import VideoFormat, jpeg_file, rank, video_format
-from plugins.v4l2.nodes import chosen
-from plugins.v4l2.settings import VideoSettings
+from plugins.v4l2.formats import VideoFormat, VideoSettings, jpeg_file, rank, video_format
+from plugins.v4l2.kernel import chosen
 
 _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))
 _ABSOLUTE_S: Final = 1e-4

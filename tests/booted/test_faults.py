@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from controller.bundle.starts import NAME as COUNT
+from controller.bundle.install import NAME as COUNT
 from controller.core.kiosk_places import RUNTIME
 from tests.booted.faults import Disk, clock_of_its_own, disk_of_its_own, spoil
 from tests.booted.kiosk import FOURTH, OTHER_SEED, SECOND, SERVICES, THIRD, Kiosk

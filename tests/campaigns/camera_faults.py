@@ -32,8 +32,7 @@ from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.emulated.cameras.usb_camera import numbered_files
 from plugins.emulated.usb.bus import environment
 from plugins.emulated.usb.process import UsbBusProcess
-from plugins.ptp.ip.link import PtpIpLink
-from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import PtpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera

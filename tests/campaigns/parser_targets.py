@@ -21,9 +21,8 @@ from controller.config import load_stage
 from controller.core.errors import BundleError, UsageError
 from controller.kiosk.building import artnet_packets, osc, pjlink_lines
 from controller.kiosk.building.sacn import SacnOptions, frame_of
-from hal.codecs.hid import light as hid_light
-from hal.codecs.hid import relay as hid_relay
-from hal.codecs.projectors import json_rpc, logins, pjlink, pjlink_udp
+from hal.codecs import hid as hid_reports
+from hal.codecs.projectors import logins, pjlink, serial_protocol
 from hal.codecs.projectors.profiles import parse_profile
 from hal.codecs.projectors.serial_protocol import (
     command_bytes,
@@ -35,14 +34,13 @@ from hal.codecs.projectors.serial_protocol import (
 )
 from hal.codecs.ptp import eos as ptp_eos
 from hal.codecs.ptp import ip as ptp_ip
-from hal.codecs.ptp import nikon as ptp_nikon
-from hal.codecs.ptp import sony as ptp_sony
+from hal.codecs.ptp import makers
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
 from hal.errors import DeviceBusy, DeviceRefused, ProtocolError
 from hal.escapes import unescaped
-from hal.tape.reading import parse_tape
+from hal.tape import parse_tape
 from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.dousers import read_levels
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
@@ -70,7 +68,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "ptp-ip": Target(_ptp_ip, _packets()),
         "eos-records": Target(_eos, _records()),
         "nikon": Target(_nikon, (b"\x02\0\x02\x40\1\0\0\0\x0d\x40\0\0\0\0", bytes(384) + b"\xff\xd8\xff\xe0")),
-        "sony": Target(ptp_sony.parse_properties, _SONY),
+        "sony": Target(makers.parse_sony_properties, _SONY),
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
         "logins": Target(_login, _GREETINGS, (ProtocolError, DeviceRefused, DeviceBusy)),
@@ -81,7 +79,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "art-net": Target(artnet_packets.read, _ARTNET, ()),
         "json-rpc": Target(_json_rpc, _JSON_RPC),
         "escapes": Target(lambda data: unescaped(data.decode("latin-1")), (b"on\\r\\x00\\\\",)),
-        "pjlink-udp": Target(pjlink_udp.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
+        "pjlink-udp": Target(pjlink.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
         "tape": Target(_tape, _TAPES),
         "hid-reports": Target(_hid, _REPORTS),
         "bundle-index": Target(_index, (json.dumps(_INDEX).encode(),), (BundleError,)),
@@ -181,14 +179,14 @@ def _pjlink(data: bytes) -> None:
 _REPORTS = (
     b"\x03\0BITFT\0\0\x03",
     b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
-    b"\x02" + hid_light.SensorSettings().pack(),
+    b"\x02" + hid_reports.SensorSettings().pack(),
 )
 
 
 def _nikon(data: bytes) -> None:
     """Every parser gets all the bytes."""
     refused = None
-    for parse in (ptp_nikon.parse_events, ptp_nikon.parse_codes, ptp_nikon.parse_view):
+    for parse in (makers.parse_nikon_events, makers.parse_nikon_codes, makers.parse_nikon_view):
         try:
             parse(data)
         except ProtocolError as error:
@@ -217,11 +215,11 @@ def _hid(data: bytes) -> None:
     report = list(data[1:])
     match data[0] % 3 if data else 0:
         case 0:
-            hid_relay.parse_state(report, 1 + (data[0] // 3) % 8 if data else 1)
+            hid_reports.parse_state(report, 1 + (data[0] // 3) % 8 if data else 1)
         case 1:
-            hid_light.parse_reading(report)
+            hid_reports.parse_reading(report)
         case _:
-            hid_light.parse_settings(report)
+            hid_reports.parse_settings(report)
 
 
 _INDEX = {
@@ -349,8 +347,8 @@ _JSON_RPC: Final = (
 
 
 def _json_rpc(data: bytes) -> None:
-    json_rpc.is_complete(data)
-    json_rpc.parse_message(data, json_rpc.json_bytes("property.get system.state", 7))
+    serial_protocol.is_complete(data)
+    serial_protocol.parse_message(data, serial_protocol.json_bytes("property.get system.state", 7))
 
 
 STAGE = """\

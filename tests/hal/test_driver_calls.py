@@ -13,10 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.annotations import mismatch
 from hal.conformance import CameraConformance, LightSensorConformance, ProjectorConformance
 from hal.deadline import Cancelled, Deadline, in_seconds
-from hal.driver_calls import Caller
+from hal.driver_calls import Caller, mismatch
 from hal.errors import DeviceError, DeviceGone, DriverFault
 from hal.interfaces import BundleDisplay, Camera, Display, LiveViewCamera, Projector, WatchedCamera
 from hal.registry import Driver, OpenContext, check_device, open_device

@@ -11,13 +11,12 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceGone
-from hal.pty_links import PtyLink, leads_to_its_owner
-from hal.serial_link import SerialLink
+from hal.serial_link import PtyLink, SerialLink, leads_to_its_owner
 
 OWNER = """
 import os, sys, time
 from pathlib import Path
-from hal.pty_links import PtyLink
+from hal.serial_link import PtyLink
 link = PtyLink(Path(sys.argv[1]), sys.argv[2])
 print("made", flush=True)
 time.sleep(600)

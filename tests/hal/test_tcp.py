@@ -12,7 +12,7 @@ import pytest
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.links import TcpLink
-from plugins.ptp.ip.wire import Wire
+from plugins.ptp.ip import Wire
 
 FIND = socket.getaddrinfo
 

@@ -38,7 +38,7 @@ from controller.optics.solve.targets.values import Target
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.report.pictures import to_screen
 from controller.stage.steps.appearance.solving import options_of, solved_base
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes
 
 JUDGED_PX: Final = 960
 """About the longer side of what is judged and drawn: every so-many-th pixel of the camera."""

@@ -117,7 +117,7 @@ def _samples(pixels: int, step: float) -> npt.NDArray[np.int64]:
 
 
 def _in_white(calibrated: Calibrated) -> bytes:
-    from controller.bundle.export import png
+    from controller.bundle.describe import png
     from controller.stage.report.pictures import to_screen
 
     calibration = calibrated.calibration

@@ -10,12 +10,10 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
-from controller.bundle.fallback import chosen
 from controller.bundle.format import Index
-from controller.bundle.install import current, previous
+from controller.bundle.install import Count, chosen, current, previous
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.bundle.starts import Count
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import Turn

@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from controller.bundle.fallback import before_it, chosen, is_readable
-from controller.bundle.starts import Starts
+from controller.bundle.install import Starts, before_it, chosen, is_readable
 from controller.core.errors import VelaturaError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision

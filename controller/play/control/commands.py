@@ -1,4 +1,8 @@
-"""Carries requests from the socket out on the player, and answers them."""
+"""Carries requests from the socket out on the player, and answers them.
+
+The last request that may be repeated is kept in a file, so that a player that was killed shows the same again at its
+next start.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +11,53 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from controller.core.errors import UsageError, VelaturaError
+from controller.core.storage import write_atomically
 from controller.play.control import protocol
-from controller.play.control.resume import SavedRequest
+from controller.play.control.notify import log
+from controller.play.control.protocol import MAX_LINE_BYTES, Play, Request, Sequence, Stop, Suggested, parse_request
 from controller.play.control.server import Client, Server
 from controller.play.display.identification import identification
 from controller.play.frames import FrameFile, FrameSet
-from controller.play.loop import Player
-from controller.play.pending_presentation import PresentedSet
-from controller.play.playlist import Playlist
+from controller.play.loop import Player, Playlist
+from controller.play.presenting import PresentedSet
+
+SUFFIX: Final = ".playing"
+_BLACK: Final = b'{"op": "stop"}\n'
+
+
+class SavedRequest:
+    """The last request to play, or that nothing is to be played, in ``path``; None keeps nothing.
+
+    No disk ever stops the picture.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._line: bytes | None = None
+
+    def accepted(self, request: Request, line: bytes) -> None:
+        """Keep the line of a request to play; when something else is to be shown, that the next start is black."""
+        kept = line if isinstance(request, Play | Sequence | Suggested) else _BLACK
+        if self._path is None or kept == self._line:
+            return
+        try:
+            write_atomically(self._path, kept)
+            self._line = kept
+        except (VelaturaError, OSError) as error:
+            self._line = None
+            log(f"The current request could not be saved: {error}")
+
+    def request(self) -> Request | None:
+        """What is kept, or None where nothing is, or nothing that can be played."""
+        if self._path is None:
+            return None
+        with contextlib.suppress(OSError, VelaturaError), self._path.open("rb") as file:
+            _, request = parse_request(file.read(MAX_LINE_BYTES))
+            return request if isinstance(request, Play | Sequence | Suggested | Stop) else None
+        return None
 
 
 class Commands:

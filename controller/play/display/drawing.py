@@ -9,8 +9,7 @@ from typing import Any, Final
 from pyglet import gl
 
 from controller.core.errors import WorkError
-from controller.play.frames import FrameSet, OutputSize
-from controller.play.tiles import Tiles, differing
+from controller.play.frames import FrameSet, OutputSize, Tiles, differing
 
 _VERTEX: Final = """#version 330 core
 out vec2 place;

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.play.frames import FrameSet, OutputSize
-from controller.play.tiles import Tiles, differing, same_tiles
+from controller.play.frames import FrameSet, OutputSize, Tiles, differing, same_tiles
 
 _BLOCK_BYTES: Final = 96 * 1024
 """Small enough that the working copies stay in the processor's cache."""

@@ -18,8 +18,7 @@ from pyglet.libs.x11 import xlib, xrandr
 
 from controller.core.errors import WorkError
 from controller.play.display.edid import serial_names
-from controller.play.display.kept_picture import KeptPicture
-from controller.play.display.properties import number_of, set_number
+from controller.play.display.kept_picture import KeptPicture, number_of, set_number
 
 _ATOM: Final = 4
 _NOTIFY_EVERYTHING: Final = 0b1111

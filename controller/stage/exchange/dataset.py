@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.capture.linear_files import exr_bytes

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError

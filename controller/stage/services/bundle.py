@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from controller.bundle import install as slots
-from controller.bundle.export import export_pictures
+from controller.bundle.describe import export_pictures
 from controller.bundle.format import Index, valid_name
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER, Trust, generate_key, load_public_key, unsigned_warning

@@ -21,7 +21,7 @@ from controller.core.storage import runtime_folder
 from controller.optics.solve.reach.feasibility import exposure
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.play.frames import FrameFile, FrameSet, OutputSize
-from controller.play.live.stream import TARGET
+from controller.play.live_stream import TARGET
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from controller.core.errors import UsageError
 from controller.play.frames import MAGIC, FrameSet, OutputSize
-from controller.play.live.stream import SILENT_S, LiveFile
+from controller.play.live_stream import SILENT_S, LiveFile
 from controller.stage.live.sources import LivePicture
 
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from controller.core.errors import WorkError
 from hal.registry import OpenContext
-from hal.tape.recorder import Tape
+from hal.tape import Tape
 
 VARIABLE: Final = "VELATURA_TAPE"
 """Environment variable with the file of the tape."""

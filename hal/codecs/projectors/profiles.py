@@ -1,4 +1,5 @@
-"""Device profiles of projector families, as validated values (``firmware_configs/``).
+"""Device profiles of projector families, as validated values (``firmware_configs/``). A profile has a table of serial
+commands, a table ``network`` for the projector's own LAN port, or both.
 
 Words for faults: a word that ends in ``-warning`` (``lamp-hours-warning``) needs attention later; any other
 (``lamp-failed``, ``over-temperature``, ``fan-failed``, ``cover-open``) means that the projector can't work.
@@ -9,10 +10,35 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from hal.codecs.projectors.network_table import NetworkTable, parse_network
+from hal.codecs.projectors.logins import LOGINS
 from hal.codecs.projectors.serial_table import MAY_BE_UNKNOWN, SerialTable, parse_serial
 from hal.codecs.projectors.toml_table import Table, parse_toml
 from hal.values import LampRules
+
+LONGEST_PASSWORD: Final = {"escvpnet": 16, "jvc": 64, "ntcontrol": 64, "adcp": 64}
+"""Characters of a password, by login."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkTable:
+    """``port``: TCP port; ``login``: what comes before the commands (``hal.codecs.projectors.logins``);
+    ``user``: the usual account, for logins that have accounts."""
+
+    port: int
+    login: str
+    user: str = ""
+
+
+def parse_network(table: Table) -> NetworkTable:
+    """Read the table. Raises ProtocolError("profile-wrong")."""
+    made = NetworkTable(
+        port=table.integer("port", 1, 65_535),
+        login=table.choice("login", LOGINS, "none"),
+        user=table.string("user", ""),
+    )
+    table.finish()
+    return made
+
 
 _DAY_S: Final = 86_400.0
 

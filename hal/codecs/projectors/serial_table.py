@@ -99,7 +99,7 @@ class SerialTable:
     Answers end in ``terminator``, or carry their length (``frame``). ``binary``: commands and shapes are written as
     hexadecimal bytes, where ``?`` stands for any byte and ``?*9`` for nine. ``cooling``: replies that refuse because
     the lamp cools; ``ignored``: lines without meaning. ``json``: each message is a JSON-RPC object, written as
-    in ``hal.codecs.projectors.json_rpc``; a shape is the text of a result, and each error refuses.
+    in ``hal.codecs.projectors.serial_protocol``; a shape is the text of a result, and each error refuses.
     """
 
     baud: int

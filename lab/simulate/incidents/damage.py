@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.bundle.install import current, previous
-from controller.bundle.starts import Starts
+from controller.bundle.install import Starts, current, previous
 from controller.stage.rig.lamp_ledger import LampFile
 from lab.simulate.disk import STAGE
 from lab.simulate.incidents.living import Living

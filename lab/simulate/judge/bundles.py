@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from controller.bundle.fallback import chosen
-from controller.bundle.install import previous
+from controller.bundle.install import Starts, chosen, previous
 from controller.bundle.reader import Bundle
-from controller.bundle.starts import Starts
 from controller.core.errors import VelaturaError
 from lab.simulate.disk import STAGE
 from lab.simulate.judge.found import Found

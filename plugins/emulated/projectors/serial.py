@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from hal.errors import DeviceError
-from hal.pty_links import PtyLink
+from hal.serial_link import PtyLink
 from plugins.emulated.faults import Faults
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.optoma import OptomaBoard, OptomaQuirks

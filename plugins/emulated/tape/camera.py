@@ -7,7 +7,7 @@ from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from hal.tape.reading import Track
+from hal.tape import Track
 from hal.transcript import Direction, Entry
 from plugins.emulated.cameras.body import CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings

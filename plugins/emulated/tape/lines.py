@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
-from hal.pty_links import PtyLink
-from hal.tape.reading import Track
+from hal.serial_link import PtyLink
+from hal.tape import Track
 from hal.transcript import Direction, Entry
 from plugins.emulated.tape.exchanges import Exchange, Replay
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
-from hal.tape.reading import Track
+from hal.tape import Track
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.tape.camera import TapeBody, no_files
 from plugins.emulated.tape.lines import LineReplay, ReplayedPort, ReplayedTerminal

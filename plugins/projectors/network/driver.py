@@ -1,24 +1,56 @@
-"""Projectors on the network with a table of commands: their own LAN port, with the login of their family."""
+"""Projectors on the network with a table of commands: their own LAN port, with the login of their family. A packet by
+Wake-on-LAN wakes a projector whose network sleeps in standby; it strikes no lamp.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import re
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from hal.codecs.projectors.network_table import LONGEST_PASSWORD, NetworkTable
-from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.codecs.projectors.profiles import LONGEST_PASSWORD, NetworkTable, ProjectorProfile
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.links import ByteLink, host_and_port
 from hal.registry import Driver, OpenContext, setting
 from hal.transcript import Transcript
 from plugins.projectors.network.logins import Account, open_logged_in
-from plugins.projectors.network.wake import BROADCAST, PORT, magic_packet, wake
-from plugins.projectors.profile_files import load_profile
+from plugins.projectors.profile_files import load_profile, serial_table
 from plugins.projectors.serial import SerialProjector
-from plugins.projectors.serial_settings import serial_table
+
+_ADDRESS: Final = re.compile(r"(?:[0-9A-Fa-f]{2}[:-]?){5}[0-9A-Fa-f]{2}")
+PORT: Final = 9
+BROADCAST: Final = "255.255.255.255"
+
+
+def magic_packet(address: str) -> bytes:
+    """The packet for a MAC address: six bytes FF, and the address 16 times. Raises PluginError("setting-wrong")."""
+    if not _ADDRESS.fullmatch(address):
+        raise PluginError(
+            "setting-wrong",
+            what=f"{address!r} is not a MAC address.",
+            remedy='Write wake in stage.toml like this: "00:1a:2b:3c:4d:5e".',
+        )
+    return b"\xff" * 6 + bytes.fromhex(re.sub("[:-]", "", address)) * 16
+
+
+def wake(address: str, to: tuple[str, int] = (BROADCAST, PORT)) -> None:
+    """Send the packet once. Raises DeviceGone("wake-not-sent") without a network, and PluginError."""
+    packet = magic_packet(address)
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            sender.sendto(packet, to)
+    except OSError as error:
+        raise DeviceGone(
+            "wake-not-sent",
+            what=f"The packet that wakes {address} could not be sent: {error.strerror}.",
+            remedy="Check this computer's network.",
+        ) from error
+
 
 CHECK: Final = "its network cable, its address, and that its network is on in standby"
 WAKING_S: Final = 20.0

@@ -1,6 +1,7 @@
 """Canon EOS bodies, old (910F, such as the EOS 400D) and new (9128/9129): chosen by their operations, not by model.
 
-Sequences as libgphoto2 documents them from traces; see ``hal.codecs.ptp.eos`` for the bytes.
+Sequences as libgphoto2 documents them from traces; see ``hal.codecs.ptp.eos`` for the bytes. Live view (9153) is for
+aiming, and off before any picture.
 """
 
 from __future__ import annotations
@@ -9,18 +10,66 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import Final
 
-from hal.codecs.ptp.eos import Destination, EosProperty, aperture_of, exposure_of, iso_of
+from hal.codecs.ptp.eos import VIEW_TO_COMPUTER, Destination, EosProperty, aperture_of, exposure_of, iso_of, parse_view
 from hal.codecs.ptp.values import Answer, Operation
 from hal.deadline import Deadline
-from hal.errors import DeviceRefused
+from hal.errors import DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
-from plugins.ptp.body import Channel, nearest, no_such_file, still_waiting
+from plugins.camera_files import PendingFile, kind_of
+from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
 from plugins.ptp.canon.conversation import EosTalk
-from plugins.ptp.canon.live_view import EosView
 from plugins.ptp.canon.shutter import EosShutter, not_released, released
-from plugins.ptp.files import PendingFile, kind_of
 from plugins.ptp.link import Reply, camera_busy, refused
 from plugins.ptp.shot import Picture, Shot
+
+_WHOLE_FRAME: Final = (0x0020_0000, 0, 0)
+
+
+class EosView:
+    """``on`` while live view is active."""
+
+    def __init__(self, talk: EosTalk) -> None:
+        self._talk = talk
+
+    @property
+    def able(self) -> bool:
+        return self._talk.channel.has(Operation.EOS_GET_VIEWFINDER) and self._talk.state.knows(EosProperty.VIEW_OUTPUT)
+
+    @property
+    def on(self) -> bool:
+        return self.able and self._talk.state.number(EosProperty.VIEW_OUTPUT) & VIEW_TO_COMPUTER != 0
+
+    def frame(self, deadline: Deadline) -> bytes:
+        """One JPEG. The body answers "busy" or "not ready" until the first frame is there."""
+        if not self.able:
+            raise no_live_view()
+        talk = self._talk
+        if not self.on:
+            if talk.state.knows(EosProperty.VIEW_MODE):
+                talk.set(EosProperty.VIEW_MODE, 1, deadline)
+            talk.set(EosProperty.VIEW_OUTPUT, VIEW_TO_COMPUTER, deadline)
+        until = deadline.within(talk.channel.timing.busy_s)
+        while True:
+            talk.keep_alive(deadline)
+            # Every body is busy until its mirror is up: that is no trouble.
+            reply = talk.channel.once(Operation.EOS_GET_VIEWFINDER, *_WHOLE_FRAME, deadline=deadline, note_busy=False)
+            if reply.ok:
+                return parse_view(reply.data)
+            if not reply.busy:
+                raise refused(reply, "show live view")
+            if until.passed:
+                raise DeviceTimeout(
+                    "camera-no-view",
+                    what="The camera sent no live view picture in time.",
+                    remedy="Enable live view in its menu, leave its menus, then try again.",
+                )
+            talk.drain(deadline)
+            until.sleep(0.02)
+
+    def end(self, deadline: Deadline) -> None:
+        if self.on:
+            self._talk.set(EosProperty.VIEW_OUTPUT, 0, deadline)
+
 
 _BLOCK: Final = 1 << 20
 """Some bodies stop answering when asked for more at once."""

@@ -14,7 +14,7 @@ from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceRefused, PluginError
 from hal.transcript import Transcript
-from plugins.ptp.ip.wire import still_time
+from plugins.ptp.ip import still_time
 from plugins.ptp.link import camera_off
 from plugins.ptp.usb.link import PtpUsbLink
 from plugins.ptp.usb.pipes import PyusbPipes, still_interface

@@ -20,10 +20,9 @@ from hal.codecs.ptp.values import Answer, broken
 from hal.deadline import Deadline
 from hal.errors import DeviceError, ProtocolError
 from hal.transcript import Transcript
-from plugins.ptp.ip.wire import still_time
+from plugins.ptp.ip import still_time
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
-from plugins.ptp.usb.events import InterruptReader
-from plugins.ptp.usb.pipes import Pipes, PipeStalled
+from plugins.ptp.usb.pipes import InterruptReader, Pipes, PipeStalled
 
 Result = TypeVar("Result")
 

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.fallback import CountedStart
-from controller.bundle.install import install, rollback
-from controller.bundle.starts import NAME, Starts
+from controller.bundle.install import NAME, CountedStart, Starts, install, rollback
 from tests.controller.bundle.test_install import made, plays
 
 

@@ -15,8 +15,7 @@ import pytest
 from nacl.signing import SigningKey
 from skimage.io import imread
 
-from controller.bundle.describe import as_text, describe, differences, differences_as_text
-from controller.bundle.export import export_pictures
+from controller.bundle.describe import as_text, describe, differences, differences_as_text, export_pictures
 from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER

@@ -10,9 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.fallback import CountedStart
-from controller.bundle.install import current, install
-from controller.bundle.starts import Starts
+from controller.bundle.install import CountedStart, Starts, current, install
 from tests.controller.bundle.power_cuts import every_cut
 from tests.controller.bundle.test_install import made, plays
 

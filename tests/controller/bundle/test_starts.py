@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from controller.bundle.fallback import CountedStart, chosen
-from controller.bundle.install import current, install, previous, rollback
+from controller.bundle.install import NAME, CountedStart, Starts, chosen, current, install, previous, rollback
 from controller.bundle.signing import Trust
-from controller.bundle.starts import NAME, Starts
 from controller.core.storage import runtime_folder
 from controller.kiosk.store.bundle_store import BundleStore
 from tests.controller.bundle.test_install import made

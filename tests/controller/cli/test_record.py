@@ -14,7 +14,7 @@ from controller.core.errors import WorkError
 from controller.stage.sessions import recording
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from hal.tape.reading import read_tape
+from hal.tape import read_tape
 from hal.values import Power
 from plugins.emulated.bench import DRIVER as BENCH
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming

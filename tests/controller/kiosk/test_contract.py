@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.bundle.install import current, install
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.kiosk import service as service_module

@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.play import pacing, presenting
+from controller.play import presenting
+from controller.play import presenting as pacing
 from controller.play.frames import FrameSet, OutputSize
-from controller.play.pending_presentation import PendingPresentation
-from controller.play.presenting import Presenter
+from controller.play.presenting import PendingPresentation, Presenter
 from tests.controller.play.conftest import OUTPUTS, write_noise
 from tests.controller.play.wire import Wire
 

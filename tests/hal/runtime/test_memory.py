@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes
 
 MEMINFO = "MemTotal: 9000 kB\nMemAvailable:    8000 kB\n"
 STAT = "anon 1\ninactive_file 300\nactive_file 100\n"

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import hal.tape as tape_module
 from hal.errors import ProtocolError
 from hal.registry import OpenContext
-from hal.tape import reading
-from hal.tape.reading import parse_tape, read_tape
-from hal.tape.recorder import HEADER, Tape
+from hal.tape import HEADER, Tape, parse_tape, read_tape
 from hal.transcript import Direction
 
 PIECES = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.binary(min_size=1, max_size=600)), max_size=20)
@@ -63,7 +62,7 @@ def test_a_wrong_line_is_named(line: str) -> None:
 
 
 def test_a_piece_that_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "LARGEST_PIECE", 1 << 20)
+    monkeypatch.setattr(tape_module, "LARGEST_PIECE", 1 << 20)
     bomb = zlib.compress(bytes(2 << 20))
     with pytest.raises(ProtocolError, match="line 3"):
         parse_tape(f"{HEADER}\n0.1 + 1 ptp a\n0.2 {{ 1 {base64.b64encode(bomb).decode()}\n")

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 from StreamDeck.ProductIDs import USBVendorIDs
 
-from hal.codecs.hid import light as hid_light
-from hal.codecs.hid import relay as hid_relay
+from hal.codecs import hid as hid_reports
 from hal.codecs.ptp.usb import STILL_IMAGE_CLASS
 from plugins.emulated.cameras.usb_camera import numbered_camera
 from plugins.emulated.usb.bus import UsbBus
@@ -88,8 +87,8 @@ def test_every_device_with_a_driver_may_be_opened_and_no_other(folder: Path) -> 
 
 def test_the_numbers_in_the_rules_are_those_that_drivers_claim() -> None:
     claimed = {
-        (f"{hid_relay.VENDOR:04x}", f"{hid_relay.PRODUCT:04x}"),
-        (f"{hid_light.VENDOR:04x}", f"{hid_light.PRODUCT:04x}"),
+        (f"{hid_reports.RELAY_VENDOR:04x}", f"{hid_reports.RELAY_PRODUCT:04x}"),
+        (f"{hid_reports.LIGHT_SENSOR_VENDOR:04x}", f"{hid_reports.LIGHT_SENSOR_PRODUCT:04x}"),
         (f"{USBVendorIDs.USB_VID_ELGATO:04x}", ""),
     }
     ways = {"SUBSYSTEM": set[tuple[str, str]](), "KERNEL": set[tuple[str, str]]()}

@@ -18,7 +18,7 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
-from plugins.gphoto2 import settings as words
+from plugins.gphoto2 import library as words
 from plugins.gphoto2.camera import DRIVER, Gphoto2Camera, open_camera
 from tests.campaigns.camera_peers import FLAVOURS, Flavour, driver_captures
 from tests.processes import children, command_of

@@ -21,8 +21,8 @@ from hal.registry import OpenContext
 from hal.values import Power
 from plugins.emulated.projectors.lamp import LampTiming
 from plugins.emulated.projectors.quick_profile import quick_profile
+from plugins.finding.network import PjLinkListener
 from plugins.projectors.pjlink import open_pjlink_projector
-from plugins.projectors.pjlink_listener import PjLinkListener
 from tests.plugins.projectors.pjlink_advance import NOTICE, pjlink_advance_python
 
 SERVER = """

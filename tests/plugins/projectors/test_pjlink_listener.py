@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from hal.codecs.projectors.pjlink_udp import InputChanged, LinkUp, PowerChanged, TroubleChanged
+from hal.codecs.projectors.pjlink import InputChanged, LinkUp, PowerChanged, TroubleChanged
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout
 from hal.values import Power
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink_udp import EmulatedPjLinkUdp
-from plugins.projectors.pjlink_listener import FoundProjector, PjLinkListener
+from plugins.finding.network import FoundProjector, PjLinkListener
 
 MAC = "02:00:00:00:00:0a"
 

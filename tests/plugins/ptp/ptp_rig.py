@@ -15,8 +15,7 @@ from hal.deadline import in_seconds
 from hal.values import ExposureSettings
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
-from plugins.ptp.ip.link import PtpIpLink
-from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 

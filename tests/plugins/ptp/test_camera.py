@@ -20,7 +20,7 @@ from hal.values import ExposureSettings, FileKind
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
 from plugins.ptp.camera import DRIVER, open_camera
-from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.ip import PtpIpAddress
 from plugins.ptp.still import PtpCamera
 from tests.plugins.ptp.ptp_rig import SHORT, Rig, Studio, card_rig, left_behind, rig, running
 

@@ -20,8 +20,7 @@ from hal.values import ExposureSettings
 from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.wire import GENERAL_ERROR
-from plugins.ptp.ip.link import PtpIpLink
-from plugins.ptp.ip.wire import PtpIpAddress, Wire
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, Rig, Studio, connect, running, when

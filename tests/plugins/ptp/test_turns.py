@@ -14,8 +14,7 @@ import pytest
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.ptp.ip.link import PtpIpLink
-from plugins.ptp.ip.wire import PtpIpAddress
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import MOST_IN_MEMORY, Diary, Reply, Sink
 from plugins.ptp.still import PtpCamera
 from tests.plugins.ptp.ptp_rig import PATIENT, Studio

@@ -1,4 +1,4 @@
-"""Light by way of other surfaces for live targets, at speed; ``bundle.live_indirect`` is the definition.
+"""Light by way of other surfaces for live targets, at speed; ``bundle.live_maps`` is the definition.
 
 What a target's pixel makes of falling light is kept in 16 bits: the loop over all pixels waits for memory, and these
 are half of what floats take.
@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from controller.bundle.live_indirect import ROUNDS, LiveIndirect, between
-from controller.bundle.live_maps import FULL
+from controller.bundle.live_maps import FULL, ROUNDS, LiveIndirect, between
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
 from controller.optics.transport.simd.scaling import Index

@@ -5,7 +5,7 @@ gives that mean exactly; here each pixel keeps the centre and the covariance of 
 Gaussian to within what a stage's grade leaves open (docs/decisions/0010), and the mean is taken over a narrower one
 (docs/decisions/0010).
 
-The maps of indirect light for live targets (``bundle.live_indirect``) are made from the stage's G. Live targets have
+The maps of indirect light for live targets (``bundle.live_maps``) are made from the stage's G. Live targets have
 few, large blocks: indirect light is smooth but for the paint, which stays in the target's own pixels
 (docs/decisions/0014).
 """
@@ -20,8 +20,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.bundle.live_indirect import SAMPLES, LiveIndirect
-from controller.bundle.live_maps import FULL, TILE, LiveMaps, OutputMaps, packed_shape
+from controller.bundle.live_maps import FULL, SAMPLES, TILE, LiveIndirect, LiveMaps, OutputMaps, packed_shape
 from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Radiometry

@@ -45,7 +45,7 @@ from controller.stage.steps.appearance.photographing import take_bracket
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.capture.photographs import frames_digest
 from hal.notices import Level
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes
 
 WORSE: Final = "the last correction was no better"
 ENOUGH: Final = "the rest is noise"

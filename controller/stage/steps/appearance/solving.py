@@ -26,7 +26,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.solved import RequestedTarget, Solved, SolvedBase
 from controller.stage.steps import costs
 from hal.notices import Level
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes
 
 BASE = StepId(StepKind.BASE)
 

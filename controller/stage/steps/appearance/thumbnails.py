@@ -7,7 +7,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.optics.solve.targets.values import linear_to_srgb
 from controller.stage.artefacts.calibrated import Calibrated

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.troubles import TroubleCode
 from controller.optics.calibrate.photometry.glare import veiled, veiling_glare

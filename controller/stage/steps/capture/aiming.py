@@ -13,7 +13,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.storage import write_atomically

@@ -17,7 +17,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
 from hal.notices import Level
-from hal.runtime.memory import free_bytes
+from hal.runtime.compute import free_bytes
 
 Size = tuple[int, int]
 

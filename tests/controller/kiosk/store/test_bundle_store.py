@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.bundle.install import install
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust

@@ -24,7 +24,7 @@ from pyglet import gl  # noqa: E402
 
 from controller.bundle.live_maps import LiveMaps  # noqa: E402
 from controller.bundle.reader import Bundle  # noqa: E402
-from controller.play.live.gl import LiveRenderer  # noqa: E402
+from controller.play.display.live_targets import LiveRenderer  # noqa: E402
 
 
 def main(bundle: Path, asked: Path, out: Path) -> None:

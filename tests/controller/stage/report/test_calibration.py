@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from controller.bundle.export import png
+from controller.bundle.describe import png
 from controller.core.arrays import save_arrays
 from controller.core.errors import UsageError
 from controller.core.troubles import TroubleCode

@@ -8,8 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.codecs.hid.light import SensorSettings, SensorState, parse_reading, parse_settings
-from hal.codecs.hid.relay import RelayState, channels_of, parse_state, switch_report
+from hal.codecs.hid import (
+    RelayState,
+    SensorSettings,
+    SensorState,
+    channels_of,
+    parse_reading,
+    parse_settings,
+    parse_state,
+    switch_report,
+)
 from hal.errors import ProtocolError
 
 

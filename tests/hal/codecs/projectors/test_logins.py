@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.codecs.projectors import logins
-from hal.codecs.projectors.json_rpc import Message, MessageKind, is_complete, json_bytes, parse_message
 from hal.codecs.projectors.logins import NtGreeting
+from hal.codecs.projectors.serial_protocol import Message, MessageKind, is_complete, json_bytes, parse_message
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, ProtocolError
 
 

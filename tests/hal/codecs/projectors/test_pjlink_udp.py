@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.codecs.projectors.pjlink_udp import (
+from hal.codecs.projectors.pjlink import (
     InputChanged,
     LinkUp,
     PowerChanged,

@@ -21,8 +21,7 @@ from plugins.emulated.projectors.families.panasonic_dz import PanasonicDzBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.projectors.network.gates import GATES, JvcGate, JvcHashedGate, NtControlSha256Gate
 from plugins.emulated.projectors.network.server import EmulatedNetworkProjector
-from plugins.projectors.network.driver import DRIVER, open_network_projector
-from plugins.projectors.network.wake import magic_packet
+from plugins.projectors.network.driver import DRIVER, magic_packet, open_network_projector
 from tests.plugins.conftest import each, hasty
 from tests.plugins.projectors.switching import strikes_once_when_its_second_answer_is_lost
 

@@ -19,8 +19,7 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, Pro
 from hal.transcript import Direction, Transcript, parse_transcript
 from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.ptp.ip.link import PtpIpLink
-from plugins.ptp.ip.wire import PtpIpAddress, Wire, readable
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire, readable
 from plugins.ptp.link import LinkEvent
 from tests.plugins.ptp.ptp_rig import Studio
 from tests.waiting import wait_for

@@ -22,8 +22,7 @@ from controller.bundle.live_maps import LiveMaps
 from controller.core.errors import UsageError, WorkError
 from controller.play.display.outputs import Output
 from controller.play.frames import ENTRY, HEAD, PRESENTED_AT, SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
-from controller.play.pacing import Intervals
-from controller.play.pending_presentation import PendingPresentation, PresentedSet
+from controller.play.presenting import Intervals, PendingPresentation, PresentedSet
 
 TARGET: Final = "target"
 SILENT_S: Final = 1.0

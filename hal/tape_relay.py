@@ -17,8 +17,8 @@ from hal.codecs.ptp import ip as ptp_ip
 from hal.codecs.ptp import usb as ptp_usb
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
-from hal.tape.recorder import Tape
-from hal.tcp import connected
+from hal.links import connected
+from hal.tape import Tape
 from hal.transcript import Transcript
 
 _BLOCK: Final = 1 << 16

@@ -1,1 +1,0 @@
-"""Reports of USB HID devices: relay boards and light sensors."""

@@ -1,1 +1,0 @@
-"""PTP over TCP (PTP/IP). Entry: `link`."""
