@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 def simulate(
     seed: Annotated[int, typer.Option(help="Random seed of the events and of their order.", min=0)] = 1,
     years: Annotated[float, typer.Option(help="Years of a kiosk, in lives of 14 days.", min=0.001)] = 0.1,
-    keep: Annotated[Path | None, typer.Option(help="File for the shortened script of what broke a promise.")] = None,
+    keep: Annotated[Path | None, typer.Option(help="File for the shortened scenario of a violation.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Run the kiosk's own code for months in virtual time, with faults from a seed, and check what it promises."""
+    """Run the kiosk's own code for months in virtual time, with faults from a seed, and check its invariants."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from lab.simulate.run import simulate
+        from lab.simulate.simulation import simulate
 
         # From here on relative names are those of a folder in memory.
         file = None if keep is None else keep.resolve()

@@ -46,7 +46,7 @@ class SimulatedJobs:
         return {kind: JobHandler(do, handler.refusal) for kind, handler in own.table().items()}
 
     def _seconds(self, request: Request, cancel: threading.Event) -> range:
-        lasts_s = SECONDS.get(request.kind, _OTHER_S) * self._world.chance.uniform(0.5, 2.0)
+        lasts_s = SECONDS.get(request.kind, _OTHER_S) * self._world.rng.uniform(0.5, 2.0)
         steps = range(int(lasts_s / _EVERY_S) + 1)
 
         class Steps:

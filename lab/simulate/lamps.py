@@ -33,7 +33,7 @@ class Lamp:
         self.lasts_s = float("inf")
         self.strikes = self.doubled = 0
         self.late = False
-        self.sins: list[str] = []
+        self.violations: list[str] = []
 
     @property
     def bad(self) -> bool:
@@ -63,7 +63,7 @@ class Lamp:
             return
         dark_s = self._scheduler.now_s - self.off_at_s
         if dark_s < RULES.minimum_off_s - _ROUNDING_S:
-            self.sins.append(f"the lamp of {self.name} was struck {dark_s:.1f} s after it went off")
+            self.violations.append(f"the lamp of {self.name} was struck {dark_s:.1f} s after it went off")
         self.strikes += 1
         self.lit_at_s = self.struck_at_s = self._scheduler.now_s
         self.by_hand = self.late = False
@@ -82,8 +82,8 @@ class Line:
     takes no new connection for so long after a program was killed that had one.
     """
 
-    def __init__(self, lamp: Lamp, scheduler: Scheduler, chance: random.Random) -> None:
-        self.lamp, self._scheduler, self._chance = lamp, scheduler, chance
+    def __init__(self, lamp: Lamp, scheduler: Scheduler, rng: random.Random) -> None:
+        self.lamp, self._scheduler, self._rng = lamp, scheduler, rng
         self.trouble = ""
         self.owner: SimulatedProjector | None = None
         self.connection = 0
@@ -134,13 +134,13 @@ class Line:
         trouble = self.trouble
         if trouble == "gone":
             raise self._error(DeviceGone, "link-lost", "can't be reached")
-        if trouble in ("silent", "slow", "flaky") and (trouble != "flaky" or self._chance.random() < 0.3):
+        if trouble in ("silent", "slow", "flaky") and (trouble != "flaky" or self._rng.random() < 0.3):
             self._scheduler.sleep(min(deadline.left_s(), SLOW_S if trouble == "slow" else 1e6))
             if trouble != "slow" or deadline.passed:
                 raise self._error(DeviceTimeout, "link-no-answer", "did not answer in time")
         else:
-            self._scheduler.sleep(self._chance.uniform(0.01, 0.15))
-        if trouble == "garbled" and self._chance.random() < 0.5:
+            self._scheduler.sleep(self._rng.uniform(0.01, 0.15))
+        if trouble == "garbled" and self._rng.random() < 0.5:
             raise self._error(ProtocolError, "answer-wrong", "gave an answer that is none")
 
     def command(self, on: bool, deadline: Deadline) -> None:
@@ -150,16 +150,16 @@ class Line:
         self.talk(deadline)
         if trouble == "refuses":
             raise self._error(DeviceRefused, "projector-not-now", "refuses to switch")
-        if trouble == "loses" and self._chance.random() < 0.5:
+        if trouble == "loses" and self._rng.random() < 0.5:
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
         if trouble == "delays":
-            self._late.append((self._scheduler.now_s + self._chance.uniform(1.0, 90.0), on, False))
+            self._late.append((self._scheduler.now_s + self._rng.uniform(1.0, 90.0), on, False))
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
         if on and lamp.power() is Power.COOLING:
-            lamp.sins.append(f"the lamp of {lamp.name} was switched on while it cooled")
+            lamp.violations.append(f"the lamp of {lamp.name} was switched on while it cooled")
         do()
         if trouble == "doubles":
-            self._late.append((self._scheduler.now_s + self._chance.uniform(0.1, 20.0), on, True))
+            self._late.append((self._scheduler.now_s + self._rng.uniform(0.1, 20.0), on, True))
         if trouble == "late":
             raise self._error(DeviceTimeout, "projector-not-confirmed", "did not switch in time")
 

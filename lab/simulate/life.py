@@ -1,4 +1,4 @@
-"""One life of a simulated kiosk: its service is started, things happen to it from outside, and a witness judges."""
+"""One life of a simulated kiosk: its service is started, incidents come from outside, and monitors check it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,14 @@ from controller.run.state_machine import State
 from hal.deadline import Stop
 from hal.errors import DeviceError
 from lab.simulate.disk import STAGE, watched
-from lab.simulate.incidents import happenings
-from lab.simulate.incidents.commands import arguments_of, believe, look_at_hours, whole
-from lab.simulate.incidents.draw import draw
-from lab.simulate.incidents.places import setting
-from lab.simulate.incidents.script import Item, Setting
 from lab.simulate.jobs import SimulatedJobs
-from lab.simulate.judge.after_the_end import after_the_end
-from lab.simulate.judge.calendar import Calendar
-from lab.simulate.judge.promises import Broken
-from lab.simulate.judge.witness import Witness
+from lab.simulate.monitors.expectation import Calendar
+from lab.simulate.monitors.invariants import Violation
+from lab.simulate.monitors.monitor import KioskMonitor, check_restart
+from lab.simulate.scenarios import injection
+from lab.simulate.scenarios.commands import arguments_of, expect, unknown_outcome_if_killed, verify_doubtful_hours
+from lab.simulate.scenarios.generator import random_scenario, random_site
+from lab.simulate.scenarios.scenario import Incident, Site
 from lab.simulate.scheduler import DAY_S, STACK_BYTES, Event, Program
 from lab.simulate.stage import make_stage, write_log
 from lab.simulate.world import SimulatedWorld
@@ -65,18 +63,19 @@ class Halt(Event, Stop):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a life at ``place``.
+    """The result of a life at ``site``.
 
-    ``broken``: the promise's name, and how; ``digest``: of every line of its event log.
+    ``violated``: the name of the violated invariant, and ``violation``: how, "" if all held;
+    ``digest``: of every line of its event log.
     """
 
     seed: str
     days: float
-    place: Setting
-    items: tuple[Item, ...]
+    site: Site
+    incidents: tuple[Incident, ...]
     digest: str
-    broken: str = ""
-    how: str = ""
+    violated: str = ""
+    violation: str = ""
     at_s: float = 0.0
     events: int = 0
     took_s: float = 0.0
@@ -85,88 +84,88 @@ class Outcome:
 
 
 class Life:
-    """``items``: the script, and ``place`` its setting; None: drawn.
+    """``incidents``: the scenario, and ``site``: where it happens; None: drawn from the seed.
 
-    ``days``: for so long, less if a promise is broken.
+    ``days``: for so long, less if an invariant is violated.
     """
 
     def __init__(
-        self, seed: str, days: float = LIFE_DAYS, items: Sequence[Item] | None = None, place: Setting | None = None
+        self, seed: str, days: float = LIFE_DAYS, incidents: Sequence[Incident] | None = None, site: Site | None = None
     ) -> None:
         self.seed, self.days = seed, days
-        self.items = tuple(draw(seed, days) if items is None else items)
-        self.place = setting(seed) if place is None else place
-        self.world = SimulatedWorld(seed, self.place.begins_unix_s)
-        self.world.is_small = self.place.is_small
+        self.incidents = tuple(random_scenario(seed, days) if incidents is None else incidents)
+        self.site = random_site(seed) if site is None else site
+        self.world = SimulatedWorld(seed, self.site.begins_unix_s)
+        self.world.is_small = self.site.is_small
         for line in self.world.lines.values():
-            line.lingers_s = self.place.lingers_s
-        self.witness = Witness(self.world, Calendar(self.place.zone, self.place.rows))
+            line.lingers_s = self.site.lingers_s
+        self.monitor = KioskMonitor(self.world, Calendar(self.site.zone, self.site.rows))
         self.program: Program | None = None
         self.kiosk: StageKiosk | None = None
         self.service: Service | None = None
         self.stop = Halt(self.world.scheduler)
         self.news = Event(self.world.scheduler)
-        self.broken: Exception | None = None
+        self.violation: Exception | None = None
         self.restart_in_s: float | None = None
         self.damaged: set[str] = set()
         self.unreadable: set[str] = set()
-        self.sound: dict[str, bytes] = {}
-        """What people will write again into files that are damaged."""
+        self.originals: dict[str, bytes] = {}
+        """The content of damaged files, which people write again later."""
         self.repaired_s, self.renewed_s = 0.0, -1e9
-        self.doubtful_hours: Item | None = None
+        self.doubtful_hours: Incident | None = None
         self._keep_by_s: float | None = None
         self._looked_s = 0.0
         self._order = itertools.count()
-        self._waiting: list[Item] = []
-        """What waits for a moment."""
-        self.witness.log.moment = self._moment
+        self._waiting: list[Incident] = []
+        """Incidents that wait for an event."""
+        self.monitor.log.on_event = self._on_event
         self._repairs: list[tuple[float, int, Callable[[], None]]] = []
         self._last: tuple[Any, ...] = ()
 
     # -- living
 
-    def live(self) -> Outcome:
+    def run(self) -> Outcome:
         began_s = time.process_time()
         with _one_core(), _folder() as here, watched(self.world.disk):
             # It has another name each time, and the kiosk names files of which its disk takes no more.
-            self.witness.log.here = f"{here}/"
-            rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.place.rows)
-            make_stage(STAGE, Schedule(self.place.zone, rows, self.place.drift_check), self.place.bundles)
-            self.witness.log.knows(write_log(STAGE, self.place.logged, self.place.begins_unix_s))
+            self.monitor.log.here = f"{here}/"
+            rows = tuple(ScheduleRow(row["day"], row["opens"], row["closes"]) for row in self.site.rows)
+            make_stage(STAGE, Schedule(self.site.zone, rows, self.site.drift_check), self.site.bundles)
+            self.monitor.log.preload(write_log(STAGE, self.site.logged, self.site.begins_unix_s))
             self.world.scheduler.on_kill = self.news.set
             self.boot()
             try:
                 self._pass()
                 self._ends()
-            except Broken as error:
-                self.broken = self.broken or error
+            except Violation as error:
+                self.violation = self.violation or error
             finally:
                 self.end_of_program()
-        if self.broken is not None and not isinstance(self.broken, Broken):
-            raise self.broken
-        witness = self.witness
-        text = "\n".join(witness.log.digested)
+        if self.violation is not None and not isinstance(self.violation, Violation):
+            raise self.violation
+        monitor = self.monitor
+        text = "\n".join(monitor.log.digested)
         lamps = " ".join(f"{name} {lamp.strikes} {lamp.off_at_s!r}" for name, lamp in self.world.lamps.items())
-        broken = self.broken
+        violation = self.violation
         return Outcome(
-            self.seed, self.days, self.place, self.items, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
-            "" if broken is None else broken.promise, "" if broken is None else str(broken),
-            self.world.scheduler.now_s, len(witness.log.digested), time.process_time() - began_s, witness.minutes,
-            tuple(witness.log.digested[-30:]),
+            self.seed, self.days, self.site, self.incidents, hashlib.sha256(f"{text}\n{lamps}".encode()).hexdigest(),
+            "" if violation is None else violation.invariant, "" if violation is None else str(violation),
+            self.world.scheduler.now_s, len(monitor.log.digested), time.process_time() - began_s, monitor.minutes,
+            tuple(monitor.log.digested[-30:]),
         )  # fmt: skip
 
     def _pass(self) -> None:
-        scheduler, left = self.world.scheduler, list(self.items)
-        while scheduler.now_s < self.days * DAY_S and self.broken is None:
-            soon = [self.days * DAY_S, self.witness.next_edge_s()]
+        scheduler, left = self.world.scheduler, list(self.incidents)
+        while scheduler.now_s < self.days * DAY_S and self.violation is None:
+            soon = [self.days * DAY_S, self.monitor.next_edge_s()]
             soon += [left[0].at_s] if left else []
             soon += [self._repairs[0][0]] if self._repairs else []
             self.news.wait(max(0.0, min(soon) - scheduler.now_s))
             self.news.clear()
-            if scheduler.crashes and self.broken is None:
+            if scheduler.crashes and self.violation is None:
                 name, error = scheduler.crashes[0]
-                self.broken = Broken("no crash", f"{name}: {type(error).__name__}: {error}")
-            if self.broken is not None:
+                self.violation = Violation("no crash", f"{name}: {type(error).__name__}: {error}")
+            if self.violation is not None:
                 return
             scheduler.rush()
             if self.program is not None and self.program.dead:
@@ -176,29 +175,29 @@ class Life:
                 self.boot()
             while self._repairs and self._repairs[0][0] <= scheduler.now_s:
                 heapq.heappop(self._repairs)[2]()
-            while left and left[0].at_s <= scheduler.now_s and self.broken is None:
-                item = left.pop(0)
-                if item.moment:
-                    self._waiting.append(item)
+            while left and left[0].at_s <= scheduler.now_s and self.violation is None:
+                incident = left.pop(0)
+                if incident.after_event:
+                    self._waiting.append(incident)
                 else:
-                    self._happen(item)
+                    self._inject(incident)
 
     def _ends(self) -> None:
-        """What the last service logged is judged now; others are when the next one begins. Raises Broken."""
-        if self.broken is None and self.service is not None and self.service.log.problem is None:
-            self.witness.log.in_file(STAGE / EventLog.FILE)
+        """Checks the log of the last service; that of others is checked when the next one begins. Raises Violation."""
+        if self.violation is None and self.service is not None and self.service.log.problem is None:
+            self.monitor.log.in_file(STAGE / EventLog.FILE)
 
-    def _happen(self, item: Item) -> None:
-        happenings.happen(self, item)
+    def _inject(self, incident: Incident) -> None:
+        injection.inject(self, incident)
         self.world.scheduler.rush()
 
-    def _moment(self, name: str) -> None:
-        """The kiosk's log says this: what waits for it happens soon. In a thread of the kiosk."""
+    def _on_event(self, name: str) -> None:
+        """The kiosk's log has this event: incidents that wait for it come soon. In a thread of the kiosk."""
         now_s = self.world.scheduler.now_s
-        self._waiting = [item for item in self._waiting if now_s - item.at_s < WAITS_S]
-        for item in [item for item in self._waiting if item.moment == name]:
-            self._waiting.remove(item)
-            self.later(item.after_s, partial(self._happen, item))
+        self._waiting = [incident for incident in self._waiting if now_s - incident.at_s < WAITS_S]
+        for incident in [incident for incident in self._waiting if incident.after_event == name]:
+            self._waiting.remove(incident)
+            self.later(incident.delay_s, partial(self._inject, incident))
             self.news.set()
 
     def later(self, seconds: float, repair: Callable[[], None]) -> None:
@@ -215,13 +214,13 @@ class Life:
         self.later(SERVES_S, partial(self._serves, self.program))
 
     def _serves(self, program: Program) -> None:
-        """A program that was not ended since has a service. Raises Broken."""
+        """A program that was not ended since has a service. Raises Violation."""
         spoilt = {"stage.toml", GOOD} <= self.unreadable
         spoilt = spoilt or self.world.scheduler.now_s - self.repaired_s < SERVES_S
         spoilt = spoilt or self.world.scheduler.now_s - self.renewed_s < RENEWS_S
         if self.program is program and not program.dead and self.service is None and not spoilt:
             why = None if self.kiosk is None else self.kiosk.snapshot().reason
-            raise Broken("serves", f"{SERVES_S:.0f} s after its start it does not: {why}")
+            raise Violation("serves", f"{SERVES_S:.0f} s after its start it does not: {why}")
 
     def end_of_program(self) -> None:
         """Kill it, and let go of all that it had."""
@@ -231,11 +230,11 @@ class Life:
         self.world.disk.kill_after = None
         self.world.release()
         self.program = self.kiosk = self.service = None
-        self.witness.killed()
-        self.witness.disturb(0.0)
+        self.monitor.killed()
+        self.monitor.disturb(0.0)
 
     def restart(self, *, lit: bool) -> None:
-        """As systemd does: asked to end, then started again. Raises Broken."""
+        """As systemd does: asked to end, then started again. Raises Violation."""
         self.end(lit=lit)
         self.world.scheduler.sleep(1.0)
         self.boot()
@@ -271,7 +270,7 @@ class Life:
                         assert self.program is not None
                         self.later(RENEWS_S, partial(self._serves, self.program))
                 kiosk.detach()
-                self.witness.disturb(0.0)
+                self.monitor.disturb(0.0)
             except (VelaturaError, DeviceError) as error:
                 kiosk.attach(None, f"{error.what} {error.remedy}")
                 # Nothing else of it runs, and whatever happens ends the pause.
@@ -281,31 +280,31 @@ class Life:
     def _follow(self, kiosk: StageKiosk, service: Service) -> None:
         self.service = service
         self._keep_by_s = None
-        self.witness.begins()
-        look_at_hours(self, kiosk)
+        self.monitor.begins()
+        verify_doubtful_hours(self, kiosk)
         refresh = service.changed
 
         def stepped() -> None:
             refresh()
-            if self.broken is None and self.service is service:
+            if self.violation is None and self.service is service:
                 try:
                     self._keeps_good()
-                    self._calm(service, news=self.witness.judge(kiosk, service))
-                    self.witness.paused_long = self.world.scheduler.stretch > 1
-                except Exception as error:  # noqa: BLE001 - a mistake of the witness must not be taken for one of the kiosk
-                    self.broken = error
+                    self._calm(service, news=self.monitor.check(kiosk, service))
+                    self.monitor.paused_long = self.world.scheduler.stretch > 1
+                except Exception as error:  # noqa: BLE001 - a mistake of the monitor is none of the kiosk
+                    self.violation = error
                     self.news.set()
 
         try:
-            after_the_end(self.witness, service, damaged=frozenset(self.damaged))
-        except Broken as error:
-            self.broken = error
+            check_restart(self.monitor, service, damaged=frozenset(self.damaged))
+        except Violation as error:
+            self.violation = error
             self.news.set()
         self.damaged.clear()
         service.changed = stepped
 
     def _keeps_good(self) -> None:
-        """A service that runs with a sound stage.toml has a copy of it, soon after the disk has room. Raises Broken."""
+        """A running service has a copy of a sound stage.toml, soon after the disk has room. Raises Violation."""
         now_s = self.world.scheduler.now_s
         if now_s < self._looked_s + LOOKS_S and self._keep_by_s is not None:
             return
@@ -318,7 +317,7 @@ class Life:
         elif self._keep_by_s is None:
             self._keep_by_s = now_s + KEEPS_S
         elif now_s > self._keep_by_s:
-            raise Broken("settings kept", f"{GOOD} is no copy of stage.toml")
+            raise Violation("settings kept", f"{GOOD} is no copy of stage.toml")
 
     def _calm(self, service: Service, *, news: bool) -> None:
         """Stretch pauses while nothing happens."""
@@ -341,22 +340,22 @@ class Life:
         waits = state in (State.OFF, State.CALIBRATING) and well
         limit = CALM[3] if settled and well and rests else CALM[2] if wrong else CALM[1] if waits else CALM[0]
         # A picture has to come in time: who hangs is asked up to 16 times, and starts are half a minute apart.
-        limit = 1.0 if self.world.screen.hung else CALM[0] if self.witness.bundles.dark else limit
+        limit = 1.0 if self.world.screen.hung else CALM[0] if self.monitor.bundles.dark else limit
         scheduler.stretch = min(scheduler.stretch * CALMER, limit)
 
     # -- people
 
-    def command(self, item: Item) -> None:
+    def command(self, incident: Incident) -> None:
         """A person's command, in a thread of the service, as the panel's."""
         kiosk, program = self.kiosk, self.program
         if kiosk is None or program is None:
             return
 
         def asked() -> None:
-            with contextlib.suppress(VelaturaError, DeviceError), whole(self, item):
-                values = arguments_of(self, item, kiosk)
-                socket_table({"kiosk": kiosk})[item.who](**values)
-                believe(self, item, values)
+            with contextlib.suppress(VelaturaError, DeviceError), unknown_outcome_if_killed(self, incident):
+                values = arguments_of(self, incident, kiosk)
+                socket_table({"kiosk": kiosk})[incident.target](**values)
+                expect(self, incident, values)
 
         self.world.scheduler.task(asked, "command", program).start()
 

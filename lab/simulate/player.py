@@ -27,8 +27,8 @@ END_S: Final = 5.0
 class Screen:
     """What the projectors show, and the process that makes it. ``trouble``: of its answers, or empty."""
 
-    def __init__(self, scheduler: Scheduler, disk: Disk, chance: random.Random) -> None:
-        self.scheduler, self.disk, self.chance = scheduler, disk, chance
+    def __init__(self, scheduler: Scheduler, disk: Disk, rng: random.Random) -> None:
+        self.scheduler, self.disk, self.rng = scheduler, disk, rng
         self.process: SimulatedPlayer | None = None
         self.trouble, self.hung = "", False
         self.late = False
@@ -41,8 +41,8 @@ class Screen:
         self.number = 0
         self.vain_starts: dict[str, int] = {}
         """Starts in a row with a bundle that were asked for a picture, or never got so far, and showed none."""
-        self.sins: list[tuple[str, str]] = []
-        """What it did against a promise of the kiosk: its name, and how."""
+        self.violations: list[tuple[str, str]] = []
+        """What it did against an invariant of the kiosk: its name, and how."""
 
     @property
     def appearance(self) -> str:
@@ -58,7 +58,7 @@ class Screen:
         fails = self.hung or self.late or bool(self.trouble)
         return process is not None and process.alive and process.is_ready and not fails
 
-    def heed(self) -> None:
+    def apply_trouble(self) -> None:
         """Asked seldom, it would leave two questions in a row unanswered only once in hours."""
         self.scheduler.brisk = "player" if self.late or self.trouble in UNHEARD else ""
 
@@ -107,7 +107,7 @@ class SimulatedPlayer:
         self.running = False
         self.loaded: Index | None = None
         self.identity = ""
-        self.ready_at_s = screen.scheduler.now_s + screen.chance.uniform(0.3, 1.5)
+        self.ready_at_s = screen.scheduler.now_s + screen.rng.uniform(0.3, 1.5)
         self.pid = screen.number
         self._start: CountedStart | None = None
         self._bundle = ""
@@ -194,11 +194,11 @@ class SimulatedPlayer:
     def _given_up(self, before: Path, *, now: bool) -> None:
         """Whether that was right, as far as it was. ``now``: by this start, if at all."""
         if now and self._bundle != before.name and not self._opens(self._bundle, before.parent):
-            self._screen.sins.append(("bundle back", f"{self._bundle} plays again, and can't be read"))
+            self._screen.violations.append(("bundle back", f"{self._bundle} plays again, and can't be read"))
         vain = self._screen.vain_starts.get(before.name, 0) if self._bundle != before.name else MOST_FAILED_STARTS
         if vain < MOST_FAILED_STARTS and before.is_file():
             how = f"the bundle {before.name} was given up after {vain} starts without a picture"
-            self._screen.sins.append(("bundle kept", how))
+            self._screen.violations.append(("bundle kept", how))
 
     def _opens(self, name: str, folder: Path) -> bool:
         """Whether this bundle can be read, whoever signed it, as far as the disk can be."""
@@ -230,12 +230,12 @@ class SimulatedPlayer:
                 self._begin_to_play()
                 self._show(appearance, brightness, running=False)
                 return {}, fade_s
-            case protocol.Sequence(items, _, _, brightness, first_fade_s):
+            case protocol.Sequence(incidents, _, _, brightness, first_fade_s):
                 self._begin_to_play()
-                for item in items:
-                    self._known(item[0])
-                self._show(items[0][0], brightness, running=True)
-                return {}, items[0][2] if first_fade_s is None else first_fade_s
+                for incident in incidents:
+                    self._known(incident[0])
+                self._show(incidents[0][0], brightness, running=True)
+                return {}, incidents[0][2] if first_fade_s is None else first_fade_s
             case protocol.Stop(fade_s):
                 self.showing, self.appearance, self.running = "black", "", False
                 return {}, fade_s
@@ -303,24 +303,24 @@ class Connection:
         if screen.hung:
             return
         ticket, request = protocol.parse_request(data.rstrip(b"\n"))
-        after_s = 0.0
+        delay_s = 0.0
         try:
-            answer, after_s = process.do(request)
+            answer, delay_s = process.do(request)
             line = protocol.answer_line(ticket, answer)
         except VelaturaError as error:
             line = protocol.error_line(ticket, error)
-        self._send(line, screen.scheduler.now_s + after_s + screen.chance.uniform(0.001, 0.02))
+        self._send(line, screen.scheduler.now_s + delay_s + screen.rng.uniform(0.001, 0.02))
 
     def _send(self, line: bytes, at_s: float) -> None:
-        chance, trouble = self._screen.chance, self._screen.trouble or "slow" * self._screen.late
-        troubled = trouble and chance.random() < 0.4
+        rng, trouble = self._screen.rng, self._screen.trouble or "slow" * self._screen.late
+        troubled = trouble and rng.random() < 0.4
         pieces: list[tuple[float, bytes]] = [(at_s, line)]
         if troubled:
             half = len(line) // 2
             made: dict[str, Callable[[], list[tuple[float, bytes]]]] = {
-                "slow": lambda: [(at_s + chance.uniform(0.3, 3.0), line)],
-                "doubles": lambda: [(at_s, line), (at_s + chance.uniform(0.0, 1.0), line)],
-                "torn": lambda: [(at_s, line[:half]), (at_s + chance.uniform(0.0, 1.0), line[half:])],
+                "slow": lambda: [(at_s + rng.uniform(0.3, 3.0), line)],
+                "doubles": lambda: [(at_s, line), (at_s + rng.uniform(0.0, 1.0), line)],
+                "torn": lambda: [(at_s, line[:half]), (at_s + rng.uniform(0.0, 1.0), line[half:])],
                 "garbles": lambda: [(at_s, b"{" + line)],
                 "loses": list,
                 "reorders": lambda: [(at_s + 0.05, line), (at_s, json.dumps({"id": 0, "ok": True}).encode() + b"\n")],

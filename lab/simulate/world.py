@@ -64,7 +64,7 @@ class SimulatedCamera:
 
     def capture(self, destination: Path, *, deadline: Deadline) -> list[Any]:
         self.identity(deadline=deadline)
-        self._body.answer(self._body.chance.uniform(*EXPOSED_S))
+        self._body.answer(self._body.rng.uniform(*EXPOSED_S))
         return []
 
     def close(self) -> None:
@@ -76,17 +76,17 @@ class SimulatedCamera:
 class Body:
     """The camera itself. ``sins``: that two used it at a time; ``connection``: another one once it was away."""
 
-    def __init__(self, scheduler: Scheduler, chance: random.Random) -> None:
-        self._scheduler, self.chance = scheduler, chance
+    def __init__(self, scheduler: Scheduler, rng: random.Random) -> None:
+        self._scheduler, self.rng = scheduler, rng
         self.gone, self.owner = False, cast("SimulatedCamera | None", None)
-        self.sins: list[str] = []
+        self.violations: list[str] = []
         self.connection = 0
         self._asked = False
 
     def answer(self, lasts_s: float = ANSWER_S) -> None:
         """Takes so long. Raises DeviceGone."""
         if self._asked:
-            self.sins.append("the camera was used by two at a time")
+            self.violations.append("the camera was used by two at a time")
         self._asked = True
         try:
             self._scheduler.sleep(lasts_s)
@@ -121,13 +121,13 @@ class SimulatedWorld(World):
 
     def __init__(self, seed: str, begins_unix_s: float) -> None:
         self.scheduler = Scheduler(seed)
-        chance = random.Random(f"{seed} devices")
-        self.chance = chance
+        rng = random.Random(f"{seed} devices")
+        self.rng = rng
         self.disk = Disk(self.scheduler)
-        self.screen = Screen(self.scheduler, self.disk, chance)
+        self.screen = Screen(self.scheduler, self.disk, rng)
         self.lamps = {name: Lamp(name, self.scheduler) for name in NAMES}
-        self.lines = {name: Line(lamp, self.scheduler, chance) for name, lamp in self.lamps.items()}
-        self.camera = Body(self.scheduler, chance)
+        self.lines = {name: Line(lamp, self.scheduler, rng) for name, lamp in self.lamps.items()}
+        self.camera = Body(self.scheduler, rng)
         self.alerted: list[EventRow] = []
         self.no_network = False
         self.begins_unix_s, self.clock_off_s = begins_unix_s, 0.0
@@ -184,12 +184,12 @@ class SimulatedWorld(World):
     def busy(self) -> Iterator[None]:
         """The computer works: on a small one, some answers of the player are late meanwhile."""
         self.screen.late = self.is_small
-        self.screen.heed()
+        self.screen.apply_trouble()
         try:
             yield
         finally:
             self.screen.late = False
-            self.screen.heed()
+            self.screen.apply_trouble()
 
     # -- as World
 
@@ -253,7 +253,7 @@ class SimulatedWorld(World):
         return SimulatedProjector(self.lines[_ADDRESSES[settings["address"]]], deadline)
 
     def _alert(self, stage: Path, name: str, table: AlertsTable, rows: Sequence[EventRow]) -> None:
-        self.scheduler.sleep(self.chance.uniform(0.05, 0.5))
+        self.scheduler.sleep(self.rng.uniform(0.05, 0.5))
         if self.no_network:
             raise WorkError("alert-not-sent", what="The server of the webhook does not answer.", remedy="Check it.")
         self.alerted += rows

@@ -5,7 +5,7 @@
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
 the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
 WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet; ``--log``: lives
-in which things happen to the event log alone (``log_lives``). A search that fails does not stop the others; the exit
+with incidents of the event log alone (``log_lives``). A search that fails does not stop the others; the exit
 code is 1 then.
 """
 
@@ -28,24 +28,24 @@ PARTS = ("controller", "hal", "plugins", "firmware_configs")
 LIVES = """
 import sys, time
 from lab.simulate.life import Life
-from tests.campaigns.log_lives import lived
+from tests.campaigns.log_lives import log_life
 number, days = 0, 0.0
 while time.process_time() < float(sys.argv[1]):
     seed = f"{sys.argv[2]}-{number}"
-    outcome = lived(seed) if sys.argv[3] == "log" else Life(seed, 7.0).live()
+    outcome = log_life(seed) if sys.argv[3] == "log" else Life(seed, 7.0).run()
     number, days = number + 1, days + outcome.at_s / 86400
-    if outcome.broken:
-        print(f"{outcome.how} (seed {outcome.seed}, after {days:.1f} days)")
+    if outcome.violated:
+        print(f"{outcome.violation} (seed {outcome.seed}, after {days:.1f} days)")
         sys.exit(9)
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """``how``: the broken promise, empty if none was; ``took_s``: seconds of a core."""
+    """``violation``: of an invariant, empty if there was none; ``took_s``: seconds of a core."""
 
     bug: str
-    how: str
+    violation: str
     took_s: float
 
 
@@ -64,7 +64,7 @@ def planted(patch: Path | None, folder: Path) -> Path:
 
 
 def search(patch: Path | None, seconds: float, seeds: str = "planted", kind: str = "usual") -> Found:
-    """Live until a promise is broken, or the time is over; ``kind`` of lives: "usual" or "log"."""
+    """Live until an invariant is violated, or the time is over; ``kind`` of lives: "usual" or "log"."""
     with tempfile.TemporaryDirectory() as name:
         copy = planted(patch, Path(name))
         before_s = os.times().children_user + os.times().children_system
@@ -91,7 +91,7 @@ def main() -> int:
     began_s, found, all_s = time.monotonic(), 0, 0.0
     if not words:
         control = search(None, seconds, seeds, kind)
-        print(f"{control.took_s:6.0f} s  without a bug: {control.how or 'nothing'}", flush=True)
+        print(f"{control.took_s:6.0f} s  without a bug: {control.violation or 'nothing'}", flush=True)
     bugs = patches(words or [""])
     failed = 0
     for patch in bugs:
@@ -101,9 +101,9 @@ def main() -> int:
             failed += 1
             print(f"         {patch.stem:42} FAILED: {str(error).strip().splitlines()[-1]}", flush=True)
             continue
-        found += bool(one.how)
+        found += bool(one.violation)
         all_s += one.took_s
-        print(f"{one.took_s:6.0f} s  {one.bug:42} {one.how or 'NOT FOUND'}", flush=True)
+        print(f"{one.took_s:6.0f} s  {one.bug:42} {one.violation or 'NOT FOUND'}", flush=True)
     took_s = time.monotonic() - began_s
     print(f"{found} of {len(bugs)} found in {all_s:.0f} s of a core, {took_s:.0f} s here")
     return 1 if failed else 0

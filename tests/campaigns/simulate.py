@@ -7,21 +7,20 @@ import time
 from collections.abc import Iterable
 
 from lab.simulate.life import Outcome
-from lab.simulate.run import YEAR_DAYS, lives
 from lab.simulate.scheduler import DAY_S
-from lab.simulate.shrink import shortened
+from lab.simulate.simulation import YEAR_DAYS, lives, minimise
 
 
-def judged(outcomes: Iterable[Outcome]) -> tuple[float, int]:
-    """The days that were lived, and how many lives broke a promise; their shortest scripts are printed."""
+def report_violations(outcomes: Iterable[Outcome]) -> tuple[float, int]:
+    """The days that were lived, and how many lives violated an invariant; their shortest scenarios are printed."""
     days, failed = 0.0, 0
     for outcome in outcomes:
         days += outcome.at_s / DAY_S
-        if outcome.broken:
+        if outcome.violated:
             failed += 1
-            print(f"{outcome.how} (seed {outcome.seed}, day {outcome.at_s / DAY_S:.3f})", flush=True)
-            short = shortened(outcome)
-            print("\n".join([*(item.line for item in short.items), *short.last]), flush=True)
+            print(f"{outcome.violation} (seed {outcome.seed}, day {outcome.at_s / DAY_S:.3f})", flush=True)
+            short = minimise(outcome)
+            print("\n".join([*(incident.line for incident in short.incidents), *short.last]), flush=True)
     return days, failed
 
 
@@ -30,9 +29,9 @@ def main() -> int:
     seed = int(sys.argv[2]) if len(sys.argv) > 2 else int(time.time())
     began_s = time.process_time()
     print(f"seed {seed}")
-    days, failed = judged(lives(seed, years))
+    days, failed = report_violations(lives(seed, years))
     hours = (time.process_time() - began_s) / 3600
-    print(f"{days / YEAR_DAYS:.2f} years, {failed} broken promises, {days / YEAR_DAYS / hours:.1f} years a core-hour")
+    print(f"{days / YEAR_DAYS:.2f} years, {failed} broken invariants, {days / YEAR_DAYS / hours:.1f} years a core-hour")
     return 1 if failed else 0
 
 

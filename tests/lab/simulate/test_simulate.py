@@ -8,16 +8,15 @@ from typing import Any
 
 import pytest
 
-from lab.simulate.incidents.draw import draw
-from lab.simulate.incidents.places import setting
-from lab.simulate.incidents.script import STOPPED, Item, Setting, from_json, to_json
-from lab.simulate.judge.promises import PROMISES
 from lab.simulate.life import Life, Outcome
-from tests.campaigns.log_lives import lived
+from lab.simulate.monitors.invariants import INVARIANTS
+from lab.simulate.scenarios.generator import random_scenario, random_site
+from lab.simulate.scenarios.scenario import STOPPED, Incident, Site, from_json, to_json
+from tests.campaigns.log_lives import log_life
 
 FOUND = Path(__file__).parent / "found"
 ROOT = Path(__file__).parents[3]
-ONE = "from lab.simulate.life import Life; print(Life('same', 0.5).live().digest)"
+ONE = "from lab.simulate.life import Life; print(Life('same', 0.5).run().digest)"
 
 
 def digest(folder: Path, cores: int, **variables: str) -> str:
@@ -42,81 +41,81 @@ def test_the_same_seed_gives_the_same_event_log_in_every_process(tmp_path: Path)
 
 
 def test_another_seed_gives_another_life() -> None:
-    assert draw("one", 3.0) != draw("two", 3.0)
-    assert draw("one", 3.0) == draw("one", 3.0)
+    assert random_scenario("one", 3.0) != random_scenario("two", 3.0)
+    assert random_scenario("one", 3.0) == random_scenario("one", 3.0)
 
 
 def test_a_script_is_the_same_after_it_was_kept() -> None:
-    place, script = setting("kept"), draw("kept", 5.0)
-    assert from_json(to_json(place, script)) == (place, script)
+    site, script = random_site("kept"), random_scenario("kept", 5.0)
+    assert from_json(to_json(site, script)) == (site, script)
 
 
 def test_each_life_leaves_some_kinds_of_things_out_and_all_of_them_have_all() -> None:
-    lives = [{item.what for item in draw(f"all-{number}", 60.0)} for number in range(8)]
+    lives = [{incident.kind for incident in random_scenario(f"all-{number}", 60.0)} for number in range(8)]
     assert set().union(*lives) >= {"line", "power cut", "killed while writing", "clock set", "command", "x server"}
     assert all(kinds < set().union(*lives) for kinds in lives)
 
 
 @pytest.mark.parametrize("file", sorted(FOUND.glob("*.json")), ids=lambda path: path.stem)
 def test_what_was_found_once_is_not_found_again(file: Path) -> None:
-    """A file is named after its seed; its script broke a promise when it was kept, some only with a planted bug."""
-    place, items = from_json(file.read_text("utf-8"))
-    outcome = Life(file.stem.partition(".")[0], items[-1].at_s / 86_400 + 0.25, items, place).live()
-    assert outcome.how == ""
+    """A file is named after its seed; its scenario violated an invariant once, some only with a planted bug."""
+    site, incidents = from_json(file.read_text("utf-8"))
+    outcome = Life(file.stem.partition(".")[0], incidents[-1].at_s / 86_400 + 0.25, incidents, site).run()
+    assert outcome.violation == ""
 
 
 def test_a_short_life_keeps_every_promise() -> None:
-    outcome = Life("planted-0", 0.8).live()
-    assert outcome.how == "", outcome.last
+    outcome = Life("planted-0", 0.8).run()
+    assert outcome.violation == "", outcome.last
     assert outcome.events > 10
     assert outcome.minutes["open"] + outcome.minutes["closed"] > 900
 
 
 @pytest.mark.parametrize("number", range(10))
 def test_troubles_of_the_log_alone_break_no_promise(number: int) -> None:
-    outcome = lived(f"short-{number}")
-    assert outcome.how == "", outcome.last
+    outcome = log_life(f"short-{number}")
+    assert outcome.violation == "", outcome.last
     assert outcome.events > 10
 
 
 def test_what_waits_for_a_moment_happens_when_the_log_says_that() -> None:
     rows = [{"day": day, "opens": "10:00", "closes": "18:00"} for day in ("mon", "tue", "wed", "thu", "fri")]
-    killed = Item(600.0, "killed", moment="work-begins", after_s=5.0)
-    outcome = Life("moment", 1.0, [killed], Setting(1_767_571_200.0, "UTC", rows, "03:30")).live()
+    killed = Incident(600.0, "killed", after_event="work-begins", delay_s=5.0)
+    outcome = Life("moment", 1.0, [killed], Site(1_767_571_200.0, "UTC", rows, "03:30")).run()
     began, again = [
         float(line.split()[1]) for line in outcome.last if " work-begins " in line or "run ended unexpectedly" in line
     ]
     assert 5.0 <= again - began < 9.0
-    assert outcome.how == ""
+    assert outcome.violation == ""
 
 
-def a_life(items: list[Item], days: float, **values: Any) -> Outcome:
+def a_life(incidents: list[Incident], days: float, **values: Any) -> Outcome:
     """From Monday, 00:00 on: open from 10:00 to 18:00."""
     rows = [{"day": "mon", "opens": "10:00", "closes": "18:00"}]
-    return Life("script", days, items, Setting(1_767_571_200.0, "UTC", rows, "03:30", **values)).live()
+    return Life("script", days, incidents, Site(1_767_571_200.0, "UTC", rows, "03:30", **values)).run()
 
 
 def test_the_player_of_a_small_computer_answers_late_while_it_works() -> None:
-    work = [Item(600.0, "command", "recalibrate", arguments='{"kind": "full"}')]
+    work = [Incident(600.0, "command", "recalibrate", arguments='{"kind": "full"}')]
     small, large = a_life(work, 0.05, is_small=True), a_life(work, 0.05)
-    assert [outcome.how for outcome in (small, large)] == ["", ""]
+    assert [outcome.violation for outcome in (small, large)] == ["", ""]
     assert any(" player-hung " in line for line in small.last)
     assert not any(" player-hung " in line for line in large.last)
 
 
 def test_an_administrator_edits_the_settings_on_a_full_disk_too() -> None:
-    edited = Item(900.0, "settings edited", how="comment")
-    damaged = Item(9000.0, "file damaged", "stage.toml", "empty")
-    outcome = a_life([Item(600.0, "disk full", for_s=1200.0), edited, damaged], 0.12)
-    assert outcome.how == ""
+    edited = Incident(900.0, "settings edited", variant="comment")
+    damaged = Incident(9000.0, "file damaged", "stage.toml", "empty")
+    outcome = a_life([Incident(600.0, "disk full", duration_s=1200.0), edited, damaged], 0.12)
+    assert outcome.violation == ""
     assert sum(" service-started " in line for line in outcome.last) == 4
     assert any("runs with the last good settings" in line for line in outcome.last)
 
 
 def test_a_computer_without_a_battery_has_no_time_after_a_power_cut() -> None:
-    cut = [Item(600.0, "power cut", for_s=5.0)]
+    cut = [Incident(600.0, "power cut", duration_s=5.0)]
     without, with_battery = a_life(cut, 0.05, no_time_s=120.0), a_life(cut, 0.05)
-    assert [outcome.how for outcome in (without, with_battery)] == ["", ""]
+    assert [outcome.violation for outcome in (without, with_battery)] == ["", ""]
     unknown, known = [line for line in without.last if " clock-unknown " in line or " clock-known " in line]
     assert float(unknown.split()[1]) < 1_000.0 < 1_767_571_200.0 < float(known.split()[1])
     assert not any(" clock-unknown " in line for line in with_battery.last)
@@ -125,20 +124,20 @@ def test_a_computer_without_a_battery_has_no_time_after_a_power_cut() -> None:
 @pytest.mark.parametrize("how", ["block", "half", "zeros"])
 def test_damage_to_what_was_written_last_meets_the_small_tables_of_a_log_of_months(how: str) -> None:
     # One of those pages has the number of the last event.
-    items = [
-        Item(
+    incidents = [
+        Incident(
             1800.0 * (1 + page), "file damaged", "kiosk/events.sqlite", how,
-            number=1.0 + (page + 0.6) / 8, arguments=STOPPED,
+            magnitude=1.0 + (page + 0.6) / 8, arguments=STOPPED,
         )
         for page in range(8)
     ]  # fmt: skip
-    outcome = a_life(items, 0.25, logged=1000)
+    outcome = a_life(incidents, 0.25, logged=1000)
     numbers = [int(line.split()[0]) for line in outcome.last]
-    assert outcome.how == ""
+    assert outcome.violation == ""
     assert numbers[0] == 1001
     assert numbers[-1] > 1_767_571_200
 
 
 def test_every_promise_is_on_the_page() -> None:
     page = (ROOT / "docs" / "how-to" / "simulate.md").read_text("utf-8")
-    assert [name for name, sentence in PROMISES.items() if f"| {name} | {sentence} |" not in page] == []
+    assert [name for name, sentence in INVARIANTS.items() if f"| {name} | {sentence} |" not in page] == []

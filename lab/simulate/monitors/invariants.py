@@ -1,10 +1,12 @@
-"""What a kiosk promises."""
+"""What must hold in every life of a kiosk: its invariants, and how long a condition has held."""
 
 from __future__ import annotations
 
 from typing import Final
 
-PROMISES: Final = {
+from lab.simulate.world import SimulatedWorld
+
+INVARIANTS: Final = {
     "lamp rules": "No lamp is switched on while it is hot, or before its minimum off time.",
     "one owner": "A device is used by one program, and by one of its threads, at a time.",
     "no crash": "Nothing ends with an unexpected error.",
@@ -42,10 +44,30 @@ PROMISES: Final = {
 }
 
 
-class Broken(Exception):
-    """``promise``: its name in ``PROMISES``."""
+class Violation(Exception):
+    """A kiosk broke an ``invariant``, named as in ``INVARIANTS``."""
 
-    def __init__(self, promise: str, how: str) -> None:
-        super().__init__(f"{promise}: {how}")
-        assert promise in PROMISES
-        self.promise = promise
+    def __init__(self, invariant: str, how: str) -> None:
+        super().__init__(f"{invariant}: {how}")
+        assert invariant in INVARIANTS
+        self.invariant = invariant
+
+
+class Durations:
+    """For how long conditions have held in each check until now, in the world's time."""
+
+    def __init__(self, world: SimulatedWorld) -> None:
+        self._world = world
+        self._since_s: dict[str, float] = {}
+
+    def held_s(self, condition: str, holds: bool) -> float:
+        """Seconds since the first of the checks in a row that found this. The check before it may be minutes older."""
+        now_s = self._world.scheduler.now_s
+        if not holds:
+            self.restart(condition)
+            return 0.0
+        return now_s - self._since_s.setdefault(condition, now_s)
+
+    def restart(self, condition: str) -> None:
+        """Count this one from its next check on."""
+        self._since_s.pop(condition, None)

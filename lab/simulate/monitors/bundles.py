@@ -1,4 +1,4 @@
-"""Checks what a kiosk promises of its bundles: one that can be read is shown, and one that can't is named."""
+"""Checks the invariants of bundles: one that can be read is shown, and one that can't is named."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from controller.bundle.install import Starts, chosen, previous
 from controller.bundle.reader import Bundle
 from controller.core.errors import VelaturaError
 from lab.simulate.disk import STAGE
-from lab.simulate.judge.found import Found
-from lab.simulate.judge.promises import Broken
+from lab.simulate.monitors.invariants import Durations, Violation
 from lab.simulate.stage import OUTPUTS, TRUST
 from lab.simulate.world import SimulatedWorld
 
@@ -24,7 +23,7 @@ SHOWN_S: Final = 900.0
 _FOLDER: Final = STAGE / "bundles"
 
 
-class BundleWitness:
+class BundleMonitor:
     """``spoilt``: the names of the files that can't be read any more, and when each went bad; ``dark``: whether a
     picture is wanted and could be shown, and is not.
     """
@@ -34,29 +33,29 @@ class BundleWitness:
         self.spoilt: dict[str, float] = {}
         self.dark = False
         self._began_s = 0.0
-        self._found = Found(world)
+        self._durations = Durations(world)
 
     def begins(self) -> None:
         """A service does."""
         self._began_s = self._world.scheduler.now_s
-        self._found.forget("dark")
-        self._found.forget("unnamed")
+        self._durations.restart("dark")
+        self._durations.restart("unnamed")
 
     def disturbed(self) -> None:
         """Something happened to the player or its display: it begins again."""
-        self._found.forget("dark")
+        self._durations.restart("dark")
 
-    def judge(self, kiosk: StageKiosk, service: Service) -> None:
-        """After a step. Raises Broken."""
+    def check(self, kiosk: StageKiosk, service: Service) -> None:
+        """After a step. Raises Violation."""
         unnamed = self._unnamed(kiosk, service) if self.spoilt else ""
-        unnamed_s = self._found.for_s("unnamed", bool(unnamed))
+        unnamed_s = self._durations.held_s("unnamed", bool(unnamed))
         if unnamed_s > NAMED_S:
-            said = " ".join(kiosk.snapshot().warnings) or "nothing"
-            raise Broken("bundle named", f"{unnamed} can't be read, for {unnamed_s:.0f} s it says: {said}")
+            report = " ".join(kiosk.snapshot().warnings) or "nothing"
+            raise Violation("bundle named", f"{unnamed} can't be read, for {unnamed_s:.0f} s it says: {report}")
         self.dark = self._is_dark(service)
-        dark_s = self._found.for_s("dark", self.dark)
+        dark_s = self._durations.held_s("dark", self.dark)
         if dark_s > SHOWN_S:
-            raise Broken("bundle shown", f"it is black for {dark_s:.0f} s")
+            raise Violation("bundle shown", f"it is black for {dark_s:.0f} s")
 
     def _unnamed(self, kiosk: StageKiosk, service: Service) -> str:
         """The bundle that can't be read with which the service began, if it does not say so; else nothing."""

@@ -1,4 +1,4 @@
-"""Checks what a kiosk promises of its lamps: how often they are struck, and that they burn only when they may."""
+"""Checks the invariants of lamps: how often they are struck, and that they burn only when they may."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 from controller.kiosk.decide.interfaces import Condition
 from controller.kiosk.interface import EventRow
 from controller.kiosk.service import Service
-from lab.simulate.judge.promises import Broken
+from lab.simulate.monitors.invariants import Violation
 from lab.simulate.world import SimulatedWorld
 
 BACK_S: Final = 15.0
@@ -17,7 +17,7 @@ LOOKED_S: Final = 300.0
 _SEEN: Final = (Condition.LIT, Condition.DARK, Condition.COOLING)
 
 
-class LampWitness:
+class LampMonitor:
     """``stays_lit``: lamps that a restart must leave lit, and since when they are."""
 
     def __init__(self, world: SimulatedWorld) -> None:
@@ -48,25 +48,25 @@ class LampWitness:
             name: line.lamp.strikes - line.lamp.doubled + line.delayed for name, line in self._world.lines.items()
         }
 
-    # -- judging
+    # -- checks
 
-    def judge(self, service: Service, *, serving_s: float, open_surely: bool) -> None:
-        """After a step, ``serving_s`` after the service's start. Raises Broken."""
+    def check(self, service: Service, *, serving_s: float, open_surely: bool) -> None:
+        """After a step, ``serving_s`` after the service's start. Raises Violation."""
         for lamp in self._world.lamps.values():
-            if lamp.sins:
-                raise Broken("lamp rules", lamp.sins[0])
+            if lamp.violations:
+                raise Violation("lamp rules", lamp.violations[0])
         self._strikes(service)
         self._may_burn(service)
         self._stay_lit(due=open_surely and serving_s <= STAYS_S)
 
     def off(self, row: EventRow) -> None:
-        """The stage says that it is off. Raises Broken."""
+        """The stage says that it is off. Raises Violation."""
         for name, line in self._world.lines.items():
             # A look is some seconds old; a command that was under way may have struck it since.
             seen = self._world.scheduler.now_s - line.lamp.struck_at_s > BACK_S
             known = line.lamp.lit and not line.lamp.by_hand and not line.lamp.late
             if known and seen and row.text.startswith("The stage is off: every lamp"):
-                raise Broken("off is off", f"the lamp of {name} burns")
+                raise Violation("off is off", f"the lamp of {name} burns")
 
     def _may_burn(self, service: Service) -> None:
         """Whether each lamp that burns behind a broken line counts as one that may."""
@@ -76,7 +76,7 @@ class LampWitness:
             # Nobody can know of one that somebody else switched on, or a command that was taken for lost.
             known = lamp.lit and not lamp.by_hand and not lamp.late
             if dark and known and self._world.scheduler.now_s - lamp.struck_at_s > BACK_S:
-                raise Broken("may burn", f"the lamp of {supervisor.name} burns, and counts as dark")
+                raise Violation("may burn", f"the lamp of {supervisor.name} burns, and counts as dark")
 
     def _strikes(self, service: Service) -> None:
         for supervisor in service.devices.projectors:
@@ -86,10 +86,10 @@ class LampWitness:
             # Nobody can count a strike by the second of one command, after the first one's light went out.
             commanded = lamp.strikes - lamp.doubled
             if seen and view.strikes < commanded - self._uncounted.get(lamp.name, 0):
-                raise Broken("strikes counted", f"{view.strikes} instead of {commanded} for {lamp.name}")
+                raise Violation("strikes counted", f"{view.strikes} instead of {commanded} for {lamp.name}")
         for name, lamp in self._world.lamps.items():
             if lamp.strikes - self._strikes_since.get(name, 0) > MOST_STRIKES and lamp.bad:
-                raise Broken("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
+                raise Violation("few strikes", f"the lamp of {name} was struck {MOST_STRIKES + 1} times without light")
             if not lamp.bad:
                 self._strikes_since[name] = lamp.strikes
 
@@ -98,4 +98,4 @@ class LampWitness:
             self.stays_lit = {}
         for name, since_s in self.stays_lit.items():
             if self._world.lamps[name].lit_at_s != since_s:
-                raise Broken("lit through a restart", f"the lamp of {name} went off")
+                raise Violation("lit through a restart", f"the lamp of {name} went off")

@@ -2,17 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timedelta
 from typing import Final
+from zoneinfo import ZoneInfo
 
-from lab.simulate.judge.calendar import Calendar
+_DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+_FAR_S: Final = 9 * 86_400.0
+
+
+class Calendar:
+    """Opening hours of a zone; ``rows`` have day, opens and closes."""
+
+    def __init__(self, zone: str, rows: Sequence[Mapping[str, str]]) -> None:
+        self._zone, self._hours = ZoneInfo(zone), {row["day"]: (row["opens"], row["closes"]) for row in rows}
+
+    def open(self, unix_s: float) -> bool:
+        now = datetime.fromtimestamp(unix_s, self._zone)
+        later = now
+        while later.fold:
+            # Of times that come twice, the first counts: in the second pass all of them are over.
+            unix_s += 60
+            now, later = later, datetime.fromtimestamp(unix_s, self._zone)
+        clock, today = now.strftime("%H:%M"), self._span(now)
+        if today is not None:
+            opens, closes = today
+            if clock >= opens and (closes <= opens or clock < closes):
+                return True
+        before = self._span(now - timedelta(days=1))
+        return before is not None and before[1] <= before[0] and clock < before[1]
+
+    def changes_s(self, unix_s: float) -> float:
+        """When this changes next, to the second; infinite without hours. Minutes are whole in every zone."""
+        was, at_s = self.open(unix_s), unix_s - unix_s % 60
+        while at_s < unix_s + _FAR_S:
+            # A quarter of an hour, then minutes: hours are of at least an hour.
+            if self.open(at_s + 900) is not was:
+                return next(at_s + 60 * minute for minute in range(1, 16) if self.open(at_s + 60 * minute) is not was)
+            at_s += 900
+        return float("inf")
+
+    def _span(self, day: datetime) -> tuple[str, str] | None:
+        return self._hours.get(_DAYS[day.weekday()])
+
 
 SETTLING_S: Final = 200.0
 """After a change of any kind, the stage may be between what it did and what it is to do: warm-up, rests, cooling."""
 FAR_S: Final = 9 * 86_400.0
 
 
-class Wanted:
+class OpeningExpectation:
     """``truth``: Unix seconds as they are.
 
     What people say lasts until the hours change next. While the kiosk has no time, that is the first change after it
@@ -39,10 +78,10 @@ class Wanted:
         truth_s = self._truth()
         if truth_s >= self._edge_s:
             self._open, self._edge_s = self._calendar.open(truth_s), self._calendar.changes_s(truth_s)
-        said = self._said
-        if said is not None and not self.unknown and said[1] is not None and truth_s >= said[1]:
-            self._ended_s, said, self._said = said[1], None, None
-        return said[0] if said is not None else self._open and not self.unknown
+        report = self._said
+        if report is not None and not self.unknown and report[1] is not None and truth_s >= report[1]:
+            self._ended_s, report, self._said = report[1], None, None
+        return report[0] if report is not None else self._open and not self.unknown
 
     def edge_s(self) -> float:
         """When hours change next (Unix seconds)."""
@@ -54,7 +93,7 @@ class Wanted:
         """Whether the kiosk has to take itself for open exactly when ``open`` says so."""
         return self._truth() > max(self._wrong_until_s, self._unsure_until_s) and not (self.unknown and self._forgotten)
 
-    # -- what happens to it
+    # -- incidents
 
     def ran(self, *, remembers: bool) -> None:
         """The kiosk runs now. ``remembers``: its disk takes what it has to know after a restart."""
@@ -97,12 +136,12 @@ class Wanted:
         elif self._said is not None and self._said[1] is None:
             self.say(self._said[0])
 
-    def wrong(self, for_s: float, *, has_time: bool = False) -> None:
+    def wrong(self, duration_s: float, *, has_time: bool = False) -> None:
         """For so long its time or its hours may be wrong. ``has_time``: it has a time now, if it had none."""
         truth_s = self._truth()
         doubtful = self.unknown or self._said is not None or truth_s <= self._unsure_until_s
         self.unknown = self.unknown and not has_time
-        self._wrong_until_s = max(self._wrong_until_s, truth_s + for_s)
+        self._wrong_until_s = max(self._wrong_until_s, truth_s + duration_s)
         if doubtful:
             self.unsure_until_hours()
 

@@ -10,12 +10,12 @@ from typing import Final
 from controller.bundle.install import Starts, current, previous
 from controller.stage.rig.lamp_ledger import LampFile
 from lab.simulate.disk import STAGE
-from lab.simulate.incidents.living import Living
-from lab.simulate.incidents.power import power_cut
-from lab.simulate.incidents.script import DIED, POWER_CUT, STOPPED, WRITTEN_LAST, Item
-from lab.simulate.judge.bundles import SHOWN_S, is_sound
-from lab.simulate.judge.log_file import PAGE_BYTES, pages_of, readable
-from lab.simulate.judge.witness import PLAYER_S, REPAIR_S
+from lab.simulate.monitors.bundles import SHOWN_S, is_sound
+from lab.simulate.monitors.log import PAGE_BYTES, pages_of, readable
+from lab.simulate.monitors.monitor import PLAYER_S, REPAIR_S
+from lab.simulate.scenarios.power import cut_power
+from lab.simulate.scenarios.scenario import DIED, POWER_CUT, STOPPED, WRITTEN_LAST, Incident
+from lab.simulate.scenarios.system import SystemUnderTest
 from lab.simulate.stage import publish
 
 SECTOR_BYTES: Final = 512
@@ -26,58 +26,60 @@ MEND_FILE_S: Final = 600.0
 _TWINS: Final = {LampFile.NAME: LampFile.COPY, LampFile.COPY: LampFile.NAME}
 
 
-def file_damaged(life: Living, item: Item) -> None:
+def damage_file(life: SystemUnderTest, incident: Incident) -> None:
     """While the service is away, a file becomes another one. Somebody puts the settings right after a while.
-    Raises Broken.
+    Raises Violation.
 
     With the arguments "stopped" the service has ended as it should: what its log's write-ahead log had is in the file.
     """
-    last = pages_of(LOG.with_name(f"{LOG.name}-wal")) if item.who.endswith(LOG.name) else []
-    if item.arguments == STOPPED and life.service is not None:
+    last = pages_of(LOG.with_name(f"{LOG.name}-wal")) if incident.target.endswith(LOG.name) else []
+    if incident.arguments == STOPPED and life.service is not None:
         life.end(lit=True)
     else:
         life.end_of_program()
-    path = STAGE / item.who
-    life.witness.log.in_file(LOG)
+    path = STAGE / incident.target
+    life.monitor.log.in_file(LOG)
     before = path.read_bytes() if path.is_file() else None
-    twin = _TWINS.get(item.who)
-    if item.how == "removed" and twin is not None and not (STAGE / twin).is_file():
+    twin = _TWINS.get(incident.target)
+    if incident.variant == "removed" and twin is not None and not (STAGE / twin).is_file():
         # Without both, it is a stage whose lamps were never lit.
         before = None
     if before is not None:
-        life.damaged.add(item.who)
+        life.damaged.add(incident.target)
         # A stage.toml that is gone is not replaced: it would most likely be the wrong folder.
-        gone = item.who == "stage.toml" and item.how == "removed"
-        life.unreadable |= {item.who, "kiosk/stage.toml.good"} if gone else {item.who}
-        if item.how == "removed":
+        gone = incident.target == "stage.toml" and incident.variant == "removed"
+        life.unreadable |= {incident.target, "kiosk/stage.toml.good"} if gone else {incident.target}
+        if incident.variant == "removed":
             path.unlink()
         else:
-            path.write_bytes(_damaged(before, item, last))
-        if item.who.startswith("kiosk/events"):
-            life.witness.log.begun_checks.clear()
-            life.witness.log.damaged(readable(LOG))
-            life.witness.wanted.unsure_until_hours()
-        if item.who.endswith("lamps.json"):
-            life.witness.lamps.ledger_lost()
-        if item.who == "schedule.toml":
+            path.write_bytes(_damaged(before, incident, last))
+        if incident.target.startswith("kiosk/events"):
+            life.monitor.log.begun_checks.clear()
+            life.monitor.log.damaged(readable(LOG))
+            life.monitor.expectation.unsure_until_hours()
+        if incident.target.endswith("lamps.json"):
+            life.monitor.lamps.ledger_lost()
+        if incident.target == "schedule.toml":
             # With other hours for a while, what people said may have ended.
-            life.witness.wanted.unsure_until_hours()
-        if item.who in ("stage.toml", "schedule.toml"):
-            life.witness.wanted.wrong(MEND_FILE_S + REPAIR_S)
-            if item.who not in life.sound:  # of a file that is damaged twice, what it was before the first time
-                life.sound[item.who] = before
+            life.monitor.expectation.unsure_until_hours()
+        if incident.target in ("stage.toml", "schedule.toml"):
+            life.monitor.expectation.wrong(MEND_FILE_S + REPAIR_S)
+            if (
+                incident.target not in life.originals
+            ):  # of a file that is damaged twice, what it was before the first time
+                life.originals[incident.target] = before
                 life.later(MEND_FILE_S, partial(_put_right, life, path))
     life.world.scheduler.sleep(2.0)
     life.boot()
 
 
-def _damaged(content: bytes, item: Item, last: Sequence[int]) -> bytes:
+def _damaged(content: bytes, incident: Incident, last: Sequence[int]) -> bytes:
     """``last``: the pages that were written last, of a file that has such."""
-    at = int(item.number % 1 * len(content))
-    if item.number >= WRITTEN_LAST and last:
-        part, within = divmod(item.number % 1 * len(last), 1)
+    at = int(incident.magnitude % 1 * len(content))
+    if incident.magnitude >= WRITTEN_LAST and last:
+        part, within = divmod(incident.magnitude % 1 * len(last), 1)
         at = max(0, min(int((last[int(part)] - 1 + within) * PAGE_BYTES), len(content) - 1))
-    match item.how:
+    match incident.variant:
         case "empty":
             return b""
         case "cut":
@@ -106,71 +108,71 @@ def _zeros(content: bytes, at: int, until: int) -> bytes:
     return content[:at] + bytes(min(until, len(content)) - at) + content[until:]
 
 
-def _put_right(life: Living, path: Path) -> None:
-    if (before := life.sound.pop(path.name, None)) is None:
+def _put_right(life: SystemUnderTest, path: Path) -> None:
+    if (before := life.originals.pop(path.name, None)) is None:
         return
     path.write_bytes(before)
     life.unreadable.discard(path.name)
     life.repaired_s = life.world.scheduler.now_s
     if life.service is not None:
         life.restart(lit=True)
-    life.witness.disturb(0.0)
+    life.monitor.disturb(0.0)
 
 
-def bundle_damaged(life: Living, item: Item) -> None:
+def damage_bundle(life: SystemUnderTest, incident: Incident) -> None:
     """The file of the installed bundle goes bad, or those of all, and the player dies, or the power is cut.
 
     After a while the appearances are published again. Until then the bundle before plays, where there is a sound one.
     """
-    bundles, world, witness = STAGE / "bundles", life.world, life.witness
+    bundles, world, monitor = STAGE / "bundles", life.world, life.monitor
     newest, earlier = current(bundles), previous(bundles)
     if newest is None:
         return
-    for file in [newest, earlier] if item.how == "all" else [newest]:
+    for file in [newest, earlier] if incident.variant == "all" else [newest]:
         if file is not None:
             _spoil(file)
-            witness.bundles.spoilt.setdefault(file.name, world.scheduler.now_s)
+            monitor.bundles.spoilt.setdefault(file.name, world.scheduler.now_s)
     if world.screen.process is not None:
         world.screen.process.kill()
-    repaired_s = item.for_s or MEND_FILE_S
-    witness.bundle_bad_until_s = max(witness.bundle_bad_until_s, world.scheduler.now_s + repaired_s)
-    witness.disturb(SHOWN_S if _goes_back(bundles, earlier) else repaired_s, PLAYER_S)
-    witness.disturb_player(repaired_s)
+    repaired_s = incident.duration_s or MEND_FILE_S
+    monitor.bundle_bad_until_s = max(monitor.bundle_bad_until_s, world.scheduler.now_s + repaired_s)
+    monitor.disturb(SHOWN_S if _goes_back(bundles, earlier) else repaired_s, PLAYER_S)
+    monitor.disturb_player(repaired_s)
 
     def repair() -> None:
         publish_again(life)
-        witness.disturb(0.0, PLAYER_S)
+        monitor.disturb(0.0, PLAYER_S)
 
     life.later(repaired_s, repair)
-    if item.arguments == POWER_CUT:
-        power_cut(life, 0.0)
+    if incident.arguments == POWER_CUT:
+        cut_power(life, 0.0)
 
 
-def publish_again(life: Living) -> None:
+def publish_again(life: SystemUnderTest) -> None:
     """The appearances, by another computer."""
     publish(STAGE, int(life.world.truth_s))
     written = current(STAGE / "bundles")
     if written is not None:
         # Twice in one second gives the same name, and a sound file in the place of a bad one.
-        life.witness.bundles.spoilt.pop(written.name, None)
+        life.monitor.bundles.spoilt.pop(written.name, None)
 
 
-def bundles_unreadable(life: Living, item: Item) -> None:
+def make_bundles_unreadable(life: SystemUnderTest, incident: Incident) -> None:
     """The disk gives errors where bundles are, and then no more: a cable, a controller, no file handle left.
 
     With the arguments "the player died" it could not read its own program any more either.
     """
-    disk, witness = life.world.disk, life.witness
+    disk, monitor = life.world.disk, life.monitor
     disk.blind = True
-    if item.arguments == DIED and life.world.screen.process is not None:
+    if incident.arguments == DIED and life.world.screen.process is not None:
         life.world.screen.process.kill()
-    witness.disturb(item.for_s, PLAYER_S)
-    witness.disturb_player(item.for_s)
+    monitor.disturb(incident.duration_s, PLAYER_S)
+    monitor.disturb_player(incident.duration_s)
 
     def repair() -> None:
         disk.blind = False
 
-    life.later(item.for_s, repair)
+    life.later(incident.duration_s, repair)
 
 
 def _spoil(file: Path) -> None:

@@ -1,7 +1,10 @@
-"""Reads the event log of a simulated kiosk after each step, and judges what it says."""
+"""Reads the event log of a simulated kiosk after each step, and its file without the kiosk's code."""
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
+import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,13 +13,38 @@ from typing import TYPE_CHECKING, Final
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
-from lab.simulate.incidents.script import moment_of
-from lab.simulate.judge.log_file import readable
-from lab.simulate.judge.promises import Broken
+from lab.simulate.monitors.invariants import Violation
+from lab.simulate.scenarios.scenario import event_name
 from lab.simulate.world import SimulatedWorld
 
 if TYPE_CHECKING:
     from controller.kiosk.service import Service
+
+PAGE_BYTES: Final = 4096
+_HEADER_BYTES: Final = 32
+_FRAME_BYTES: Final = 24
+
+
+def readable(file: Path) -> dict[int, str]:
+    """The texts of its events by their numbers: all, or the newest ones as far as the first that can't be read."""
+    texts: dict[int, str] = {}
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(name) / file.name
+        for end in ("", "-wal"):
+            if (part := file.with_name(f"{file.name}{end}")).is_file():
+                copy.with_name(f"{copy.name}{end}").write_bytes(part.read_bytes())
+        with contextlib.suppress(sqlite3.Error, UnicodeDecodeError), contextlib.closing(sqlite3.connect(copy)) as rows:
+            for number, text in rows.execute("SELECT number, text FROM events ORDER BY number DESC"):
+                texts[number] = text
+    return texts
+
+
+def pages_of(write_ahead_log: Path) -> list[int]:
+    """The numbers of the pages that it has: those that were written last."""
+    content = write_ahead_log.read_bytes() if write_ahead_log.is_file() else b""
+    frames = range(_HEADER_BYTES, len(content) - _FRAME_BYTES - PAGE_BYTES + 1, _FRAME_BYTES + PAGE_BYTES)
+    return sorted({int.from_bytes(content[at : at + 4], "big") for at in frames})
+
 
 CHECK_BEGINS: Final = "Started: Drift check."
 MOST_WORDS: Final = 240
@@ -31,7 +59,7 @@ ENDED: Final = ("player-hung", "player-gone")
 STARTED: Final = "service-started"
 
 
-class LogWitness:
+class LogMonitor:
     """``rows``: by number, those that are surely written; ``read``: the number of the last one.
 
     ``digested``: all lines in the order in which they were read, without ``here``, the folder of this life.
@@ -48,7 +76,7 @@ class LogWitness:
         self.state = self.fault = self._before = ""
         self.unlit_s = -1e9
         self.begun_checks: set[str] = set()
-        self.moment: Callable[[str], None] = lambda _: None
+        self.on_event: Callable[[str], None] = lambda _: None
         self._held: deque[EventRow] = deque(maxlen=SHOWN)
         self._alerted, self._alerted_number, self._kills = 0, 0, 0
         self._due_check = ""
@@ -58,7 +86,7 @@ class LogWitness:
         self._often: Counter[str] = Counter()
         self._ends_s: deque[float] = deque(maxlen=MOST_ENDS)
 
-    def knows(self, rows: Sequence[EventRow]) -> None:
+    def preload(self, rows: Sequence[EventRow]) -> None:
         """These are in the log before the life begins."""
         self.rows = {row.number: row for row in rows[-SHOWN:]}
         self.read = len(rows)
@@ -87,18 +115,18 @@ class LogWitness:
         self._alerted_number = min(self._alerted_number, self.read)
 
     def in_file(self, file: Path) -> None:
-        """After its end, or at the end of a life: what was written is in the file. Raises Broken."""
+        """After its end, or at the end of a life: what was written is in the file. Raises Violation."""
         left = readable(file)
         # Older ones may go when a damaged file is replaced.
         least = sorted(left)[-SHOWN] if len(left) >= SHOWN else 0
         gone = [number for number, row in self.rows.items() if number >= least and left.get(number) != row.text]
         if gone:
-            raise Broken("nothing lost", f"event {gone[0]} is gone from the log's file: {self.rows[gone[0]].text}")
+            raise Violation("nothing lost", f"event {gone[0]} is gone from the log's file: {self.rows[gone[0]].text}")
 
-    # -- judging
+    # -- checks
 
-    def listen(self, service: Service, check_begins_rightly: Callable[[], bool]) -> list[EventRow]:
-        """Read what is new, and return it. Raises Broken."""
+    def check(self, service: Service, check_begins_rightly: Callable[[], bool]) -> list[EventRow]:
+        """Read what is new, and return it. Raises Violation."""
         number = service.log.number
         self._is_written(service, has_news=number != self.read)
         if service.log.problem is None:
@@ -117,38 +145,38 @@ class LogWitness:
             else:
                 self._held.append(row)
             self._said(row)
-            self.moment(moment_of(row.code, row.text))
+            self.on_event(event_name(row.code, row.text))
             if row.code == "crash":
-                raise Broken("no crash", row.text)
+                raise Violation("no crash", row.text)
             if row.level == "error" and row.code != "state" and row.text.count(".") < 2:
-                raise Broken("remedy", f"{row.code}: {row.text}")
+                raise Violation("remedy", f"{row.code}: {row.text}")
             if row.code == "state":
                 self._changes_state(row)
             elif row.code == "task-due":
                 if not check_begins_rightly():
-                    raise Broken("at night", row.text)
+                    raise Violation("at night", row.text)
                 self._due_check = row.text.partition("(")[2].partition(")")[0]
             elif row.text == CHECK_BEGINS:
                 self._check_begins(service)
         return list(new)
 
     def _is_written(self, service: Service, *, has_news: bool) -> None:
-        """What is new since the last look was logged while there had long been room. Raises Broken."""
+        """What is new since the last look was logged while there had long been room. Raises Violation."""
         now_s, problem = self._world.scheduler.now_s, service.log.problem
         if problem is None or self._world.disk.full:
             self._unwritten_since_s = None
         elif self._unwritten_since_s is None:
             self._unwritten_since_s = now_s
         elif has_news and self._looked_s > max(self._unwritten_since_s, self._world.disk.refused_s) + WRITTEN_S:
-            raise Broken("log written", f"since {now_s - self._unwritten_since_s:.0f} s: {problem}")
+            raise Violation("log written", f"since {now_s - self._unwritten_since_s:.0f} s: {problem}")
         self._looked_s = now_s
 
     def alerts(self) -> None:
-        """What was sent since the last look. Raises Broken."""
+        """What was sent since the last look. Raises Violation."""
         world = self._world
         for row in world.alerted[self._alerted :]:
             if row.number <= self._alerted_number and not self._kills:
-                raise Broken("alerts", f"event {row.number} was sent after {self._alerted_number}")
+                raise Violation("alerts", f"event {row.number} was sent after {self._alerted_number}")
             if row.number > self._alerted_number:
                 self._alerted_number, self._kills = row.number, 0
         self._alerted = len(world.alerted)
@@ -161,12 +189,12 @@ class LogWitness:
         elif state == State.POWERING.value and self.state == State.FAULT.value:
             before = reason.partition("Before: ")[2].rstrip(".")
             if not before or before not in self.fault:
-                raise Broken("says why it is dark", f"it had a fault ({self.fault}), and says: {row.text}")
+                raise Violation("says why it is dark", f"it had a fault ({self.fault}), and says: {row.text}")
         self.state = state
 
     def _check_begins(self, service: Service) -> None:
         if self._due_check in self.begun_checks:
-            raise Broken("once a night", f"{self._due_check} begins again")
+            raise Violation("once a night", f"{self._due_check} begins again")
         if service.log.problem is None:
             # What can't be written may be done again after a kill.
             self.begun_checks.add(self._due_check)
@@ -178,9 +206,11 @@ class LogWitness:
         if row.code in ENDED:
             self._ends_s.append(now_s)
             if len(self._ends_s) == MOST_ENDS and now_s - self._ends_s[0] < WORDS_S:
-                raise Broken("few ends", f"the player was ended {MOST_ENDS} times in {now_s - self._ends_s[0]:.0f} s")
+                raise Violation(
+                    "few ends", f"the player was ended {MOST_ENDS} times in {now_s - self._ends_s[0]:.0f} s"
+                )
         # Who asks often gets as many answers: a request, and the line after it, are words of their own. So is a start,
-        # because people restart the service; what ends by itself is another promise.
+        # because people restart the service; what ends by itself is another invariant.
         asked = "done-by" in (row.code, self._before) or row.code == STARTED
         self._before = row.code
         text = f"{row.text} ({row.number})" if asked else row.text
@@ -189,6 +219,6 @@ class LogWitness:
         while now_s - recent[0][0] >= WORDS_S:
             often[recent.popleft()[1]] -= 1
         if len(recent) >= MOST_WORDS:
-            raise Broken("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
+            raise Violation("few words", f"{MOST_WORDS} events in {now_s - recent[0][0]:.0f} s")
         if often[text] >= MOST_AGAIN:
-            raise Broken("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")
+            raise Violation("few words", f"{MOST_AGAIN} times in {WORDS_S:.0f} s: {row.text}")

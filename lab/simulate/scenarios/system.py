@@ -1,4 +1,4 @@
-"""A life, as far as what happens to it has to know it."""
+"""The system under test: a life, as far as incidents have to know it."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from collections.abc import Callable
 from typing import Protocol
 
 from controller.kiosk.service import Service
-from lab.simulate.incidents.script import Item, Setting
-from lab.simulate.judge.witness import Witness
+from lab.simulate.monitors.monitor import KioskMonitor
+from lab.simulate.scenarios.scenario import Incident, Site
 from lab.simulate.scheduler import Event
 from lab.simulate.world import SimulatedWorld
 
 
-class Living(Protocol):
-    """A life, as far as it is needed here; see ``life.Life``."""
+class SystemUnderTest(Protocol):
+    """What incidents need of ``life.Life``."""
 
-    place: Setting
+    site: Site
     world: SimulatedWorld
-    witness: Witness
+    monitor: KioskMonitor
     service: Service | None
     damaged: set[str]
     unreadable: set[str]
-    sound: dict[str, bytes]
+    originals: dict[str, bytes]
     repaired_s: float
-    doubtful_hours: Item | None
+    doubtful_hours: Incident | None
     news: Event
 
     def later(self, seconds: float, repair: Callable[[], None]) -> None: ...
@@ -36,4 +36,4 @@ class Living(Protocol):
 
     def restart(self, *, lit: bool) -> None: ...
 
-    def command(self, item: Item) -> None: ...
+    def command(self, incident: Incident) -> None: ...

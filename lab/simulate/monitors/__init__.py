@@ -1,0 +1,1 @@
+"""Oracles of a simulated kiosk: `monitor` checks its `invariants` after each step, without the kiosk's own code."""

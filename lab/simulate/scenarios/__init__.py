@@ -1,0 +1,1 @@
+"""Incidents of a simulated kiosk: `generator` draws a `scenario` from a seed, `injection` injects it into a life."""
