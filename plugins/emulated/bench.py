@@ -1,14 +1,17 @@
-"""The emulated stage as a whole: prepares it, and serves all of its devices in one process."""
+"""The emulated stage as a whole: prepares it, serves all of its devices in one process, and prints what it serves."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import itertools
+import json
 import os
 import secrets
+import shlex
 import signal
 import socket
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,13 +23,13 @@ from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from hal.runtime.files import read_text
 from hal.tape import read_tape
-from plugins.emulated.bench_output import OutputLines
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
+from plugins.emulated.core.faults import ScenarioPlayer, read_scenario
+from plugins.emulated.core.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.bumps import bumps_of, write_bumps
+from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_engine, read_room, read_stands
 from plugins.emulated.optics.objects import default_object, load_object
-from plugins.emulated.optics.rooms import DARK, arranged
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
@@ -36,20 +39,63 @@ from plugins.emulated.optics.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.optics.stands import SETTINGS, Stands, read_engine, read_room, read_stands
-from plugins.emulated.optics.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
-from plugins.emulated.projectors.boards import DEFAULT_BOARD, board_named
+from plugins.emulated.projectors.boards import DEFAULT_BOARD, board_named, projector_on_its_wire, quick_profile
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.mains import Mains, boot_times, check_mains
-from plugins.emulated.projectors.quick_profile import quick_profile
-from plugins.emulated.projectors.wires import projector_on_its_wire
-from plugins.emulated.scenario import ScenarioPlayer, read_scenario
-from plugins.emulated.tape.serving import serve_tape
+from plugins.emulated.tape import serve_tape
 from plugins.emulated.usb.bench import UsbDevices, read_usb
+from plugins.emulated.usb.camera import STAGE_CAMERA, ExposureServer
+from plugins.emulated.usb.mains import Mains, boot_times, check_mains
 
 if TYPE_CHECKING:
     from plugins.emulated.optics.world import World
+
+
+class OutputLines:
+    """Prints what is served on standard output; ``json_lines``: one JSON object for each line."""
+
+    def __init__(self, json_lines: bool) -> None:
+        self._json = json_lines
+        self._reported_percent = -1
+
+    def say(self, record: Mapping[str, Any], sentence: str) -> None:
+        # A reader that went away must not take the bench with it.
+        with contextlib.suppress(BrokenPipeError):
+            sys.stdout.write((json.dumps(record) if self._json else sentence) + "\n")
+            sys.stdout.flush()
+
+    def progress(self, share: float) -> None:
+        if (percent := int(100 * share) // 10 * 10) > self._reported_percent:
+            self._reported_percent = percent
+            self.say({"progress": percent / 100, "what": "rays"}, f"Casting rays through the stage: {percent} %")
+
+    def served(self, device: str, kind: str, address: str) -> None:
+        self.say({"device": device, "kind": kind, "address": address}, f"{kind:<10} {device:<10} {address}")
+
+    def environment(self, variables: Mapping[str, str]) -> None:
+        words = " ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items())
+        self.say({"environment": dict(variables)}, f"To see the USB devices, begin commands with: {words}")
+
+    def mains(self, projector: str, on: bool, damages: int) -> None:
+        hurt = f" Its lamp was switched off hot, {damages} times so far." if damages else ""
+        self.say(
+            {"mains": projector, "on": on, "damages": damages},
+            f"Projector {projector} {'has' if on else 'has no'} mains.{hurt}",
+        )
+
+    def douser(self, projector: str, is_open: bool) -> None:
+        state = "opens" if is_open else "closes"
+        self.say({"douser": projector, "open": is_open}, f"The douser of projector {projector} {state}.")
+
+    def ready(self) -> None:
+        self.say({"ready": True}, "Ready. Ctrl-C ends.")
+
+    def failed(self, error: DeviceError) -> None:
+        if self._json:
+            self.say({"error": {"code": error.code, "what": error.what, "remedy": error.remedy}}, "")
+        else:
+            sys.stderr.write(f"velatura: {error.what}\n{error.remedy}\n")
+
 
 OBJECT_FILE: Final = f"{FOLDER}/object.npz"
 DEVICE_FAILED: Final = 3

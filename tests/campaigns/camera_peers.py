@@ -28,9 +28,9 @@ from hal.errors import DeviceError
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
-from plugins.emulated.cameras.usb_camera import numbered_files
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.emulated.usb.bus import environment
+from plugins.emulated.usb.camera import numbered_files
 from plugins.emulated.usb.process import UsbBusProcess
 from plugins.gphoto2.camera import open_camera
 

@@ -24,10 +24,10 @@ import numpy.typing as npt
 
 from controller.demo import stage as demo_stage
 from plugins.emulated import bench
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.emulated.optics import staging, world
+from plugins.emulated.optics.layout import Stands
 from plugins.emulated.optics.staging import Size
-from plugins.emulated.optics.stands import Stands
 from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 

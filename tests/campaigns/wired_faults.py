@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from plugins.emulated.cameras.body import CameraFaults
-from plugins.emulated.faults import WireFaults
-from plugins.emulated.scenario import ACTIONS, ONCE, FaultEvent, Scenario, ScenarioPlayer
+from plugins.emulated.core.faults import ACTIONS, ONCE, FaultEvent, Scenario, ScenarioPlayer, WireFaults
 from tests.campaigns.wired_kiosk import WiredKiosk
 
 FOR_S: Final = 8.0

@@ -25,13 +25,12 @@ from controller.run.state_machine import State
 from lab.timings.devices.serve import install_grey
 from plugins.emulated.cameras.body import CameraFaults, CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.emulated.cameras.usb_camera import UsbCameraFaults
-from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, ExposureServer
-from plugins.emulated.optics.truth import MainsTruth, read_truth
+from plugins.emulated.core.truth import MainsTruth, read_truth
 from plugins.emulated.projectors.lamp import LampTiming
-from plugins.emulated.projectors.mains import Mains
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.usb.bus import environment
+from plugins.emulated.usb.camera import STAGE_CAMERA, ExposureServer, UsbCameraFaults
+from plugins.emulated.usb.mains import Mains
 from plugins.emulated.usb.process import KINDS, UsbBusProcess
 from tests.campaigns.mini_stage import HonestLamp, SteadyWorld, prepare_mini
 from tests.processes import children, command_of

@@ -16,7 +16,7 @@ from typing import Any
 
 from plugins.emulated import bench
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
-from plugins.emulated.projectors import wires
+from plugins.emulated.projectors import boards
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 
@@ -61,6 +61,6 @@ def listen() -> None:
 
 if __name__ == "__main__":
     vars(bench).update(EmulatedPtpCamera=KnownCamera)
-    vars(wires).update(EmulatedSerialProjector=KnownProjector)
+    vars(boards).update(EmulatedSerialProjector=KnownProjector)
     threading.Thread(target=listen, daemon=True).start()
     sys.exit(bench.EmulatedBench().serve(Path(sys.argv[1]), json_lines=True))

@@ -20,7 +20,7 @@ from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
 from lab.timings.calibration.indirect import GOALS, Judge, traced_stage
 from lab.timings.calibration.rooms import possible_troubles
-from plugins.emulated.optics.truth import read_truth
+from plugins.emulated.core.truth import read_truth
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1200)]
 SCENE, SEED = "two-objects", 1

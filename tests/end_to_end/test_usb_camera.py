@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.optics.truth import read_truth
+from plugins.emulated.core.truth import read_truth
 from plugins.emulated.usb.bench import FILE
 from tests.campaigns.mini_stage import prepare_mini
 from tests.campaigns.wired_kiosk import tether

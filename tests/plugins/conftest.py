@@ -14,12 +14,10 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, login_of
+from plugins.emulated.projectors.boards import BOARDS, login_of, quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.network.gates import GATES
-from plugins.emulated.projectors.network.server import EmulatedNetworkProjector
+from plugins.emulated.projectors.network import GATES, EmulatedNetworkProjector
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.network.driver import open_network_projector
 from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector
@@ -123,12 +121,12 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         board = kwargs.pop("board", None) or BOARDS.get(profile)
         if board is None:
             raise LookupError(f"no emulated board for {profile}: add it to plugins/emulated/projectors/boards.py")
-        if board is not BOARDS[DEFAULT_BOARD]:  # the emulator makes that one itself, with its number and quirks
-            kwargs["board"] = board(lamp)
         (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
         table_read = load_profile(f"{name}.toml", tmp_path).serial
         assert table_read is not None
-        emulator = EmulatedSerialProjector(tmp_path / "run" / f"tty-{name}", lamp, baud=table_read.baud, **kwargs)
+        emulator = EmulatedSerialProjector(
+            tmp_path / "run" / f"tty-{name}", lamp, board(lamp), baud=table_read.baud, **kwargs
+        )
         emulator.start()
         table = {"profile": f"{name}.toml", "port": f"run/tty-{name}", **(settings or {})}
         context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")

@@ -27,11 +27,11 @@ from controller.stage.sessions.session import OwnSession
 from hal.deadline import in_seconds
 from lab.timings import Row, Timing, at_most, peak_bytes, timed
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
+from plugins.emulated.core.truth import BenchTruth, read_truth
 from plugins.emulated.optics.dng import PictureFacts, dng
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
 from plugins.emulated.optics.sensor import mosaic
-from plugins.emulated.optics.truth import BenchTruth, read_truth
 from plugins.emulated.optics.world import object_of
 
 SHOTS = {"small": 20, "medium": 10, "paper": 6}

@@ -28,10 +28,10 @@ from controller.optics.calibrate.values import Correspondence
 from lab.timings import Row, at_least, at_most, peak_bytes
 from lab.timings.tools.alignment import similarity
 from lab.timings.tools.stage import over
+from plugins.emulated.core.truth import BenchTruth, ObjectTruth
 from plugins.emulated.optics.objects import StageObject, default_object, load_object
 from plugins.emulated.optics.rays import cast, directions
 from plugins.emulated.optics.staging import device_tables, intrinsics_of, random_truth
-from plugins.emulated.optics.truth import BenchTruth, ObjectTruth
 
 FIRST_SEED = 900
 STAGES = {"small": 20, "medium": 5, "paper": 1}

@@ -36,7 +36,7 @@ from lab.timings import Row, at_most
 from lab.timings.tools.judge import predicted_light
 from lab.timings.tools.scenes import SCENES, write_scene
 from lab.timings.tools.truth import Truth, developed
-from plugins.emulated.optics.truth import read_truth, write_truth
+from plugins.emulated.core.truth import read_truth, write_truth
 
 SEEDS: Final = "1"
 REFINED: Final = (0, 1, 2)

@@ -22,8 +22,7 @@ from controller.demo.job import demo
 from controller.demo.stage import APPEARANCES, prepare
 from controller.run.progress import Silent
 from lab.timings import Row, at_least, at_most
-from plugins.emulated.optics.effects.levels import NO_BANDS
-from plugins.emulated.optics.truth import BenchTruth, ProjectorTruth, read_truth
+from plugins.emulated.core.truth import NO_BANDS, BenchTruth, ProjectorTruth, read_truth
 
 ROOMS: Final = "room hard"
 SEEDS: Final = "1 7 23"

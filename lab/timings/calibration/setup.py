@@ -31,7 +31,7 @@ from hal.deadline import Deadline
 from hal.values import CapturedFile
 from lab.timings import Row, at_most
 from lab.timings.tools.stage import FIRST_SEED, prepared_stage
-from plugins.emulated.optics.truth import read_truth, write_truth
+from plugins.emulated.core.truth import read_truth, write_truth
 from plugins.ptp.still import PtpCamera
 
 PICTURE_S: Final = 3.0

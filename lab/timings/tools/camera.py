@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
 
 
 def main(size: str, flavour: str) -> None:

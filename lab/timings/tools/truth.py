@@ -14,14 +14,14 @@ from embreex.mesh_construction import TriangleMesh
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.capture.raw import develop
-from plugins.emulated.kept_light import kept_folder
+from plugins.emulated.core.truth import FOLDER, BenchTruth, read_truth
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
-from plugins.emulated.optics.indirect.kept import Indirect
+from plugins.emulated.optics.indirect.transfers import Indirect
+from plugins.emulated.optics.light_cache import kept_folder
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, directions, samples_of
 from plugins.emulated.optics.render import Renderer, response
-from plugins.emulated.optics.truth import FOLDER, BenchTruth, read_truth
 from plugins.emulated.optics.world import object_of
 
 RGGB = np.array([[0, 1], [1, 2]])

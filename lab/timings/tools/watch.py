@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from plugins.emulated.outputs import FrameReader
+from plugins.emulated.optics.outputs import FrameReader
 
 
 def digest(frames: Mapping[str, npt.NDArray[np.uint8]]) -> str:

@@ -1,1 +1,1 @@
-"""Emulated PTP cameras, over TCP and USB. Entry: `camera`, `usb_camera`."""
+"""Emulated PTP cameras, over TCP; the USB bus has them, too. Entry: `camera`."""

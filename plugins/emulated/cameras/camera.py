@@ -14,9 +14,7 @@ from typing import Final, Literal, Self
 from hal.errors import DeviceError
 from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
-from plugins.emulated.cameras.generic import EmulatedGenericBody
-from plugins.emulated.cameras.nikon import EmulatedNikonBody
-from plugins.emulated.cameras.shot import Expose
+from plugins.emulated.cameras.generic import EmulatedGenericBody, EmulatedNikonBody
 from plugins.emulated.cameras.sony import EmulatedSonyBody
 from plugins.emulated.cameras.wire import (
     CANCEL,
@@ -37,7 +35,8 @@ from plugins.emulated.cameras.wire import (
     send,
     send_data,
 )
-from plugins.emulated.switched import Switched
+from plugins.emulated.core.servers import Switchable
+from plugins.emulated.core.shot import Expose
 
 Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
 BODIES: Final = {
@@ -57,7 +56,7 @@ NAMES: Final = {
 _TAKEOVER_S: Final = 0.5
 
 
-class EmulatedPtpCamera(Switched):
+class EmulatedPtpCamera(Switchable):
     """Serves one camera from ``start`` to ``stop``; also a context.
 
     Parameters

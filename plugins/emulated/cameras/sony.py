@@ -5,11 +5,10 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from plugins.emulated.cameras.body import JPEG, EmulatedBody, ExposedPicture
-from plugins.emulated.cameras.card import Stored
+from plugins.emulated.cameras.body import JPEG, EmulatedBody, ExposedPicture, Stored
 from plugins.emulated.cameras.generic import Setting
-from plugins.emulated.cameras.shot import ShotSettings
 from plugins.emulated.cameras.wire import BUSY, GENERAL_ERROR, NO_SUCH_HANDLE, OK, WRONG_VALUE, PtpOutcome, u16s
+from plugins.emulated.core.shot import ShotSettings
 
 _HANDLE: Final = 0xFFFF_C001
 _SHUTTER, _ISO, _APERTURE, _FORMAT, _MEMORY, _BATTERY = 0xD20D, 0xD21E, 0x5007, 0xD253, 0xD215, 0xD218

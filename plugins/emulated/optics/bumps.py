@@ -34,8 +34,8 @@ import numpy.typing as npt
 
 from hal.errors import DeviceError
 from hal.runtime.files import read_text
-from plugins.emulated.optics.rays import directions
-from plugins.emulated.optics.truth import (
+from plugins.emulated.core.tables import Between, dump, load
+from plugins.emulated.core.truth import (
     FOLDER,
     BenchTruth,
     Lens,
@@ -48,7 +48,7 @@ from plugins.emulated.optics.truth import (
     matrix_of,
     rotation_vector_of,
 )
-from plugins.emulated.tables import Between, dump, load
+from plugins.emulated.optics.rays import directions
 
 FILE: Final = f"{FOLDER}/bumps.toml"
 KINDS: Final = ("projector", "camera", "object", "ambient")

@@ -20,13 +20,12 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
 from hal.runtime.compute import usable_cpus
-from plugins.emulated.kept_light import read_kept, write_kept
-from plugins.emulated.optics.effects.varnish import reflected
-from plugins.emulated.optics.furnished import Scene, furnished
-from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.core.tables import dump
+from plugins.emulated.core.truth import BenchTruth, Lens, Pose, ProjectorTruth
+from plugins.emulated.optics.effects import reflected
+from plugins.emulated.optics.light_cache import read_kept, write_kept
+from plugins.emulated.optics.objects import Scene, StageObject, furnished
 from plugins.emulated.optics.shapes import dot, length
-from plugins.emulated.optics.truth import BenchTruth, Lens, Pose, ProjectorTruth
-from plugins.emulated.tables import dump
 
 KIND: Final = "rays"
 VERSION: Final = 3

@@ -14,16 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.runtime.jit import compiled
-from plugins.emulated.optics.effects.depth_of_field import confusion_px, defocused
-from plugins.emulated.optics.effects.dithering import mean_light
-from plugins.emulated.optics.effects.flaws import veiled
-from plugins.emulated.optics.effects.levels import Dithering
-from plugins.emulated.optics.effects.spectra import colours
-from plugins.emulated.optics.effects.subsurface import Spread
+from plugins.emulated.core.truth import BenchTruth, Dithering, LightTruth, ProjectorTruth
+from plugins.emulated.optics.effects import confusion_px, defocused, mean_light, veiled
 from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, Lit
 from plugins.emulated.optics.rays import Samples
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM
-from plugins.emulated.optics.truth import BenchTruth, LightTruth, ProjectorTruth
+from plugins.emulated.optics.spectra import colours
+from plugins.emulated.optics.subsurface import Spread
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from plugins.emulated.optics.effects.flaws import SensorFlaws
-from plugins.emulated.optics.truth import Sensor
+from plugins.emulated.core.truth import Sensor
+from plugins.emulated.optics.effects import SensorFlaws
 
 REFERENCE_APERTURE_F = 8.0
 SENSOR_WIDTH_MM = 22.2

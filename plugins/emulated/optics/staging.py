@@ -10,11 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hal.errors import DeviceError
-from plugins.emulated.optics.effects.levels import OPAQUE
-from plugins.emulated.optics.objects import StageObject
-from plugins.emulated.optics.rays import project
-from plugins.emulated.optics.stands import DEFAULT, Stands
-from plugins.emulated.optics.truth import (
+from plugins.emulated.core.truth import (
+    OPAQUE,
     BenchTruth,
     CameraTruth,
     Focus,
@@ -29,6 +26,9 @@ from plugins.emulated.optics.truth import (
     Three,
     rotation_vector_of,
 )
+from plugins.emulated.optics.layout import DEFAULT, Stands
+from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.rays import project
 
 Floats = npt.NDArray[np.float64]
 

@@ -12,20 +12,20 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
-from plugins.emulated.kept_light import kept_folder
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
+from plugins.emulated.core.truth import FOLDER, BenchTruth, ObjectTruth
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
-from plugins.emulated.optics.effects.flaws import exposed_s, flickering, sensor_flaws
-from plugins.emulated.optics.effects.spectra import xyz_to_camera
-from plugins.emulated.optics.indirect.kept import Indirect
+from plugins.emulated.optics.effects import exposed_s, flickering, sensor_flaws
+from plugins.emulated.optics.indirect.transfers import Indirect
+from plugins.emulated.optics.light_cache import kept_folder
 from plugins.emulated.optics.objects import StageObject, default_object
+from plugins.emulated.optics.outputs import VisibleFrames, VisibleFrameSet
 from plugins.emulated.optics.rays import Progress, samples_of
 from plugins.emulated.optics.render import Renderer, Shutter
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM, jpeg, mosaic
-from plugins.emulated.optics.truth import FOLDER, BenchTruth, ObjectTruth
-from plugins.emulated.outputs import VisibleFrames, VisibleFrameSet
+from plugins.emulated.optics.spectra import xyz_to_camera
 
 MOST_FRAMES_IN_A_SHOT = 6
 

@@ -1,7 +1,9 @@
-"""What projectors of text protocols do with the bytes on their serial line: Epson, BenQ, Christie, Panasonic.
+"""Control boards of protocols by lines of text: Acer, BenQ, Digital Projection, Epson, Optoma, Sanyo, Sony.
 
-Each is written from the makers' command lists (docs/reference/projectors.md) and shares no parser with the driver,
-so that a common mistake would show. Bytes in, bytes out; the lamp is the only state they act on.
+See ``board``. Sources, beside docs/reference/projectors.md: "RS232 Protocol Function List" (Optoma), the RS232 tables
+of Acer's manuals, "Basic Serial Command Functional Specifications" of PLC-XM100 (Sanyo), Digital Projection's protocol
+guide 115-482H as others read it, the manuals of E-Vision Laser 5000 and 6500, and Sony's manuals as programs of users
+quote them.
 """
 
 from __future__ import annotations
@@ -9,8 +11,179 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from plugins.emulated.projectors.families.line_buffer import LineBuffer
+from plugins.emulated.projectors.board import LineBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
+
+
+class AcerBoard(LineBoard):
+    """``* 0`` and a key code or a question; *000 or *001 first, then the answer.
+
+    Warming is reported as lit, cooling as dark; a strike while it cools is refused.
+    """
+
+    start = b"*"
+
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        if not command.startswith(b"* 0 "):
+            return []
+        return [b"*001\r" if busy else self._act(command[4:])]
+
+    def _act(self, command: bytes) -> bytes:
+        lamp = self._lamp
+        match command:
+            case b"IR 001":
+                return b"*000\r" if lamp.phase is not LampPhase.COOLING and lamp.strike() else b"*001\r"
+            case b"IR 002":
+                lamp.extinguish()
+                return b"*000\r"
+            case b"Lamp ?":
+                return b"*000\rLamp %d\r" % lamp.burning
+            case b"Lamp":
+                return b"*000\r%04d\r" % lamp.hours
+        return b"*001\r"
+
+
+@dataclass(frozen=True, slots=True)
+class BenqQuirks:
+    """By model: the prompt, which answers an empty line; how many times a command comes back, an answer glued to its
+    echo in standby (W700), hours with spaces and without # (W1100), answers that lose their * in standby (W1110);
+    whether source, lamp mode and keystone can be read and set."""
+
+    prompt: bool = True
+    echoes: int = 1
+    glued_in_standby: bool = False
+    bare_hours: bool = False
+    starless_in_standby: bool = False
+    menus: bool = True
+
+
+class BenqBoard(LineBoard):
+    """``<CR>*key=value#<CR>``."""
+
+    start = b"*"
+
+    def __init__(self, lamp: EmulatedLamp, quirks: BenqQuirks | None = None) -> None:
+        super().__init__(lamp)
+        self._quirks = quirks or BenqQuirks()
+        self._menu = {b"sour": b"HDMI", b"lampm": b"LNOR", b"vkeystone": b"0"} if self._quirks.menus else {}
+        self._prompt = b""
+
+    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
+        """See ``Board``. Prompts go out with the next answer."""
+        answers = super().feed(data, busy=busy)
+        prompt, self._prompt = self._prompt, b""
+        return [*answers, prompt] if prompt else answers
+
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        if not command.strip():
+            self._prompt += b">" if self._quirks.prompt else b""
+            return []
+        prompt, self._prompt = self._prompt, b""
+        return [prompt + self._reply(command, busy)]
+
+    def _reply(self, line: bytes, busy: bool) -> bytes:
+        quirks, standby = self._quirks, not self._lamp.burning
+        answer = b"*Block item#" if busy else self._act(line.lower())
+        if quirks.starless_in_standby and standby and b"=" in answer:
+            answer = answer.removeprefix(b"*")
+        echo = (line + b"\r\n") * quirks.echoes or b"\r\n"
+        if quirks.glued_in_standby and standby:
+            echo = line
+        return echo + answer + b"\r\n"
+
+    def _act(self, line: bytes) -> bytes:
+        key, equals, value = line.removeprefix(b"*").removesuffix(b"#").partition(b"=")
+        if not (line.startswith(b"*") and line.endswith(b"#") and equals):
+            return b"*Illegal format#"
+        if key == b"pow" and value in (b"on", b"off"):
+            return self._switch(value == b"on")
+        standby = not self._lamp.burning
+        if value == b"?" and key in (b"pow", b"ltim"):
+            hours = b"*LTIM= %d" if self._quirks.bare_hours else b"*LTIM=%d#"
+            return hours % self._lamp.hours if key == b"ltim" else b"*POW=OFF#" if standby else b"*POW=ON#"
+        if key not in (items := (b"blank", b"modelname", *self._menu)) or standby:
+            return b"*Block item#" if key in items else b"*Unsupported item#"
+        return self._lit(key, value)
+
+    def _lit(self, key: bytes, value: bytes) -> bytes:
+        """What is answered only while the lamp burns."""
+        if key in self._menu:
+            self._menu[key] = self._menu[key] if value == b"?" else value.upper()
+            return b"*%s=%s#" % (key.upper(), self._menu[key])
+        if key == b"modelname":
+            return b"*MODELNAME=W1110#"
+        self._lamp.shutter_closed = value == b"on"
+        return b"*BLANK=%s#" % value.upper()
+
+    def _switch(self, on: bool) -> bytes:
+        if on and not self._lamp.strike():
+            return b"*Block item#"
+        if not on:
+            self._lamp.extinguish()
+        return b"*POW=ON#" if on else b"*POW=OFF#"
+
+
+class DigitalProjectionBoard(LineBoard):
+    """``*name = value``, ``*name ?`` or ``*name``; ``ack name = value`` or ``nack name``."""
+
+    start = b"*"
+    _STATES: Final = {LampPhase.STANDBY: b"0", LampPhase.WARMING: b"1", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
+
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        if not command.startswith(b"*"):
+            return []
+        name, _, value = command[1:].replace(b"?", b"=?").partition(b"=")
+        name, value = name.strip(), value.strip(b"= ")
+        done = None if busy else self._act(name, value)
+        if done is None:
+            return [b"nack " + name + b"\r"]
+        return [b"ack " + name + (b" = " + done if done else b"") + b"\r"]
+
+    def _act(self, name: bytes, value: bytes) -> bytes | None:
+        lamp = self._lamp
+        if value == b"?":
+            replies = {
+                b"status": b"4" if lamp.faulty else self._STATES[lamp.phase],
+                b"laser.hours": b"%d" % lamp.hours,
+                b"shutter": b"%d" % lamp.shutter_closed,
+            }
+            return replies.get(name)
+        if name == b"power.on":
+            return b"" if lamp.strike() else None
+        if name == b"power.off":
+            lamp.extinguish()
+            return b""
+        if name == b"shutter" and value in (b"0", b"1") and lamp.burning:
+            lamp.shutter_closed = value == b"1"
+            return value
+        return None
+
+
+class DigitalProjectionVBoard(LineBoard):
+    """``V``, two digits of the projector's number, S or G, four digits, CR; P or F back. Warming is reported as on."""
+
+    start = b"V"
+    _STATES: Final = {LampPhase.STANDBY: b"1", LampPhase.WARMING: b"2", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
+
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        if command[1:3] not in (b"00", b"99"):
+            return []
+        return [(b"F" if busy else self._act(command[3:])) + b"\r"]
+
+    def _act(self, command: bytes) -> bytes:
+        match command:
+            case b"S0001":
+                return b"P" if self._lamp.strike() else b"F"
+            case b"S0002":
+                self._lamp.extinguish()
+                return b"P"
+            case b"G0004":
+                return b"P%05d" % self._lamp.hours
+            case b"G0007":
+                return b"P" + self._STATES[self._lamp.phase]
+            case b"G0008":
+                return b"PMD05"
+        return b"F"
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,32 +193,29 @@ class EpsonQuirks:
     deaf_while_warming: bool = False
 
 
-class EpsonBoard:
+class EpsonBoard(LineBoard):
     """ESC/VP21. The prompt after PWR ON comes with the light, unasked; in an error state there is no prompt at all."""
 
     def __init__(self, lamp: EmulatedLamp, quirks: EpsonQuirks | None = None) -> None:
-        self._lamp = lamp
+        super().__init__(lamp)
         self._quirks = quirks or EpsonQuirks()
-        self._lines = LineBuffer(ord("\r"))
         self._owes_prompt = False
         self._menu = {b"SOURCE": b"30", b"VKEYSTONE": b"128", b"LUMINANCE": b"00"}
 
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        answers = [self._answer(line, busy) for line in self._lines.feed(data)]
-        return [answer for answer in answers if answer]
-
     def notices(self) -> list[bytes]:
+        """See ``Board``."""
         if self._owes_prompt and self._lamp.phase is LampPhase.LIT:
             self._owes_prompt = False
             return [b":"]
         return []
 
-    def _answer(self, line: bytes, busy: bool) -> bytes:
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
         if self._quirks.deaf_while_warming and self._lamp.phase is LampPhase.WARMING:
-            return b""
+            return []
         prompt = b"" if self._lamp.faulty else b":"
-        reply = b"ERR" if busy else self._act(line.strip(b"\n "))
-        return b"" if reply is None else (reply + b"\r" if reply else b"") + prompt
+        reply = b"ERR" if busy else self._act(command.strip(b"\n "))
+        answer = b"" if reply is None else (reply + b"\r" if reply else b"") + prompt
+        return [answer] if answer else []
 
     def _act(self, line: bytes) -> bytes | None:
         """The reply before the prompt: b"" nothing, None: the prompt comes later."""
@@ -82,185 +252,192 @@ class EpsonBoard:
 
 
 @dataclass(frozen=True, slots=True)
-class BenqQuirks:
-    """By model: the prompt, which answers an empty line; how many times a command comes back, an answer glued to its
-    echo in standby (W700), hours with spaces and without # (W1100), answers that lose their * in standby (W1110);
-    whether source, lamp mode and keystone can be read and set."""
+class OptomaQuirks:
+    """By model: ``ok`` is how it spells OK; ``p_first``: it acknowledges a question before it answers."""
 
-    prompt: bool = True
-    echoes: int = 1
-    glued_in_standby: bool = False
-    bare_hours: bool = False
-    starless_in_standby: bool = False
-    menus: bool = True
+    ok: bytes = b"OK"
+    p_first: bool = False
+    model_code: int = 2
 
 
-class BenqBoard:
-    """``<CR>*key=value#<CR>``."""
+class OptomaBoard(LineBoard):
+    """A later model: ``~XXnnn p``, two digits of the projector's ``number``, the command, a space, the parameter."""
 
-    def __init__(self, lamp: EmulatedLamp, quirks: BenqQuirks | None = None) -> None:
-        self._lamp = lamp
-        self._quirks = quirks or BenqQuirks()
-        self._lines = LineBuffer(ord("\r"), ord("*"))
-        self._menu = {b"sour": b"HDMI", b"lampm": b"LNOR", b"vkeystone": b"0"} if self._quirks.menus else {}
+    start = b"~"
+    _INFO: Final = {LampPhase.STANDBY: 0, LampPhase.WARMING: 1, LampPhase.COOLING: 2}
+    _LAMP_FAIL, _OVER_TEMPERATURE = 4, 7
 
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        answers, prompt = [], b""
-        for line in self._lines.feed(data):
-            if line.strip():
-                answers.append(prompt + self._reply(line, busy))
-                prompt = b""
-            elif self._quirks.prompt:
-                prompt += b">"
-        return [*answers, prompt] if prompt else answers
+    def __init__(self, lamp: EmulatedLamp, *, number: int = 1, quirks: OptomaQuirks | None = None) -> None:
+        super().__init__(lamp)
+        self._number = number
+        self._quirks = quirks or OptomaQuirks()
+        self._reported_phase = lamp.phase
+        self._reported_trouble: set[int] = set()
 
     def notices(self) -> list[bytes]:
-        return []
+        """INFO lines due since the last call: changes of the lamp's phase, and trouble."""
+        due = []
+        phase = self._lamp.phase
+        if phase is not self._reported_phase:
+            self._reported_phase = phase
+            if phase in self._INFO:
+                due.append(self._INFO[phase])
+        trouble = {self._OVER_TEMPERATURE} if self._lamp.too_hot else set()
+        if self._lamp.failed and (self._lamp.strikes or self._reported_trouble):
+            trouble.add(self._LAMP_FAIL)
+        due += sorted(trouble - self._reported_trouble)
+        self._reported_trouble = trouble
+        return [b"INFO%d\r" % code for code in due]
 
-    def _reply(self, line: bytes, busy: bool) -> bytes:
-        quirks, standby = self._quirks, not self._lamp.burning
-        answer = b"*Block item#" if busy else self._act(line.lower())
-        if quirks.starless_in_standby and standby and b"=" in answer:
-            answer = answer.removeprefix(b"*")
-        echo = (line + b"\r\n") * quirks.echoes or b"\r\n"
-        if quirks.glued_in_standby and standby:
-            echo = line
-        return echo + answer + b"\r\n"
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        if len(command) < 6 or command[:1] != b"~" or not command[1:3].isdigit():
+            return [b"F\r"] if command else []
+        if int(command[1:3]) not in (0, self._number):
+            return []  # another projector on the same cable is meant
+        code, space, parameter = command[3:].partition(b" ")
+        if not code.isdigit() or not space or busy:
+            return [b"F\r"]
+        return [self._act(int(code), parameter)]
 
-    def _act(self, line: bytes) -> bytes:
-        key, equals, value = line.removeprefix(b"*").removesuffix(b"#").partition(b"=")
-        if not (line.startswith(b"*") and line.endswith(b"#") and equals):
-            return b"*Illegal format#"
-        if key == b"pow" and value in (b"on", b"off"):
-            return self._switch(value == b"on")
-        standby = not self._lamp.burning
-        if value == b"?" and key in (b"pow", b"ltim"):
-            hours = b"*LTIM= %d" if self._quirks.bare_hours else b"*LTIM=%d#"
-            return hours % self._lamp.hours if key == b"ltim" else b"*POW=OFF#" if standby else b"*POW=ON#"
-        if key not in (known := (b"blank", b"modelname", *self._menu)) or standby:
-            return b"*Block item#" if key in known else b"*Unsupported item#"
-        return self._lit(key, value)
+    def _act(self, command: int, parameter: bytes) -> bytes:
+        if command == 0:
+            return self._switch(parameter)
+        if command == 2:
+            return self._mute(parameter)
+        status = self._read(command) if parameter == b"1" else None
+        if status is None:
+            return b"F\r"
+        return (b"P\r" if self._quirks.p_first else b"") + self._quirks.ok + status + b"\r"
 
-    def _lit(self, key: bytes, value: bytes) -> bytes:
-        """What is answered only while the lamp burns."""
-        if key in self._menu:
-            self._menu[key] = self._menu[key] if value == b"?" else value.upper()
-            return b"*%s=%s#" % (key.upper(), self._menu[key])
-        if key == b"modelname":
-            return b"*MODELNAME=W1110#"
-        self._lamp.shutter_closed = value == b"on"
-        return b"*BLANK=%s#" % value.upper()
-
-    def _switch(self, on: bool) -> bytes:
-        if on and not self._lamp.strike():
-            return b"*Block item#"
-        if not on:
+    def _switch(self, parameter: bytes) -> bytes:
+        if parameter == b"1":
+            return b"P\r" if self._strike() else b"F\r"
+        if parameter in (b"0", b"2"):
             self._lamp.extinguish()
-        return b"*POW=ON#" if on else b"*POW=OFF#"
+            return b"P\r"
+        return b"F\r"
+
+    def _strike(self) -> bool:
+        struck = self._lamp.strike()
+        if struck and self._lamp.failed:
+            self._reported_trouble.discard(self._LAMP_FAIL)  # every strike of a dead lamp is reported again
+        return struck
+
+    def _mute(self, parameter: bytes) -> bytes:
+        if parameter not in (b"0", b"1", b"2") or not self._lamp.burning:
+            return b"F\r"
+        self._lamp.shutter_closed = parameter == b"1"
+        return b"P\r"
+
+    def _read(self, command: int) -> bytes | None:
+        burning = self._lamp.burning
+        states = {
+            108: b"%04d" % self._lamp.hours,
+            121: b"7" if burning else b"0",
+            122: b"C07",
+            124: b"1" if burning else b"0",
+            151: b"%d" % self._quirks.model_code,
+        }
+        return states.get(command)
 
 
-class ChristieBoard:
-    """Messages in parentheses; a command is acknowledged only if # asks for it. Status lines come unasked.
+class SanyoBoard(LineBoard):
+    """The basic serial commands of the PLC series: three characters and CR; ACK or ``?`` back.
 
-    ``lamps`` False: a model with lasers, which has no lamp hours and tells none.
+    ``lamps``: a model with several tells the hours of each. ``deaf``: it answers 02 to everybody who asks.
     """
 
-    _FYI: Final = b'(65535 00000 FYI00000 "(SST+LAMP?001) Lamp Hours = %d:00 (h:m)")'
-    _ERROR: Final = b'(65535 00000 ERR00000 "System Error: (SST+LAMP?002) Lamp = Failed to strike")'
-    _WORDS: Final = {
-        LampPhase.STANDBY: b'000 "Standby"',
-        LampPhase.LIT: b'001 "On"',
-        LampPhase.COOLING: b'010 "Cooling Down"',
-        LampPhase.WARMING: b'011 "Warming Up"',
+    _ACK: Final = b"\x06\r"
+    _NO: Final = b"?\r"
+
+    def __init__(self, lamp: EmulatedLamp, *, lamps: int = 1, deaf: bool = False) -> None:
+        super().__init__(lamp)
+        self._lamps = lamps
+        self.deaf = deaf
+
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        # Only the last three characters count: noise before them is passed over.
+        return [self._NO if busy else self._act(command[-3:])]
+
+    def _act(self, command: bytes) -> bytes:
+        lamp = self._lamp
+        match command:
+            case b"CR0":
+                return self._state() + b"\r"
+            case b"CR3":
+                return b" ".join([b"%05d" % lamp.hours] * self._lamps) + b"\r"
+            case b"C00":
+                return self._ACK if lamp.strike() else self._NO
+            case b"C01":
+                lamp.extinguish()
+                return self._ACK
+            case b"C0D" | b"C0E" if lamp.phase is LampPhase.LIT:
+                lamp.shutter_closed = command == b"C0D"
+                return self._ACK
+        return self._NO
+
+    def _state(self) -> bytes:
+        if self.deaf:
+            return b"02"
+        phase = self._lamp.phase
+        dark = phase in (LampPhase.STANDBY, LampPhase.COOLING)
+        if dark and self._lamp.too_hot:
+            return b"28" if phase is LampPhase.COOLING else b"88"
+        if dark and self._lamp.failed and self._lamp.strikes:
+            return b"21" if phase is LampPhase.COOLING else b"81"
+        codes = {LampPhase.STANDBY: b"80", LampPhase.WARMING: b"40", LampPhase.LIT: b"00", LampPhase.COOLING: b"20"}
+        return codes[phase]
+
+
+class AdcpBoard(LineBoard):
+    """Sony: lines that end in CR LF; values in quotes, answers to questions as JSON."""
+
+    end = b"\n"
+    _PHASES: Final = {
+        LampPhase.STANDBY: b"standby",
+        LampPhase.WARMING: b"startup",
+        LampPhase.LIT: b"on",
+        LampPhase.COOLING: b"cooling1",
     }
 
-    def __init__(self, lamp: EmulatedLamp, *, lamps: bool = True) -> None:
-        self._lamp = lamp
-        self._lamps = lamps
-        self._lines = LineBuffer(ord(")"), ord("("))
-        self._phase = lamp.phase
-        self._reported_faulty = False
-
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line for line in self._lines.feed(data) if line.startswith(b"(")]
-        return [answer for answer in (self._reply(line[1:], busy) for line in lines) if answer]
-
-    def notices(self) -> list[bytes]:
-        due = []
-        if self._lamp.phase is not self._phase:
-            self._phase = self._lamp.phase
-            due += [self._FYI % self._lamp.hours] if self._lamps else []
-        faulty = self._lamp.faulty
-        if faulty and not self._reported_faulty:
-            due.append(self._ERROR)
-        self._reported_faulty = faulty
-        return due
-
-    def _reply(self, message: bytes, busy: bool) -> bytes:
-        wants_echo, bare = message.startswith(b"#"), message.lstrip(b"#$")
-        if busy:
-            return self._error(b"00007", bare[:3], b"Could not be executed")
-        if bare.endswith(b"?"):
-            return self._answer(bare[:-1])
-        name, _, parameter = bare.partition(b" ")
-        if name not in (b"PWR", b"SHU"):
-            return self._error(b"00009", name, b"Unknown request")
-        if parameter not in (b"0", b"1"):
-            return self._error(b"00005", name, b"Too Few Parameters")
-        if not self._act(name, parameter == b"1"):
-            return self._error(b"00007", name, b"Could not be executed")
-        return b"(" + message + b")" if wants_echo else b""
-
-    def _act(self, name: bytes, one: bool) -> bool:
-        if name == b"SHU":
-            self._lamp.shutter_closed = one
-            return True
-        if one:
-            self._reported_faulty = False
-            return self._lamp.strike()
-        self._lamp.extinguish()
-        return True
-
-    def _answer(self, name: bytes) -> bytes:
-        values = {
-            b"PWR": self._WORDS[self._lamp.phase],
-            b"SHU": b"%d" % self._lamp.shutter_closed,
-            b"LPH": b"%04d" % self._lamp.hours,
-        }
-        if name not in values or (name == b"LPH" and not self._lamps):
-            return self._error(b"00009", name, b"Unknown request")
-        return b"(" + name + b"!" + values[name] + b")"
-
-    def _error(self, code: bytes, name: bytes, text: bytes) -> bytes:
-        return b'(65535 00000 ERR%s "%s: %s")' % (code, name, text)
-
-
-class PanasonicBoard:
-    """STX command ETX, for one projector with one lamp."""
-
     def __init__(self, lamp: EmulatedLamp) -> None:
-        self._lamp = lamp
-        self._lines = LineBuffer(0x03, 0x02)
+        super().__init__(lamp)
+        self._menu = {b"input": b'"hdmi1"', b"light_output_mode": b'"high"'}
 
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        lines = [line for line in self._lines.feed(data) if line.startswith(b"\x02")]
-        return [b"\x02" + (b"ER401" if busy else self._act(line[1:])) + b"\x03" for line in lines]
-
-    def notices(self) -> list[bytes]:
-        return []
+    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
+        line = command.strip()
+        return [(b"err_inactive" if busy else self._act(line)) + b"\r\n"] if line else []
 
     def _act(self, line: bytes) -> bytes:
-        codes = {LampPhase.STANDBY: b"0", LampPhase.WARMING: b"1", LampPhase.LIT: b"2", LampPhase.COOLING: b"3"}
-        reply = {b"Q$S": codes[self._lamp.phase], b"Q$L": b"%04d" % self._lamp.hours}
-        if line in reply:
-            return reply[line]
-        done = False
-        if line == b"PON":
-            done = self._lamp.strike()
-        elif line == b"POF":
-            self._lamp.extinguish()
-            done = True
-        elif line in (b"OSH:0", b"OSH:1") and self._lamp.burning:
-            self._lamp.shutter_closed = line == b"OSH:1"
-            done = True
-        return line if done else b"ER402" if line.startswith(b"OSH:") else b"ER401"
+        lamp = self._lamp
+        replies = {
+            b"power_status ?": b'"%s"' % self._PHASES[lamp.phase],
+            b"timer ?": b'[{"operation":%d},{"light_src":%d},{"prev_light_src":7}]' % (lamp.hours + 9, lamp.hours),
+            b"modelname ?": b'"VPL-FHZ75"',
+        }
+        if line in replies:
+            return replies[line]
+        key, _, value = line.partition(b" ")
+        if key == b"blank" or key in self._menu:
+            return self._chosen(key, value)
+        if line == b'power "on"':
+            return b"ok" if lamp.strike() else b"err_inactive"
+        if line == b'power "off"':
+            lamp.extinguish()
+            return b"ok"
+        return b"err_val" if key == b"power" else b"err_cmd"
+
+    def _chosen(self, key: bytes, value: bytes) -> bytes:
+        """What a menu tells, or how it is set; ``blank`` also tells while it is dark."""
+        lamp, burning = self._lamp, self._lamp.burning
+        if value == b"?" and (burning or key == b"blank"):
+            return (self._menu | {b"blank": b'"on"' if lamp.shutter_closed else b'"off"'})[key]
+        if key == b"blank" and value not in (b'"on"', b'"off"'):
+            return b"err_val"
+        if not burning:
+            return b"err_inactive"
+        if key == b"blank":
+            lamp.shutter_closed = value == b'"on"'
+        else:
+            self._menu[key] = value
+        return b"ok"

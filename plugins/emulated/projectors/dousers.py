@@ -9,17 +9,16 @@ import contextlib
 import os
 import socket
 import struct
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final
 
 from hal.errors import DeviceError
-from plugins.emulated.optics.truth import FILE_NAME, DouserTruth
+from plugins.emulated.core.servers import HOST, BackgroundDevice
+from plugins.emulated.core.truth import FILE_NAME, DouserTruth
 from plugins.emulated.projectors.lamp import EmulatedLamp
 
-HOST: Final = "127.0.0.1"
 LOST_S: Final = 2.5
 _TICK_S: Final = 0.1
 _HALF: Final = 128
@@ -83,14 +82,14 @@ class EmulatedDouser:
             self._course = (self.passing(), float(is_open), self._clock())
 
 
-class EmulatedNode:
+class EmulatedNode(BackgroundDevice):
     """A DMX node at one UDP port; a context. The source with the highest priority counts, the newest of several."""
 
     def __init__(self, port: int, dousers: Sequence[tuple[DouserTruth, EmulatedDouser]], tell: Tell) -> None:
+        super().__init__()
         self._dousers = dousers
         self._tell = tell
         self._sources: dict[tuple[int, bytes], tuple[float, Levels]] = {}
-        self._closed = threading.Event()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((HOST, port))
@@ -103,22 +102,14 @@ class EmulatedNode:
             ) from error
         self._socket.settimeout(_TICK_S)
         self.address = f"{HOST}:{self._socket.getsockname()[1]}"
-        self._thread = threading.Thread(target=self._run, name="dmx", daemon=True)
-        self._thread.start()
 
-    def close(self) -> None:
-        self._closed.set()
-        self._thread.join()
+    def stop(self) -> None:
+        """End, and close its port."""
+        super().stop()
         self._socket.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _run(self) -> None:
-        while not self._closed.is_set():
+        while not self._stopped.is_set():
             with contextlib.suppress(OSError):
                 if (levels := read_levels(self._socket.recv(2048))) is not None:
                     self._take(levels)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import os
 import select
 import termios
@@ -12,70 +11,47 @@ import time
 import tty
 from collections import deque
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from hal.errors import DeviceError
 from hal.serial_link import PtyLink
-from plugins.emulated.faults import Faults
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
-from plugins.emulated.projectors.optoma import OptomaBoard, OptomaQuirks
-from plugins.emulated.scenario import ScenarioPlayer
-from plugins.emulated.switched import Switched
+from plugins.emulated.projectors.board import Board
+from plugins.emulated.projectors.boards_text import OptomaBoard
+from plugins.emulated.projectors.lamp import EmulatedLamp
+from plugins.emulated.projectors.projector import BoardProjector
 
 _TICK_S: Final = 0.02
 
 
-class Board(Protocol):
-    """The control board of a projector: bytes in, bytes out. ``boards_*`` beside this file hold the families."""
-
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        """The answers to the commands that ``data`` completes, one an element; ``busy``: each is refused."""
-
-    def notices(self) -> list[bytes]:
-        """Lines that are due now, unasked."""
-
-
-class EmulatedSerialProjector(Switched):
+class EmulatedSerialProjector(BoardProjector):
     """A projector on a pty, reached by the symlink ``port`` as a real one is by ``/dev/serial/by-id/...``.
 
     Parameters
     ----------
     port : where the symlink to the tty is made
     lamp : its lamp; the optical bench reads the same one
+    board : what it does with the bytes; an Optoma of a later model, unless given
     baud : the rate it listens at; at any other the line carries noise both ways
-    number : its own number on the line (it answers to 00 as well)
-    board : what it does with the bytes; an Optoma of a later model, with ``number`` and ``quirks``, unless given
     wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until its mains were cut
     boot_s : from mains on until its control board answers
 
     ``faults`` are its knobs, ``scenario`` a script that turns them. ``start`` and ``stop`` it, or use it in a ``with``
-    statement.
+    statement. Its serial adapter has its power from the computer, and stays when the mains are cut.
     """
 
     def __init__(
         self,
         port: Path,
         lamp: EmulatedLamp,
+        board: Board | None = None,
         *,
         baud: int = 9600,
-        number: int = 1,
-        quirks: OptomaQuirks | None = None,
-        board: Board | None = None,
         wedges_below_s: float = 0.0,
         boot_s: float = 0.0,
     ) -> None:
+        super().__init__(lamp, board or OptomaBoard(lamp), wedges_below_s=wedges_below_s, boot_s=boot_s)
         self.port = port
-        self.lamp = lamp
-        self.faults = Faults()
-        self.scenario: ScenarioPlayer | None = None
-        self._wedges_below_s = wedges_below_s
-        self._wedged = threading.Event()
-        self._heard_at_s = 0.0
         self._speed = getattr(termios, f"B{baud}")
-        self._boot_s = boot_s
-        self._awake_at_s: float | None = time.monotonic()
-        self._board = board or OptomaBoard(lamp, number=number, quirks=quirks)
-        self._new_board = self._copied(self._board)
         self._lock = threading.Lock()
         self._master: int | None = None
         self._slave: int | None = None
@@ -112,41 +88,8 @@ class EmulatedSerialProjector(Switched):
         with self._lock:
             return self._path
 
-    @property
-    def wedged(self) -> bool:
-        """Whether its control board hangs."""
-        return self._wedged.is_set()
-
-    @property
-    def awake(self) -> bool:
-        """Whether it has mains, and has booted."""
-        awake_at_s = self._awake_at_s
-        return awake_at_s is not None and time.monotonic() >= awake_at_s
-
-    def cut_mains(self) -> None:
-        """The projector is dead; its serial adapter has its power from the computer and stays. See ``lamp.damages``."""
-        self._awake_at_s = None
-        self.lamp.cut_mains()
-
-    def restore_mains(self) -> None:
-        """It boots for ``boot_s`` into standby, and has forgotten whatever it had heard."""
-        if self._awake_at_s is None:
-            self._wedged.clear()
-            self._board = self._copied(self._new_board)
-            self.lamp.restore_mains()
-            self._awake_at_s = time.monotonic() + self._boot_s
-
-    def power_cycle(self) -> None:
-        """Pull the mains plug and put it back: a hanging control board restarts."""
-        self.cut_mains()
-        self.restore_mains()
-
-    def _copied(self, board: Board) -> Board:
-        """Another board of this kind, on the same lamp."""
-        return copy.deepcopy(board, {id(self.lamp): self.lamp})
-
     def unplug(self) -> None:
-        """Pull the adapter: the tty hangs up and its name disappears. The projector itself goes on."""
+        """Pull the adapter: the tty hangs up and its name disappears. The projector itself stays as it is."""
         with self._lock:
             if self._master is None:
                 return
@@ -220,19 +163,11 @@ class EmulatedSerialProjector(Switched):
     def _hear(self, data: bytes) -> None:
         if self.scenario is not None:
             self.scenario.heard(len(data))
-        self._wedge()
+        self._hang_if_too_soon()
         for answer in self._board.feed(data, busy=self.faults.now.busy):
             if not self.faults.loses_this_one() and not self.wedged:
                 carried, wait_s = self.faults.bent(answer)
                 self._due.append((time.monotonic() + wait_s, carried))
-
-    def _wedge(self) -> None:
-        """Hang if spoken to too soon while the board is occupied with the lamp."""
-        now_s, before_s = time.monotonic(), self._heard_at_s
-        self._heard_at_s = now_s
-        occupied = self.lamp.phase in (LampPhase.WARMING, LampPhase.COOLING)
-        if occupied and now_s - before_s < self._wedges_below_s:
-            self._wedged.set()
 
     def _say(self, master: int, data: bytes) -> None:
         with self._lock:

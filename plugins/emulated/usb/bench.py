@@ -16,10 +16,10 @@ from typing import Annotated, Any, Final, Self
 from hal.errors import DeviceError
 from hal.runtime.caches import SHORTEST, temporary
 from hal.runtime.files import read_text
-from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA
-from plugins.emulated.optics.truth import FOLDER
-from plugins.emulated.tables import Between, load
+from plugins.emulated.core.tables import Between, load
+from plugins.emulated.core.truth import FOLDER
 from plugins.emulated.usb.bus import PRELOAD, environment
+from plugins.emulated.usb.camera import STAGE_CAMERA
 from plugins.emulated.usb.process import KINDS, UsbBusProcess
 
 FILE: Final = f"{FOLDER}/usb.toml"

@@ -17,15 +17,92 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
-from plugins.emulated.cameras.usb_camera import numbered_camera
-from plugins.emulated.cameras.usb_stage_camera import STAGE_CAMERA, stage_camera
-from plugins.emulated.scenario import parse_scenario
+from plugins.emulated.core.faults import ACTIONS, LAMP_ACTIONS, Scenario, ScenarioPlayer, parse_scenario
 from plugins.emulated.usb.bus import UsbBus
+from plugins.emulated.usb.camera import STAGE_CAMERA, numbered_camera, stage_camera
 from plugins.emulated.usb.device import EmulatedUsbDevice
-from plugins.emulated.usb.key_panel import EmulatedKeyPanel
-from plugins.emulated.usb.light_sensor import EmulatedLightSensor
-from plugins.emulated.usb.relay import EmulatedRelayBoard
-from plugins.emulated.usb.scenario import UsbScenario
+from plugins.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
+
+USB_ACTIONS: Final = tuple(deed for deed in ACTIONS if deed not in LAMP_ACTIONS)
+"""Those of ``faults.ACTIONS`` that can happen to a USB device."""
+_FOR_GOOD: Final = 1_000_000_000
+_TICK_S: Final = 0.02
+_COUNTS: Final = {"busy": "stalls", "garbage": "garble", "cut": "cut", "drop": "drop", "garble": "garble"}
+"""Knobs of a wire, and the counts of ``UsbFaults`` that do the same."""
+
+
+class UsbScenario:
+    """Plays the events of ``device`` (its name in the script is ``name``) until ``close``.
+
+    A busy device stalls what it is asked; "on_byte" and "on_message" count control requests with their eight bytes of
+    set-up; a lamp it has not.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        device: EmulatedUsbDevice,
+        *,
+        name: str,
+        plug: Callable[[], None],
+        unplug: Callable[[], None],
+    ) -> None:
+        self._device = device
+        self._plug, self._unplug = plug, unplug
+        self._player = ScenarioPlayer(scenario, device=name, faults=self, plug=self)
+        self._lock = threading.Lock()
+        self._due: list[Callable[[], None]] = []
+        self._stopped = threading.Event()
+        device.on_control = self._heard
+        self._thread = threading.Thread(target=self._run, name=f"scenario of {name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def happened(self) -> list[tuple[float, str]]:
+        """What happened, as (seconds since the start, deed)."""
+        return self._player.happened
+
+    def set(self, **knobs: Any) -> None:
+        """Turn knobs by the names of ``faults.WireFaults``."""
+        faults = self._device.faults
+        for knob, value in knobs.items():
+            if knob in _COUNTS:
+                setattr(faults, _COUNTS[knob], _FOR_GOOD if value is True else int(value))
+            elif knob == "late_s":
+                # One late answer is, to who asks by control requests, one that never comes.
+                faults.drop = 1
+            else:
+                setattr(faults, knob, value)
+        if not faults.silent:
+            self._later(self._device.on_ready)
+
+    def unplug(self) -> None:
+        self._later(self._unplug)
+
+    def replug(self) -> None:
+        self._later(self._plug)
+
+    def close(self) -> None:
+        self._device.on_control = lambda count: None
+        self._stopped.set()
+        self._thread.join()
+
+    def _later(self, deed: Callable[[], None]) -> None:
+        # Not here: a program's call may be running, under the device's lock.
+        self._due.append(deed)
+
+    def _heard(self, count: int) -> None:
+        with self._lock:
+            self._player.heard(count)
+
+    def _run(self) -> None:
+        while not self._stopped.wait(_TICK_S):
+            with self._lock:
+                self._player.tick()
+                due, self._due = self._due, []
+            for deed in due:
+                deed()
+
 
 KINDS: Final[Mapping[str, Callable[..., EmulatedUsbDevice]]] = {
     "relay": EmulatedRelayBoard,
@@ -58,7 +135,7 @@ class UsbBusProcess:
         self._request({"do": "add", "name": name, "kind": kind, "settings": settings})
 
     def play(self, name: str, scenario: str) -> None:
-        """Play the events of a TOML scenario (see ``plugins.emulated.scenario``) on a device."""
+        """Play the events of a TOML scenario (see ``plugins.emulated.core.faults``) on a device."""
         self._request({"do": "play", "name": name, "scenario": scenario})
 
     def rest(self, name: str) -> None:

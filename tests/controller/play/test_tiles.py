@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from controller.play.display.mixing import mix_sets, mixture_of
 from controller.play.display.outputs import MemoryOutput
 from controller.play.frames import FrameSet, OutputSize, Tiles, differing
-from plugins.emulated.outputs import FrameReader
+from plugins.emulated.optics.outputs import FrameReader
 
 SIZES = (OutputSize("P1", 23, 17), OutputSize("P2", 9, 30))
 GRIDS = ((5, 4), (9, 7))

@@ -28,7 +28,7 @@ from hal.notices import Notice
 from hal.registry import OpenContext, load_drivers, open_device
 from hal.values import Power
 from plugins.dousers.sacn_douser import DRIVER, SacnDouser, open_sacn_douser
-from plugins.emulated.optics.truth import DouserTruth
+from plugins.emulated.core.truth import DouserTruth
 from plugins.emulated.projectors.dousers import EmulatedDouser, EmulatedNode, dmx_nodes, read_levels
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from tests.ports import kept_port

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
+from plugins.emulated.core.truth import BenchTruth, Lens, ObjectTruth
 from plugins.emulated.optics.objects import StageObject, default_object
 from plugins.emulated.optics.staging import random_truth
-from plugins.emulated.optics.truth import BenchTruth, Lens, ObjectTruth
 
 CAMERA_PX, PROJECTOR_PX = (96, 64), (70, 52)
 

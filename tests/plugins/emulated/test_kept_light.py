@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plugins.emulated import kept_light
-from plugins.emulated.kept_light import UNFINISHED_S, kept_folder, read_kept, write_kept
+from plugins.emulated.optics import light_cache as kept_light
+from plugins.emulated.optics.light_cache import UNFINISHED_S, kept_folder, read_kept, write_kept
 
 
 def test_arrays_come_back_for_their_key_alone(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from plugins.emulated.outputs import FrameReader, VisibleFrames
+from plugins.emulated.optics.outputs import FrameReader, VisibleFrames
 
 WIDTH, HEIGHT = 40, 30
 

@@ -11,10 +11,9 @@ import serial
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
-from plugins.emulated.faults import Faults
+from plugins.emulated.core.faults import Faults, ScenarioPlayer, parse_scenario, read_scenario
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
-from plugins.emulated.scenario import ScenarioPlayer, parse_scenario, read_scenario
 from tests.plugins.emulated.conftest import Clock
 
 

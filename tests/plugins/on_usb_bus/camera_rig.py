@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
-from plugins.emulated.cameras.shot import ShotSettings
-from plugins.emulated.cameras.usb_camera import numbered_files
+from plugins.emulated.core.shot import ShotSettings
+from plugins.emulated.usb.camera import numbered_files
 from plugins.emulated.usb.process import UsbBusProcess
 from plugins.ptp.still import PtpCamera
 from plugins.ptp.usb.bus import UsbAddress, UsbFinder

@@ -16,11 +16,11 @@ from controller.stage.rig.power import light, power_down
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.registry import OpenContext
-from plugins.emulated.optics.truth import MainsTruth
+from plugins.emulated.core.truth import MainsTruth
+from plugins.emulated.projectors.boards import quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.mains import Mains
-from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
+from plugins.emulated.usb.mains import Mains
 from plugins.emulated.usb.process import UsbBusProcess
 from plugins.hid.relay import RelayBoard
 from plugins.projectors.serial import open_serial_projector
@@ -54,11 +54,12 @@ class Hall:
             lambda relay, count: [(channel, closed) for channel, closed in bus.call(relay, "moves_since", count)],
             lambda *told: self.told.append(told),
         )
+        self.mains.start()
         self.board = RelayBoard(serial="MAINS", deadline=in_seconds(SOON_S))
 
     def end(self) -> None:
         self.board.close()
-        self.mains.close()
+        self.mains.stop()
         for wire in self.wires.values():
             wire.stop()
 

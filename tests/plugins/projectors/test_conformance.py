@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from hal.conformance import ProjectorConformance
 from hal.interfaces import Projector
 from plugins.emulated.projectors.boards import BOARDS, baud_of, login_of
-from plugins.emulated.projectors.optoma import OptomaQuirks
+from plugins.emulated.projectors.boards_text import OptomaBoard, OptomaQuirks
 
 
 class TestSerialProjector(ProjectorConformance):
@@ -26,7 +27,7 @@ class TestSerialProjectorThatAcknowledgesQuestionsFirst(ProjectorConformance):
 
     @pytest.fixture
     def projector(self, open_serial: Any) -> Projector:
-        driver: Projector = open_serial(quirks=OptomaQuirks(ok=b"Ok", p_first=True)).driver
+        driver: Projector = open_serial(board=partial(OptomaBoard, quirks=OptomaQuirks(ok=b"Ok", p_first=True))).driver
         return driver
 
 

@@ -15,7 +15,7 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout
 from hal.values import Power
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink_udp import EmulatedPjLinkUdp
+from plugins.emulated.projectors.pjlink import EmulatedPjLinkUdp, PjLinkOddities
 from plugins.finding.network import FoundProjector, PjLinkListener
 
 MAC = "02:00:00:00:00:0a"
@@ -90,7 +90,7 @@ def test_a_port_that_is_taken_is_named_and_a_closed_listener_is_gone(listener: P
 
 
 def test_a_projector_that_tells_of_itself_before_it_answers_is_understood(open_pjlink: Any) -> None:
-    pair = open_pjlink(chatty=True)
+    pair = open_pjlink(odd=PjLinkOddities(chatty=True))
     assert pair.driver.status(deadline=in_seconds(20)).power is Power.OFF
     pair.driver.switch_on(deadline=in_seconds(20))
     assert pair.emulator.lamp.strikes == 1

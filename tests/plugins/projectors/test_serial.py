@@ -7,6 +7,7 @@ import os
 import re
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ from hal.registry import OpenContext
 from hal.serial_link import SerialLink
 from hal.transcript import ReplayLink, parse_transcript
 from hal.values import Power
+from plugins.emulated.projectors.boards import quick_profile
+from plugins.emulated.projectors.boards_text import OptomaBoard, OptomaQuirks
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.optoma import OptomaQuirks
-from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 from plugins.projectors.serial import SerialProjector, open_serial_projector
 from tests.plugins.conftest import hasty, wait_for_power
@@ -45,7 +46,7 @@ def test_a_lost_answer_is_asked_again_and_never_mistaken_for_the_next(open_seria
 
 def test_a_late_answer_is_not_taken_for_the_answer_to_the_next_question(open_serial: Any) -> None:
     # The model's answer, OK1, would read as the firmware, or as the power state "on".
-    pair = open_serial(quirks=OptomaQuirks(model_code=1), edit=hasty)
+    pair = open_serial(board=partial(OptomaBoard, quirks=OptomaQuirks(model_code=1)), edit=hasty)
     pair.emulator.faults.set(slow_s=0.6)  # later than the driver waits for an answer (0.4 s)
     who = pair.driver.identity(deadline=in_seconds(SOON))
     assert (who.model[-1], who.firmware) == ("1", "C07")
@@ -234,7 +235,7 @@ def test_the_shutter_blocks_the_light(open_serial: Any) -> None:
 
 
 def test_another_projectors_number_gets_no_answer(open_serial: Any) -> None:
-    pair = open_serial(number=3, settings={"address": "04"}, edit=hasty)
+    pair = open_serial(board=partial(OptomaBoard, number=3), settings={"address": "04"}, edit=hasty)
     with pytest.raises(DeviceTimeout):
         pair.driver.status(deadline=in_seconds(SOON))
 

@@ -15,8 +15,7 @@ from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, Pr
 from hal.values import Power
 from plugins.emulated.projectors.boards import baud_of
 from plugins.emulated.projectors.boards_binary import NecBoard
-from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks
-from plugins.emulated.projectors.families.sanyo import SanyoBoard
+from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import shipped_profiles
 from tests.plugins.conftest import each, hasty, wait_for_power

@@ -14,7 +14,7 @@ import pytest
 from hal.deadline import in_seconds
 from hal.values import ExposureSettings
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera

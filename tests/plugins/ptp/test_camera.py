@@ -18,7 +18,7 @@ from hal.errors import (
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.cameras.shot import ShotFiles, ShotSettings
+from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.ptp.camera import DRIVER, open_camera
 from plugins.ptp.ip import PtpIpAddress
 from plugins.ptp.still import PtpCamera

@@ -1,1 +1,1 @@
-"""Light that object, table and walls throw on each other: patches, and radiosity between them. Entry: `transfer`."""
+"""Light that object, table and walls throw on each other: patches, and radiosity between them. Entry: `transfers`."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
-from plugins.emulated.optics.furnished import Scene
+from plugins.emulated.optics.objects import Scene
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

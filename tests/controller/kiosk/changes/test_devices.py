@@ -29,7 +29,7 @@ from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink_board import PjLinkOddities
+from plugins.emulated.projectors.pjlink import PjLinkOddities
 from plugins.ptp.camera import open_camera
 from tests.controller.kiosk.install.test_outputs import LEFT, OFF, RIGHT
 from tests.controller.kiosk.vase import vase

@@ -11,7 +11,7 @@ from controller.stage.sessions.check import check_stage
 from hal.errors import DeviceGone
 from hal.registry import Drivers
 from plugins.dousers.sacn_douser import DRIVER
-from plugins.emulated.optics.truth import DouserTruth
+from plugins.emulated.core.truth import DouserTruth
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.controller.stage.sessions.run_models import STAGE, Models

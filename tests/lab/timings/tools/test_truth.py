@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from lab.timings.tools.truth import Truth
+from plugins.emulated.core.truth import Lens, ObjectTruth, write_truth
 from plugins.emulated.optics.objects import default_object
 from plugins.emulated.optics.staging import random_truth
-from plugins.emulated.optics.truth import Lens, ObjectTruth, write_truth
 
 CAMERA_PX, PROJECTOR_PX = (96, 64), (70, 52)
 

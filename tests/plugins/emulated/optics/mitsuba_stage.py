@@ -13,11 +13,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from plugins.emulated.core.truth import BenchTruth, Focus, Lens, LightTruth, ObjectTruth, Pose, ProjectorTruth
 from plugins.emulated.optics.objects import StageObject, corner_normals
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
 from plugins.emulated.optics.staging import random_truth
-from plugins.emulated.optics.truth import BenchTruth, Focus, Lens, LightTruth, ObjectTruth, Pose, ProjectorTruth
 
 mi = pytest.importorskip("mitsuba")
 mi.set_variant("scalar_rgb")

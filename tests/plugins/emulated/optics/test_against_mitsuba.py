@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from plugins.emulated.core.truth import Focus
 from plugins.emulated.optics.rays import cast
-from plugins.emulated.optics.truth import Focus
 from tests.plugins.emulated.optics.mitsuba_stage import (
     diffuse,
     frame_of,

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from hal.errors import DeviceError
+from plugins.emulated.core.truth import BenchTruth, Lens, ObjectTruth, Pose
 from plugins.emulated.optics.bumps import FILE, Bump, Bumps, bumped, read_bumps, write_bumps
 from plugins.emulated.optics.objects import default_object
 from plugins.emulated.optics.rays import project
 from plugins.emulated.optics.staging import random_truth
-from plugins.emulated.optics.truth import BenchTruth, Lens, ObjectTruth, Pose
 
 
 @cache

@@ -15,11 +15,11 @@ import pytest
 import rawpy
 from scipy.ndimage import gaussian_filter
 
-from plugins.emulated.cameras.shot import ShotSettings
+from plugins.emulated.core.shot import ShotSettings
+from plugins.emulated.core.truth import BenchTruth, Panels, Pose, Sensor, write_truth
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer, emitted
-from plugins.emulated.optics.truth import BenchTruth, Panels, Pose, Sensor, write_truth
 from plugins.emulated.optics.world import World
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 

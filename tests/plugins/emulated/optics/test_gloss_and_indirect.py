@@ -14,11 +14,11 @@ import trimesh
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
+from plugins.emulated.core.truth import BenchTruth
 from plugins.emulated.optics.bumps import FILE, bumped, read_bumps
 from plugins.emulated.optics.objects import StageObject, load_object
 from plugins.emulated.optics.rays import cast, directions
 from plugins.emulated.optics.render import Renderer
-from plugins.emulated.optics.truth import BenchTruth
 
 Changes = list[Mapping[str, Any]]
 
@@ -90,7 +90,7 @@ def test_light_that_comes_back_adds_its_share_evenly_where_nothing_shines_too(
 def test_a_bench_is_disturbed_and_mended(tmp_path: Path) -> None:
     bench = EmulatedBench()
     bench.prepare(tmp_path, size="small", object_file=None, seed=2)
-    from plugins.emulated.optics.truth import read_truth
+    from plugins.emulated.core.truth import read_truth
 
     truth = read_truth(tmp_path)
     changes: Changes = [

@@ -12,16 +12,14 @@ import trimesh
 
 from hal.errors import DeviceError
 from plugins.emulated.bench import EmulatedBench
-from plugins.emulated.optics.furnished import furnished
-from plugins.emulated.optics.indirect.kept import Indirect
-from plugins.emulated.optics.indirect.scattering import scattering_of
-from plugins.emulated.optics.indirect.transfer import Transfer, transfer_of
-from plugins.emulated.optics.objects import StageObject, corner_normals
+from plugins.emulated.core.tables import dump, load
+from plugins.emulated.core.truth import BenchTruth, SurfaceTruth, read_truth
+from plugins.emulated.optics.indirect.radiosity import Transfer, scattering_of, transfer_of
+from plugins.emulated.optics.indirect.transfers import Indirect
+from plugins.emulated.optics.layout import table_and_wall
+from plugins.emulated.optics.objects import StageObject, corner_normals, furnished
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
-from plugins.emulated.optics.rooms import table_and_wall
-from plugins.emulated.optics.truth import BenchTruth, SurfaceTruth, read_truth
-from plugins.emulated.tables import dump, load
 
 ALBEDO = np.array([0.8, 0.5, 0.2])
 RADIUS_M = 2.0
@@ -55,7 +53,7 @@ def test_an_integrating_sphere_has_even_light_by_its_formula(
     tiny_truth: BenchTruth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Many rays from few patches, so that chance counts for less than the tolerance.
-    monkeypatch.setattr("plugins.emulated.optics.indirect.scattering.RAYS", 4096)
+    monkeypatch.setattr("plugins.emulated.optics.indirect.radiosity.RAYS", 4096)
     truth, thing = dataclasses.replace(ideal(tiny_truth), patches=200), sphere()
     samples = cast(truth, thing, lambda share: None)
     transfer = transfer_of(truth, scattering_of(thing, truth.patches, 1), samples.pixels)

@@ -14,14 +14,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
-from plugins.emulated.optics.indirect.kept import Indirect
-from plugins.emulated.optics.indirect.scattering import scattering_of
-from plugins.emulated.optics.indirect.tracing import traced_transfer
-from plugins.emulated.optics.indirect.transfer import transfer_of
+from plugins.emulated.core.truth import BenchTruth
+from plugins.emulated.optics.indirect.paths import traced_transfer
+from plugins.emulated.optics.indirect.radiosity import scattering_of, transfer_of
+from plugins.emulated.optics.indirect.transfers import Indirect
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
-from plugins.emulated.optics.truth import BenchTruth
 from tests.plugins.emulated.optics.mitsuba_stage import (
     frame_of,
     ideal_stage,

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from plugins.emulated.core.truth import BenchTruth, Pose
 from plugins.emulated.optics.footprints import LARGEST_RADIUS, pixel_profiles
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, cast, project, samples_of
 from plugins.emulated.optics.render import Renderer, emitted, response
-from plugins.emulated.optics.truth import BenchTruth, Pose
 
 
 def facing_plane(tilt: float = 0.0) -> StageObject:

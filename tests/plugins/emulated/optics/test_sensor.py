@@ -13,9 +13,9 @@ import pytest
 import rawpy
 import tifffile
 
+from plugins.emulated.core.truth import Sensor
 from plugins.emulated.optics.dng import PictureFacts, dng, with_exif
 from plugins.emulated.optics.sensor import jpeg, mosaic, tone_curve
-from plugins.emulated.optics.truth import Sensor
 
 SENSOR = Sensor(
     electrons_per_light_s=150_000.0,

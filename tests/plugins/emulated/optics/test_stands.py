@@ -11,7 +11,7 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceError, PluginError
 from hal.registry import OpenContext
 from plugins.emulated.bench import DRIVER
-from plugins.emulated.optics.truth import BenchTruth, read_truth
+from plugins.emulated.core.truth import BenchTruth, read_truth
 
 TABLE = """\
 [[stands]]

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.errors import DeviceError
+from plugins.emulated.core.truth import BenchTruth, ObjectTruth, read_truth, write_truth
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.staging import INTRINSICS, SIZES, device_tables, intrinsics_of, random_truth
-from plugins.emulated.optics.truth import BenchTruth, ObjectTruth, read_truth, write_truth
 
 KEPT = ObjectTruth("vase-and-bust", "", 1)
 
@@ -91,7 +91,7 @@ def test_a_broken_file_and_a_missing_one_are_told_apart(written: Path, tmp_path:
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**62))
 def test_every_seed_gives_a_stage_that_can_be_written_and_read(vase_and_bust: StageObject, seed: int) -> None:
-    from plugins.emulated.tables import dump, load
+    from plugins.emulated.core.tables import dump, load
 
     truth = random_truth("small", seed, vase_and_bust, KEPT, (1, 2))
     assert load(dump(truth), BenchTruth, file="bench.toml") == truth

@@ -5,15 +5,8 @@ from __future__ import annotations
 import pytest
 
 from plugins.emulated.projectors.boards_binary import Ep910Board, NecBoard
-from plugins.emulated.projectors.boards_text import (
-    BenqBoard,
-    BenqQuirks,
-    ChristieBoard,
-    EpsonBoard,
-    EpsonQuirks,
-    PanasonicBoard,
-)
-from plugins.emulated.projectors.families.sanyo import SanyoBoard
+from plugins.emulated.projectors.boards_marked import ChristieBoard, PanasonicBoard
+from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.plugins.emulated.conftest import Clock
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from hal.errors import DeviceError
-from plugins.emulated.optics.truth import BenchTruth, MainsTruth, read_truth, write_truth
-from plugins.emulated.projectors.mains import boot_times, check_mains
+from plugins.emulated.core.truth import BenchTruth, MainsTruth, read_truth, write_truth
 from plugins.emulated.usb.bench import UsbDeviceTruth
+from plugins.emulated.usb.mains import boot_times, check_mains
 
 BOARD = UsbDeviceTruth("cupboard", "relay", channels=2)
 LIGHT = UsbDeviceTruth("dark", "light")

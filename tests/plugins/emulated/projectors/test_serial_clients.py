@@ -11,9 +11,10 @@ from benqprojector.benqprojector import BenQProjectorSerial
 from epson_projector import Projector as EpsonProjector
 from epson_projector.const import SERIAL
 
+from plugins.emulated.projectors.board import Board
 from plugins.emulated.projectors.boards_text import BenqBoard, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.projectors.serial import Board, EmulatedSerialProjector
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
 
 TIMING = LampTiming(warm_up_s=0.3, cool_down_s=0.6)
 

@@ -20,12 +20,11 @@ from hal.tape import Tape, read_tape
 from hal.tape_relay import ptpip_relays, stream_relay
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of
+from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of, quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.projectors.quick_profile import quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
-from plugins.emulated.tape.serving import serve_tape
+from plugins.emulated.tape import serve_tape
 from plugins.gphoto2.camera import open_camera as open_gphoto2
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector

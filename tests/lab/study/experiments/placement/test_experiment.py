@@ -16,7 +16,7 @@ from controller.optics.plan.target_object import AFTER_M, TargetObject
 from controller.optics.plan.values import Placement, Surface
 from lab.study.experiments.placement.experiment import CAMERA_M, STANDS, at_size, planned, planned_object, set_up
 from lab.study.experiments.placement.measuring import compare_placement, seen_by, seen_by_camera
-from plugins.emulated.optics.stands import read_stands
+from plugins.emulated.optics.layout import read_stands
 
 SIZE = (280, 210)
 

@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from plugins.emulated.optics.effects.levels import Dithering, Subsurface, Varnish
+from plugins.emulated.core.truth import BenchTruth, Dithering, Subsurface, Varnish, read_truth, write_truth
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import Samples, cast
 from plugins.emulated.optics.render import Renderer, Shutter
-from plugins.emulated.optics.truth import BenchTruth, read_truth, write_truth
 
 LAMP = ((612.0, 22.0), (541.0, 27.0), (457.0, 17.0))
 FILTERS = ((598.0, 38.0), (538.0, 42.0), (462.0, 30.0))

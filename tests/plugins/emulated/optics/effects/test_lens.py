@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from plugins.emulated.core.truth import Lens, Pose
 from plugins.emulated.optics.rays import directions, project
-from plugins.emulated.optics.truth import Lens, Pose
 
 LENS = Lens((1400, 1050), 2600.0, (702.3, 1080.5), (-0.08, 0.03))
 POSE = Pose((0.2, -0.1, -1.1), (0.1, -0.2, 0.05))

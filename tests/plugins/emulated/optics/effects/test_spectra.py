@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from plugins.emulated.optics.effects.levels import Bands
-from plugins.emulated.optics.effects.spectra import (
+from plugins.emulated.core.truth import Bands
+from plugins.emulated.optics.spectra import (
     D65_WHITE,
     EDGES_NM,
     SOFT_NM,

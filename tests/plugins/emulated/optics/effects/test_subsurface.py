@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import k0
 
-from plugins.emulated.optics.effects import subsurface
-from plugins.emulated.optics.effects.subsurface import Spread
+from plugins.emulated.optics import subsurface
+from plugins.emulated.optics.subsurface import Spread
 
 SIDE = 121
 

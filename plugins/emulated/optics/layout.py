@@ -1,0 +1,254 @@
+"""How a new stage is laid out: where its projectors stand, and in which room, with how much of real light."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+
+from hal.errors import PluginError
+from hal.escapes import toml_value
+from hal.runtime.files import read_text
+from plugins.emulated.core.tables import Between, load
+from plugins.emulated.core.truth import (
+    ENGINES,
+    BenchTruth,
+    Dithering,
+    Lens,
+    Panels,
+    Pose,
+    ProjectorTruth,
+    Subsurface,
+    SurfaceTruth,
+    Three,
+    Two,
+)
+from plugins.emulated.optics.objects import StageObject
+
+DARK: Final = "dark"
+ROOMS: Final = (DARK, "room", "hard")
+TABLE_GAP_M: Final = 5e-4
+"""Between the object and the table, so that no two surfaces are one."""
+HALF_WIDTH_M: Final = 0.7
+FRONT_M, WALL_M, CEILING_M = 0.4, 0.35, 0.7
+"""The table's edge, the wall and its upper edge, from the object's middle."""
+WOOD: Final = (0.42, 0.36, 0.29)
+PAINT: Final = (0.46, 0.46, 0.44)
+FILTERS_NM: Final = ((600.0, 38.0), (535.0, 38.0), (460.0, 28.0))
+"""Of a camera: peak and standard deviation for red, green and blue."""
+LAMP_NM: Final = ((625.0, 22.0), (540.0, 26.0), (455.0, 18.0))
+"""Of a projector, likewise."""
+BENT: Final = 0.02
+"""Largest first radial term of a projector's lens: about a pixel at the edge of a picture at size small."""
+MARBLE: Final = Subsurface(share=0.3, spread_m=0.0015)
+TURNS: Final = Dithering(levels=64, turns=4, frame_s=1 / 240)
+"""A panel of 64 levels, whose others are made by turns of frames."""
+
+
+def arranged(truth: BenchTruth, room: str, thing: StageObject) -> BenchTruth:
+    """The stage in a room of ``ROOMS``; ``dark`` leaves it as it is."""
+    if room == DARK:
+        return truth
+    truth = dataclasses.replace(
+        truth,
+        surfaces=table_and_wall(thing),
+        engine="radiosity",
+        camera=dataclasses.replace(truth.camera, glare=0.02),
+        projectors=tuple(
+            dataclasses.replace(one, lamp=dataclasses.replace(one.lamp, flicker=0.01, drift=0.02))
+            for one in truth.projectors
+        ),
+    )
+    return truth if room == "room" else _hard(truth, thing)
+
+
+def _hard(truth: BenchTruth, thing: StageObject) -> BenchTruth:
+    """All the rest, as strong as with real devices."""
+    rng = np.random.default_rng([truth.seed, 8])
+    sensor = dataclasses.replace(truth.camera.sensor, response_spread=0.01, hot_pixels=2e-4, shutter_spread=0.02)
+    away_m = float(np.linalg.norm(thing.vertices.mean(axis=0) - np.array(truth.camera.pose.position_m)))
+    return dataclasses.replace(
+        truth,
+        object=dataclasses.replace(truth.object, gloss=0.04, gloss_exponent=25.0, subsurface=MARBLE),
+        camera=dataclasses.replace(truth.camera, sensor=sensor, focus_m=away_m, bands_nm=FILTERS_NM),
+        projectors=tuple(_hard_projector(one, rng) for one in truth.projectors),
+    )
+
+
+def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> ProjectorTruth:
+    turn = rng.uniform(0.0, 2.0 * np.pi, 2)
+    red, blue = ((0.3 * float(np.cos(angle)), 0.3 * float(np.sin(angle))) for angle in turn)
+    panels = Panels(shift_px=(red, (0.0, 0.0), blue), magnified=(-4e-4, 0.0, 4e-4))
+    light = dataclasses.replace(projector.light, glare=0.02, white_segment=0.25, bands_nm=LAMP_NM)
+    lens = dataclasses.replace(projector.lens, distortion=(float(rng.uniform(-BENT, BENT)), 0.0))
+    return dataclasses.replace(projector, lens=lens, light=light, panels=panels, dithering=TURNS)
+
+
+def table_and_wall(thing: StageObject) -> tuple[SurfaceTruth, ...]:
+    """A table under the object, and a wall behind it."""
+    low = float(thing.vertices[:, 1].max()) + TABLE_GAP_M
+    across = (2.0 * HALF_WIDTH_M, 0.0, 0.0)
+    return (
+        SurfaceTruth("table", (-HALF_WIDTH_M, low, -FRONT_M), across, (0.0, 0.0, FRONT_M + WALL_M), WOOD),
+        SurfaceTruth("wall", (-HALF_WIDTH_M, -CEILING_M, WALL_M), across, (0.0, low + CEILING_M, 0.0), PAINT),
+    )
+
+
+PLACES: Final = (
+    ("left", -29.0, 6.0),
+    ("right", 27.0, 3.0),
+    ("above", 2.0, 27.0),
+    ("far-left", -50.0, 14.0),
+    ("far-right", 48.0, 12.0),
+    ("high", -16.0, 38.0),
+)
+"""Name, degrees to the right of the camera and above it, as seen from the object."""
+DEFAULT: Final = 3
+DRAWN: Final = -1.0
+"""Instead of a blur: it is drawn, as lenses differ."""
+LUX_OF_LIGHT: Final = 9000.0
+"""Illuminance by which the bench calls the light on a surface 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """A projector put up as planned. World and device frames as in ``truth``; lens and light as data sheets have them.
+
+    ``throw_ratio``: distance by picture width; ``centre_share``: the axis' place in the picture, in its width and
+    height from the upper left corner; ``focus_m``: the depth of best focus; ``lumens`` of a white picture; ``pupil_m``;
+    ``sharpest_px``: standard deviation of a pixel's blur in focus; ``DRAWN``: as lenses differ
+    """
+
+    name: str
+    position_m: Annotated[Three, Between(-100.0, 100.0)]
+    rotation_vector: Annotated[Three, Between(-10.0, 10.0)]
+    throw_ratio: Annotated[float, Between(0.05, 100.0)]
+    centre_share: Annotated[Two, Between(-10.0, 10.0)]
+    focus_m: Annotated[float, Between(0.01, 100.0)]
+    lumens: Annotated[float, Between(1.0, 1e6)]
+    pupil_m: Annotated[float, Between(0.0, 1.0)]
+    sharpest_px: Annotated[float, Between(0.0, 3.0)] = DRAWN
+
+    def lens(self, size_px: tuple[int, int]) -> Lens:
+        width, height = size_px
+        centre = (self.centre_share[0] * width - 0.5, self.centre_share[1] * height - 0.5)
+        return Lens(size_px, self.throw_ratio * width, centre, (0.0, 0.0))
+
+    def light_at_focus(self, size_px: tuple[int, int]) -> float:
+        """Of a white picture on a plane facing the lens: the picture there is focus by throw ratio wide."""
+        wide_m = self.focus_m / self.throw_ratio
+        return self.lumens / (wide_m * wide_m * size_px[1] / size_px[0]) / LUX_OF_LIGHT
+
+
+@dataclass(frozen=True, slots=True)
+class Stands:
+    """How many projectors, or where each of them: ``placed``; else at the ``PLACES`` of ``names``; else at the first
+    ``count`` of them.
+
+
+    ``count`` None: as many as stages of the size have
+    """
+
+    count: int | None = None
+    placed: tuple[Stand, ...] = ()
+    names: tuple[str, ...] = ()
+
+    def places(self, usual: int) -> Sequence[tuple[str, float, float]]:
+        """Name and two angles of each; ``usual``: how many stages of the size have."""
+        if self.placed:
+            return [(stand.name, *PLACES[0][1:]) for stand in self.placed]
+        if self.names:
+            by_name = {place[0]: place for place in PLACES}
+            return [by_name[name] for name in self.names]
+        return PLACES[: usual if self.count is None else self.count]
+
+    def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
+        """``projector`` (of this index) at its given position; unchanged where none was given."""
+        if not self.placed:
+            return projector
+        stand, size = self.placed[index], projector.lens.size_px
+        lens = stand.lens(size)
+        # near its focus a lens' disc grows in proportion to the depth; its sigma is a quarter of its width
+        slope = 0.25 * stand.pupil_m * lens.focal_px / stand.focus_m**2
+        return dataclasses.replace(
+            projector,
+            pose=Pose(stand.position_m, stand.rotation_vector),
+            lens=lens,
+            focus=dataclasses.replace(
+                projector.focus,
+                distance_m=stand.focus_m,
+                slope_px_per_m=slope,
+                sharpest_px=projector.focus.sharpest_px if stand.sharpest_px < 0 else stand.sharpest_px,
+            ),
+            light=dataclasses.replace(
+                projector.light, reference_m=stand.focus_m, brightness=stand.light_at_focus(size)
+            ),
+        )
+
+
+SETTINGS: Final = {
+    "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
+    f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
+    "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
+    " throw_ratio, centre_share, focus_m, lumens, pupil_m and sharpest_px; without the last, it is drawn at random",
+    "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
+    "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    stands: tuple[Stand, ...]
+
+
+def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
+    """From the settings of the bench; a file's path is relative to ``folder``.
+
+    Raises PluginError("setting-wrong"), DeviceError as ``tables.load``.
+    """
+    count, file = settings.get("projectors"), settings.get("stands")
+    if isinstance(count, list | tuple):
+        known = [place[0] for place in PLACES]
+        if not count or len(set(map(str, count))) != len(count) or any(name not in known for name in count):
+            raise _wrong("projectors", count)
+        return Stands(len(count), names=tuple(count))
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES)):
+        raise _wrong("projectors", count)
+    if file is None:
+        return Stands(count)
+    try:
+        text = read_text(folder / str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise _wrong("stands", str(file)) from error
+    stands = load(text, _File, file=str(file)).stands
+    if len({stand.name for stand in stands}) != len(stands):
+        raise _wrong("stands", [stand.name for stand in stands])
+    return Stands(len(stands), stands)
+
+
+def read_room(settings: Mapping[str, Any]) -> str:
+    """From the settings of the bench. Raises PluginError("setting-wrong")."""
+    room = settings.get("room", DARK)
+    if room not in ROOMS:
+        raise _wrong("room", room)
+    return str(room)
+
+
+def read_engine(settings: Mapping[str, Any]) -> str | None:
+    """From the settings of the bench; None: as the room says. Raises PluginError("setting-wrong")."""
+    engine = settings.get("engine")
+    if engine is not None and engine not in ENGINES:
+        raise _wrong("engine", engine)
+    return engine
+
+
+def _wrong(key: str, value: object) -> PluginError:
+    return PluginError(
+        "setting-wrong",
+        what=f"The bench's '{key}' = {toml_value(value)} is wrong.",
+        remedy=f"'{key}' is {SETTINGS[key]}.",
+    )

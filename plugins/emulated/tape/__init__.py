@@ -1,1 +1,0 @@
-"""Devices that are replayed from a tape. Entry: `serving`."""
