@@ -32,10 +32,10 @@ CORES := $(shell nproc 2>/dev/null || echo 2)
 WORKERS ?= $(shell expr $(CORES) + 2)
 # Folders of tests that need no other program. `slow` marks those that take seconds.
 FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle config core kiosk/decide optics stage/report) \
-	tests/plugins/ptp tests/test_architecture.py
+	tests/plugins/ptp tests/test_architecture.py tests/test_house.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: deb demo docs figures blender test test-long test-setup fast check lint style types contracts website bench campaign nightly lock clean
+.PHONY: deb demo docs figures blender test test-long test-setup fast check lint style types contracts website timings campaign nightly lock clean
 
 demo:
 	@.ci/setup demo
@@ -98,7 +98,7 @@ docs:
 	@.ci/setup test
 	@$(MAKE) --no-print-directory website
 
-bench:
+timings:
 	@.ci/setup test
 	.venv/bin/python -m lab.timings $(NAME) --size $(SIZE)
 
