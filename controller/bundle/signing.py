@@ -56,7 +56,7 @@ def unsigned_warning(signed_by: bytes | None, trust: Trust) -> BundleError | Non
     return BundleError(
         "bundle-unproven",
         what=f"The bundle {how}. Its origin is unknown; it plays because the stage allows unsigned bundles.",
-        remedy="Make a key with `velatura keys STAGE`, publish again, and remove allow_unsigned from stage.toml.",
+        remedy="Make a key with `velatura bundle key STAGE`, publish again, and remove allow_unsigned from stage.toml.",
     )
 
 
@@ -122,7 +122,7 @@ def _key_bytes(path: Path, prefix: str) -> bytes:
         raise UsageError(
             "key-unreadable",
             what=f"{path} is not a readable key file ({reason}).",
-            remedy="Give a key file that 'velatura keys' made.",
+            remedy="Give a key file that 'velatura bundle key' made.",
         ) from error
     return data
 

@@ -1,4 +1,9 @@
-"""Output on the terminal, and JSON lines with ``--json``."""
+"""Output on the terminal, and JSON lines with ``--json``.
+
+Every command has ``--json``. With it, standard output holds one JSON object a line: ``{"progress": {...}}`` and
+``{"message": {"level", "text"}}`` while it works, and at its end ``{"result": {...}}``, or
+``{"error": {"code", "what", "remedy"}}``.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -20,11 +26,28 @@ from hal.notices import Level
 PLAIN_EVERY: Final = 0.25
 """Share of a step after which plain output prints another line."""
 
+_JSON: ContextVar[bool] = ContextVar("json", default=False)
+
 
 @contextlib.contextmanager
-def reporter(*, as_json: bool, stream: TextIO | None = None) -> Iterator[Reporter]:
-    """The reporter for ``stream``: JSON lines (default stdout), Rich on a terminal, plain lines elsewhere (stderr)."""
-    if as_json:
+def json_lines(on: bool) -> Iterator[None]:
+    """Print for programs (``on``) or for people, while it is entered."""
+    before = _JSON.set(on)
+    try:
+        yield
+    finally:
+        _JSON.reset(before)
+
+
+def as_json() -> bool:
+    """Whether ``--json`` was given."""
+    return _JSON.get()
+
+
+@contextlib.contextmanager
+def reporter(stream: TextIO | None = None) -> Iterator[Reporter]:
+    """A command's reporter for ``stream``: JSON lines (default: stdout), a bar on a terminal, else lines (stderr)."""
+    if as_json():
         yield JsonReporter(stream or sys.stdout)
     elif (stream or sys.stderr).isatty():
         with RichReporter(stream or sys.stderr) as rich_reporter:
@@ -134,9 +157,9 @@ class RichReporter:
         self._console.print(Text(printable(text), style=style))
 
 
-def show_error(code: str, what: str, remedy: str, *, as_json: bool) -> None:
+def show_error(code: str, what: str, remedy: str) -> None:
     """One sentence on what happened and one on what to do, on stderr; for machines one JSON line on stdout."""
-    if as_json:
+    if as_json():
         JsonReporter(sys.stdout).line(error={"code": code, "what": printable(what), "remedy": printable(remedy)})
         return
     if not sys.stderr.isatty() or importlib.util.find_spec("rich") is None:
@@ -190,25 +213,30 @@ def output_lost(because: OSError | None = None) -> bool:
     except OSError as error:
         if not isinstance(error, BrokenPipeError):
             what = f"The output could not be written: {error.strerror}."
-            with contextlib.suppress(OSError):
-                show_error(
-                    "output-lost", what, "Check the output's destination and start the command again.", as_json=False
-                )
+            with contextlib.suppress(OSError), json_lines(False):
+                show_error("output-lost", what, "Check the output's destination and start the command again.")
         # Otherwise Python tries again at exit and fails with its own message.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115
         return True
     return False
 
 
-def show_result(result: Mapping[str, Any] | str | None, *, as_json: bool) -> None:
-    """Print a command's result: ``{"result": ...}`` as JSON, else the text or ``key: value`` lines."""
-    if as_json:
+def say(sentence: str) -> None:
+    """Print a sentence on standard output while a command works; for programs as a message."""
+    if as_json():
+        JsonReporter(sys.stdout).say(sentence)
+    else:
+        print(printable(sentence), flush=True)  # noqa: T201 - the command line's own output
+
+
+def show_result(result: Mapping[str, Any], text: str | None = None) -> None:
+    """Print a command's result: ``{"result": ...}`` as JSON; for people ``text``, by default ``key: value`` lines."""
+    if as_json():
         JsonReporter(sys.stdout).line(result=result)
-    elif isinstance(result, str):
-        print(result, flush=True)  # noqa: T201 - the command line's own output
-    elif result is not None:
-        lines = (f"{printable(str(key))}: {printable(_words(value))}" for key, value in result.items())
-        print("\n".join(lines), flush=True)  # noqa: T201 - the command line's own output
+        return
+    if text is None:
+        text = "\n".join(f"{printable(str(key))}: {printable(_words(value))}" for key, value in result.items())
+    print(text, flush=True)  # noqa: T201 - the command line's own output
 
 
 def _words(value: Any) -> str:

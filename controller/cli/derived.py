@@ -1,19 +1,27 @@
-"""Commands made from the table of operations: arguments, options and help follow from each declaration."""
+"""Commands made from the table of operations: arguments, options, help and output follow from each declaration."""
 
 from __future__ import annotations
 
-import inspect
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from controller.cli import console, presentation
-from controller.cli.running import Json, StageFolder, appearance_names, projector_names, work
+from controller.cli import console
+from controller.cli.groups import (
+    StageFolder,
+    appearance_names,
+    projector_names,
+    typed_parameter,
+    with_signature,
+    work,
+)
 from controller.core.errors import UsageError
+from controller.core.text import printable
 from controller.kiosk.operations.fields import Field
 from controller.kiosk.operations.operation import Answer, Effect, Operation
 from controller.kiosk.operations.table import OPERATIONS
@@ -24,50 +32,49 @@ if TYPE_CHECKING:
 _TYPES: Final[Mapping[str, Any]] = {"integer": int, "number": float, "boolean": bool, "file": Path, "target": Path}
 _COMPLETE: Final = {"appearance": appearance_names, "projector": projector_names, "": None}
 NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not wait for the end of the job.")]
-
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. Scripts are never asked.")]
 
 
-def commands(group: str = "", operations: Sequence[Operation] = OPERATIONS) -> tuple[Callable[..., None], ...]:
-    """The commands of one group, "" for those of one word."""
+def commands(group: str, operations: Sequence[Operation] = OPERATIONS) -> dict[str, Callable[..., None]]:
+    """The commands of one group, such as "kiosk account", by their last word."""
     words = (
         (operation, operation.words.rpartition(" "))
         for operation in operations
         if not operation.within and operation.holder != "targets"
     )
-    return tuple(command(one, name) for one, (first, _, name) in words if first == group)
+    return {name: command(operation, name) for operation, (first, _, name) in words if first == group}
 
 
 def command(operation: Operation, name: str) -> Callable[..., None]:
     """A function as typer takes it; its signature and help are the operation's."""
 
-    def run(stage: Path, as_json: bool, no_wait: bool = False, yes: bool = False, **given: Any) -> None:
-        arguments = {field.name: _value(field, given.get(field.name)) for field in operation.fields}
+    def run(stage: Path, no_wait: bool = False, yes: bool = False, **typed: Any) -> None:
+        arguments = {field.name: _value(field, typed.get(field.name)) for field in operation.fields}
         if operation.asks and not yes and sys.stdin.isatty():
             typer.confirm(operation.question(arguments), abort=True)
         if operation.effect is Effect.WORKS and not no_wait:
-            job(stage, operation.socket_name, arguments, as_json=as_json)
+            job(stage, operation.socket_name, arguments)
             return
-        from controller.kiosk.api.offline_dispatch import call
+        console.show_result(*_shown(operation, call(stage, operation.socket_name, **arguments), arguments))
 
-        answer = call(stage, operation.socket_name, **arguments)
-        shown = presentation.of(operation, answer, arguments, as_json=as_json)
-        console.show_result(shown, as_json=as_json)
-
-    parameters = [_parameter("stage", StageFolder)]
-    parameters += [_parameter(field.name, *_typed(field)) for field in operation.fields if not field.secret]
+    parameters = [typed_parameter("stage", StageFolder)]
+    parameters += [typed_parameter(field.name, *_typed(field)) for field in operation.fields if not field.secret]
     if operation.effect is Effect.WORKS:
-        parameters.append(_parameter("no_wait", NoWait, False))
+        parameters.append(typed_parameter("no_wait", NoWait, False))
     if operation.asks:
-        parameters.append(_parameter("yes", Yes, False))
-    parameters.append(_parameter("as_json", Json, False))
-    vars(run)["__signature__"] = inspect.Signature(parameters)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        parameters.append(typed_parameter("yes", Yes, False))
     run.__name__, run.__doc__ = name.replace("-", "_"), _help(operation)
-    return run
+    return with_signature(run, parameters)
 
 
-def job(stage: Path, op: str, arguments: Mapping[str, Any], *, as_json: bool) -> None:
+def call(stage: Path, op: str, **arguments: Any) -> Any:
+    """Ask the running kiosk, or do it on the stage's folder if none runs."""
+    from controller.kiosk.api.offline_dispatch import call
+
+    return call(stage, op, **arguments)
+
+
+def job(stage: Path, op: str, arguments: Mapping[str, Any]) -> None:
     """Start a job of the running kiosk and wait for its end."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
@@ -75,11 +82,7 @@ def job(stage: Path, op: str, arguments: Mapping[str, Any], *, as_json: bool) ->
 
         return ask_and_follow(stage=stage, op=op, arguments=arguments, reporter=reporter, cancel=cancel)
 
-    work(do, as_json=as_json)
-
-
-def _parameter(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+    work(do)
 
 
 def _typed(field: Field) -> tuple[Any, ...]:
@@ -87,7 +90,8 @@ def _typed(field: Field) -> tuple[Any, ...]:
     about = ("" if field.choices else field.about[:1].upper()) + field.about[0 if field.choices else 1 :] + "."
     if field.flag is not None:
         return Annotated[bool, typer.Option(field.flag.option, help=field.flag.about)], False
-    kind, complete = _TYPES.get(field.kind, str), _COMPLETE[field.names]
+    kind = Literal[tuple(field.choices)] if field.choices else _TYPES.get(field.kind, str)
+    complete = _COMPLETE[field.names]
     if field.kind == "target":
         about = "The object's requested look, seen from the camera (PNG)."
     if field.argument or (field.required and not field.usual):
@@ -97,15 +101,15 @@ def _typed(field: Field) -> tuple[Any, ...]:
     return (Annotated[kind, option], field.usual) if field.usual else (Annotated[kind | None, option], None)
 
 
-def _value(field: Field, given: Any) -> Any:
+def _value(field: Field, typed: Any) -> Any:
     """As the socket takes it."""
     if field.secret:
         return _secret(field)
     if field.flag is not None:
-        return field.flag.value if given else field.flag.otherwise
-    if field.kind == "target" and not given.is_file():
-        raise UsageError("target-missing", what=f"The file {given} does not exist.", remedy="Give a PNG file.")
-    return str(given.absolute()) if isinstance(given, Path) else given
+        return field.flag.value if typed else field.flag.otherwise
+    if field.kind == "target" and not typed.is_file():
+        raise UsageError("target-missing", what=f"The file {typed} does not exist.", remedy="Give a PNG file.")
+    return str(typed.absolute()) if isinstance(typed, Path) else typed
 
 
 def _secret(field: Field) -> str:
@@ -125,3 +129,78 @@ def _help(operation: Operation) -> str:
     if not operation.offline:
         sentences.append("The kiosk must be running.")
     return " ".join(sentences)
+
+
+Shown = tuple[Mapping[str, Any], str | None]
+"""An object for programs and text for people; None: the object's ``key: value`` lines."""
+
+
+def _shown(operation: Operation, answer: Any, arguments: Mapping[str, Any]) -> Shown:
+    """An operation's result, as its text, a sentence, the name of a file, or its values."""
+    done = {"done": operation.socket_name}
+    if (text_of := TEXTS.get(operation.name)) is not None:
+        return text_of(answer)
+    if operation.effect is Effect.WORKS:
+        return done, "Started. `velatura kiosk status` shows the progress."
+    if operation.answer is Answer.NOTHING:
+        undone = any(field.flag and arguments[field.name] == field.flag.value for field in operation.fields)
+        return done, "Done." if undone else printable(operation.sentence(dict(arguments)))
+    if operation.answer in (Answer.FILE, Answer.PICTURE, Answer.PAGE):
+        return {"file": answer}, f"Written: {answer}"
+    if isinstance(answer, Mapping):
+        return answer, None
+    lines = answer if isinstance(answer, list) else [answer]
+    return {operation.name: answer}, "\n".join(printable(str(line)) for line in lines) or "There are none yet."
+
+
+def _appearances(rows: Any) -> Shown:
+    lines = [f"{row['name']}{'  (on the projectors)' if row['playing'] else ''}" for row in rows]
+    return {"appearances": rows}, "\n".join(lines) or "There are none yet."
+
+
+def _lamps(rows: Any) -> Shown:
+    lines = [f"{row['day']} {row['projector']:<12} {row['hours']:9,.1f} h {row['strikes']:6} strikes" for row in rows]
+    return {"days": rows}, "\n".join(lines) or "No lamp has burnt yet."
+
+
+def _changes(found: Any) -> Shown:
+    if found["good_unix_s"] is None:
+        text = "There was no good day yet. The first one is after a calibration that graded well, while the kiosk runs."
+        return found, text
+    lines = [f"The last good day was {_day(found['good_unix_s'])} ({found['run']})."]
+    for change in found["changes"]:
+        lines += [f"{change['sentence']} (seen on {_day(change['since_unix_s'])})", f"  {change['remedy']}"]
+    if not found["changes"]:
+        lines.append("Nothing has changed since.")
+    lines += [f"Not compared, because it can't be read now: {name}" for name in found["unknown"]]
+    return found, "\n".join(map(printable, lines))
+
+
+def _day(unix_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_s))
+
+
+def _diagnosed(path: Any) -> Shown:
+    from hal.runtime.caches import kept, summary
+
+    outside = kept()
+    rows = [
+        {"path": str(folder.path), "what": folder.what, "bytes": folder.size_bytes, "in_use": folder.in_use}
+        for folder in outside
+    ]
+    text = "\n".join([f"Written: {path}", *(f"Stored outside the stage: {line}" for line in summary(outside))])
+    return {"file": path, "outside_the_stage": rows}, text
+
+
+def _token(made: Any) -> Shown:
+    return made, str(made["token"])
+
+
+TEXTS: Final[Mapping[str, Callable[[Any], Shown]]] = {
+    "appearances": _appearances,
+    "lamp-history": _lamps,
+    "changes": _changes,
+    "diagnostics": _diagnosed,
+    "add-token": _token,
+}
+"""How an answer is shown, by the operation's name; one that is not here is shown by its kind of answer."""

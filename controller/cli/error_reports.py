@@ -17,6 +17,7 @@ from controller.cli import console
 from controller.core.errors import VelaturaError, WorkError
 from controller.core.extras import extra_missing
 from controller.core.files import file_error
+from controller.core.text import printable
 from hal.runtime.caches import state_folder, temporary_folder
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ DONE, FAILED, WRONG_USE, DEVICE_FAILED, STOPPED = 0, 1, 2, 3, 130
 """Exit codes of the program."""
 
 
-def report_error(error: BaseException, *, as_json: bool) -> int:
+def report_error(error: BaseException) -> int:
     """Show ``error`` as two sentences and return the exit code. If output was lost, show that instead."""
     if isinstance(error, typer.Exit):
         return error.exit_code
@@ -35,8 +36,8 @@ def report_error(error: BaseException, *, as_json: bool) -> int:
     try:
         shown = _explained(error)
         if shown is None:
-            return _crashed(error, as_json=as_json)
-        console.show_error(shown.code, shown.what, shown.remedy, as_json=as_json)
+            return _crashed(error)
+        console.show_error(shown.code, shown.what, shown.remedy)
     except OSError:
         if not console.output_lost():
             raise
@@ -63,13 +64,26 @@ def _explained(error: BaseException) -> _Shown | None:
             "cancelled", "The work was stopped on request.", "Run the same command to continue from here.", STOPPED
         )
     if isinstance(error, typer.TyperException):
-        message = error.format_message()
-        sentence = message if message.endswith((".", "?")) else f"{message}."
-        return _Shown("wrong-use", sentence, "`velatura --help` shows the commands and their options.", WRONG_USE)
+        return _Shown("wrong-use", *_wrong_use(error), WRONG_USE)
     known = _as_velatura_error(error)
     if isinstance(known, DeviceError):
         return _Shown(known.code, known.what, known.remedy, DEVICE_FAILED)
     return None if known is None else _Shown(known.code, known.what, known.remedy, known.exit_code)
+
+
+def _wrong_use(error: typer.TyperException) -> tuple[str, str]:
+    """What is wrong in the words that were typed, and the nearest that would be right."""
+    context = getattr(error, "ctx", None)
+    place = "velatura" if context is None else context.command_path
+    remedy = f"`{place} --help` shows what it takes."
+    if (option := getattr(error, "option_name", None)) and hasattr(error, "possibilities"):
+        nearest = " or ".join(sorted(error.possibilities or ()))
+        return (
+            f"`{place}` has no option {printable(option)}.",
+            f"Did you mean {nearest}? {remedy}" if nearest else remedy,
+        )
+    message = error.format_message().replace("Value error, ", "")
+    return message if message.endswith((".", "?")) else f"{message}.", remedy
 
 
 def _as_velatura_error(error: BaseException) -> VelaturaError | DeviceError | None:
@@ -87,7 +101,7 @@ def _as_velatura_error(error: BaseException) -> VelaturaError | DeviceError | No
     return None
 
 
-def _crashed(error: BaseException, *, as_json: bool) -> int:
+def _crashed(error: BaseException) -> int:
     """For an unexpected error: write the traceback to a file and show a short message."""
     report = "".join(
         [
@@ -104,7 +118,6 @@ def _crashed(error: BaseException, *, as_json: bool) -> int:
         f"Send {path} to the maintainers. It contains the details."
         if path
         else "The error report could not be written.",
-        as_json=as_json,
     )
     return FAILED
 

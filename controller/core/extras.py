@@ -11,7 +11,7 @@ from controller.core.errors import UsageError
 
 EXTRAS: Final = {
     "controller": "calibrate a stage, make and play appearances: all commands except those below",
-    "panel": "run a kiosk (velatura serve) with its panel and accounts",
+    "panel": "run a kiosk (velatura kiosk serve) with its panel and accounts",
     "bench": "emulated devices (velatura demo, emulate) and velatura plan",
     "gphoto2": "cameras through libgphoto2",
     "mains": "mains by network: PDUs by SNMP, relays by Modbus",

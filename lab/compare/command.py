@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controller.cli.running import BenchSize, Json, Seeds, work
+from controller.cli.groups import BenchSize, Seeds, work
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -26,9 +26,8 @@ def benchmark(
     size: BenchSize = "small",
     out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("benchmark"),
     seed: Seeds = None,
-    as_json: Json = False,
 ) -> None:
-    """Compare methods on fixed emulated scenes, by photographs of what they make. Continues unfinished work."""
+    """Compare methods on fixed emulated scenes. Judges photographs of what they make. Continues unfinished work."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from lab.compare.service import benchmark
@@ -43,4 +42,4 @@ def benchmark(
             cancel=cancel,
         )
 
-    work(do, as_json=as_json)
+    work(do)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controller.cli.running import Json, work
+from controller.cli.groups import work
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -19,9 +19,8 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Random seed of the events and of their order.", min=0)] = 1,
     years: Annotated[float, typer.Option(help="Years of a kiosk, in lives of 14 days.", min=0.001)] = 0.1,
     keep: Annotated[Path | None, typer.Option(help="File for the shortened scenario of a violation.")] = None,
-    as_json: Json = False,
 ) -> None:
-    """Run the kiosk's own code for months in virtual time, with faults from a seed, and check its invariants."""
+    """Run the kiosk's own code for months of virtual time. Faults come from a seed; its invariants are checked."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from lab.simulate.simulation import simulate
@@ -30,4 +29,4 @@ def simulate(
         file = None if keep is None else keep.resolve()
         return simulate(seed=seed, years=years, keep=file, reporter=reporter, cancel=cancel)
 
-    work(do, as_json=as_json)
+    work(do)

@@ -253,7 +253,7 @@ class Life:
         self.end_of_program()
 
     def _serve(self) -> None:
-        """As ``controller.cli.serve_command.serve``, without panel and socket."""
+        """As ``controller.cli.kiosk_process.serve``, without panel and socket."""
         world, stop = self.world, self.stop
         kiosk = self.kiosk = StageKiosk(STAGE, world)
         while not stop.is_set():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controller.cli.running import BenchSize, Json, Seeds, work
+from controller.cli.groups import BenchSize, Seeds, work
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
@@ -24,9 +24,8 @@ def study(
     pages: Annotated[Path | None, typer.Option(help="Folder for the pages (default: OUT/pages).")] = None,
     seed: Seeds = None,
     list_only: Annotated[bool, typer.Option("--list", help="List the experiments, and end.")] = False,
-    as_json: Json = False,
 ) -> None:
-    """Repeat the paper's experiments on emulated stages and write a page for each. Continues unfinished experiments."""
+    """Repeat the paper's experiments on emulated stages. Writes a page for each; continues unfinished experiments."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from lab.study.service import experiments, study
@@ -43,4 +42,4 @@ def study(
             cancel=cancel,
         )
 
-    work(do, as_json=as_json)
+    work(do)

@@ -76,7 +76,7 @@ class Kiosk:
         return str(self.status()["state"])
 
     def status(self) -> dict[str, Any]:
-        """As `velatura status` tells it."""
+        """As `velatura kiosk status` tells it."""
         return dict(self._asked("status") or self.machine.velatura("status"))
 
     def _asked(self, operation: str) -> Any:
@@ -129,33 +129,35 @@ class Kiosk:
         first, _, _ = text.partition("\n[[appearances]]")
         new = f'{first}\n[[appearances]]\nname = "board"\nkind = "checkerboard"\n'
         (machine.at(STAGE) / "new.toml").write_text(new)
-        machine.call("velatura", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
+        machine.call("velatura", "kiosk", "settings", STAGE, "--save", STAGE / "new.toml", user="velatura")
         machine.wait_for(lambda: machine.at(STAGE / "run" / "outputs.frame").exists())
         machine.wait_for(self.answers)
 
     def calibrate(self, look: Callable[[dict[str, Any]], object] = lambda _: None) -> None:
         """Calibrate, and play what was made; after ``let_the_camera_see``. ``look`` gets the job again and again."""
         machine, number = self.machine, self.events()[-1]["number"]
-        self.begin("recalibrate")
+        self.begin("calibrate")
 
         def made() -> bool:
             look(self.status()["job"] or {})
             return {"calibrated", "published"} <= set(self.codes(number))
 
         machine.wait_for(made)
-        machine.wait_for(lambda: machine.called("velatura", "show", STAGE, "board", user="velatura").returncode == 0)
+        machine.wait_for(
+            lambda: machine.called("velatura", "kiosk", "show", STAGE, "board", user="velatura").returncode == 0
+        )
         machine.wait_for(lambda: self.status()["playing"] == "board")
 
     def begin(self, command: str, *words: str | Path) -> None:
         """Begin work, once what is still under way has ended."""
-        asked = ("velatura", command, STAGE, *words, "--no-wait")
+        asked = ("velatura", "kiosk", command, STAGE, *words, "--no-wait")
         self.machine.wait_for(lambda: self.machine.called(*asked, user="velatura").returncode == 0)
 
     def begin_appearance(self, name: str, seed: int) -> None:
         """Begin to compute an appearance from a picture that nobody has computed yet."""
         picture = Path(f"/opt/{name}-{seed}.png")
         cv2.imwrite(str(self.machine.at(picture)), np.random.default_rng(seed).integers(0, 256, (48, 48, 3), np.uint8))
-        self.begin("compute", name, picture)
+        self.begin("add", name, picture)
 
     def problems(self) -> dict[str, str]:
         """What the panel says of the devices that have one, by name."""
@@ -232,7 +234,7 @@ class Kiosk:
         machine.call("mv", STAGE / "new.toml", STAGE / described.name)
         machine.wait_for(self.answers)
         self.install_bundle(FIRST)
-        showing = ("velatura", "show", STAGE, APPEARANCE)
+        showing = ("velatura", "kiosk", "show", STAGE, APPEARANCE)
         machine.wait_for(lambda: machine.called(*showing, user="velatura").returncode == 0)
         machine.wait_for(self.shows)
         machine.wait_for(lambda: self.state == "playing")

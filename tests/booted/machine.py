@@ -223,8 +223,8 @@ class Machine:
         return done.stdout
 
     def velatura(self, command: str, *words: str | Path) -> dict[str, Any]:
-        """A command about the kiosk's stage, by the services' user."""
-        told = self.call("velatura", command, STAGE, *words, "--json", user="velatura")
+        """A command of ``velatura kiosk``, by the services' user."""
+        told = self.call("velatura", "kiosk", command, STAGE, *words, "--json", user="velatura")
         return dict(json.loads(told.splitlines()[-1])["result"])
 
     def read(self, path: Path) -> bytes:
@@ -294,4 +294,4 @@ class Machine:
         """The kiosk's status, and the end of the journal without the sessions of this class's own commands."""
         services = "--facility=kern,user,daemon,syslog"
         journal = self.called("journalctl", "--boot", "--no-pager", "--lines=60", services).stdout
-        return self.called("velatura", "status", STAGE, user="velatura").stdout + journal
+        return self.called("velatura", "kiosk", "status", STAGE, user="velatura").stdout + journal

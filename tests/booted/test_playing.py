@@ -19,7 +19,7 @@ APPEARANCE_S = 10.0
 
 def test_user_and_root_reach_the_running_kiosk(playing: Kiosk) -> None:
     assert playing.machine.velatura("status")["playing"] == "1"
-    assert "playing" in playing.machine.call("velatura", "status", STAGE)
+    assert "playing" in playing.machine.call("velatura", "kiosk", "status", STAGE)
 
 
 @pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Debian's chromium (a package of the test set-up)")
@@ -80,7 +80,7 @@ def test_a_backup_is_restored_on_this_debians_python(playing: Kiosk) -> None:
     restarts = machine.restarts("velatura-controller")
     machine.velatura("backup")
     (backup,) = machine.at(STAGE / "kiosk" / "archives").glob("backup-*")
-    machine.call("velatura", "restore", STAGE, STAGE / "kiosk" / "archives" / backup.name, user="velatura")
+    machine.call("velatura", "kiosk", "restore", STAGE, STAGE / "kiosk" / "archives" / backup.name, user="velatura")
     machine.wait_for(playing.answers)
     machine.wait_for(playing.shows)
     assert machine.restarts("velatura-controller") == restarts, "it begins anew without an end"

@@ -40,12 +40,13 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     machine.call(
         "sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer && touch /opt/told"
     )
-    machine.call("/opt/velatura/bin/velatura", "backup", STAGE)
+    machine.call("/opt/velatura/bin/velatura", "kiosk", "backup", STAGE)
     machine.call("sh", "-c", f"mv $(ls -t {STAGE}/kiosk/archives/backup-* | head -n 1) /opt/velatura-20260504.tar.gz")
     machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
     assert not machine.at(STAGE).exists()
     assert machine.called("getent", "passwd", "velatura").returncode != 0
-    command = "/opt/velatura/bin/velatura kiosk restore /opt/velatura-20260504.tar.gz < /opt/answer > /opt/told 2>&1"
+    command = "/opt/velatura/bin/velatura kiosk install --backup /opt/velatura-20260504.tar.gz "
+    command += "< /opt/answer > /opt/told 2>&1"
     with ThreadPoolExecutor(1) as pool:
         restoring = pool.submit(machine.called, "sh", "-c", command)
         # The pipe has to be open at both ends before the command starts.

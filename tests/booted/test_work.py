@@ -38,7 +38,7 @@ def works(status: dict[str, Any], name: str) -> bool:
 
 def test_a_closed_stage_that_computes_says_so_and_not_only_that_it_is_closed(playing: Kiosk) -> None:
     machine, number = playing.machine, playing.events()[-1]["number"]
-    machine.call("velatura", "stop", STAGE, user="velatura")
+    machine.call("velatura", "kiosk", "stop", STAGE, user="velatura")
     machine.wait_for(lambda: playing.state == "off")
     playing.begin_appearance("dark", 5)
     seen: list[tuple[str, str]] = []
@@ -54,7 +54,7 @@ def test_a_closed_stage_that_computes_says_so_and_not_only_that_it_is_closed(pla
     assert len(seen) > 3
     assert set(seen) == {("solving", "New appearance dark. The stage is closed, and the lamps are off.")}
     machine.wait_for(lambda: playing.state == "off")
-    machine.call("velatura", "start", STAGE, user="velatura")
+    machine.call("velatura", "kiosk", "start", STAGE, user="velatura")
     machine.wait_for(lambda: playing.state == "playing")
     machine.wait_for(playing.shows_installed)
 
@@ -63,7 +63,7 @@ def test_power_cuts_while_it_calibrates_and_publishes_leave_the_picture_and_are_
     machine = playing.machine
     calibrated = len(list(machine.at(STAGE / "runs").iterdir()))
     machine.wait_for(lambda: playing.state == "playing" and not playing.problems())
-    playing.begin("recalibrate")
+    playing.begin("calibrate")
     machine.wait_for(lambda: works(playing.status(), "Full recalibration"))
     before, number = kept(playing), playing.events()[-1]["number"]
     assert cut_now(playing, playing.shows_installed) < PICTURE_S
@@ -77,5 +77,5 @@ def test_power_cuts_while_it_calibrates_and_publishes_leave_the_picture_and_are_
     assert cut_now(playing, playing.shows_installed) < PICTURE_S
     assert lost(playing, before) == []
     machine.wait_for(lambda: {"work-cut-off", "published"} <= set(playing.codes(number)))
-    shown = machine.call("velatura", "appearances", STAGE, user="velatura")
+    shown = machine.call("velatura", "kiosk", "appearances", STAGE, user="velatura")
     assert "random" in shown, "what needs no lamps is done again by itself"

@@ -85,7 +85,9 @@ def check_damaged_settings(kiosk: Kiosk, page: Page) -> None:
 
 def check_guessed_tokens(kiosk: Kiosk, page: Page) -> None:
     """A program that guesses, and one with a good token, at the same address."""
-    made = kiosk.machine.call("velatura", "account", "add-token", STAGE, "robot", "--role", "viewer", user="velatura")
+    made = kiosk.machine.call(
+        "velatura", "kiosk", "account", "add-token", STAGE, "robot", "--role", "viewer", user="velatura"
+    )
     token = re.search(r"velatura_[\w-]+", made)
     assert token is not None, made
 

@@ -101,8 +101,8 @@ import controller.stage.services.camera, controller.stage.services.plan, control
 import trimesh, cv2, OpenEXR, plugins.emulated.bench, controller.demo.job, controller.stage.doctor.examine
 import controller.stage.services.compare, controller.panel.server
 from tests.campaigns.bad_readers import COMMANDS
-program.COMMANDS = (*program.COMMANDS, *COMMANDS)
-program.application()
+program.MEMBERS["For this campaign"] = COMMANDS
+program._built()
 gc.freeze()
 print(json.dumps({{"ready": True}}), flush=True)
 for line in sys.stdin:

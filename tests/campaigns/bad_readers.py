@@ -5,17 +5,15 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from controller.cli.running import Json
 
-
-def read_target(file: Path, as_json: Json = False) -> None:
+def read_target(file: Path) -> None:
     """Read a target picture, as ``velatura appearance`` does, for a camera of 64 x 48 pixels."""
     from controller.optics.solve.targets.files import load_target
 
     load_target(file, (64, 48))
 
 
-def read_live(source: Path, as_json: Json = False) -> None:
+def read_live(source: Path) -> None:
     """Open a stream of targets, as ``velatura live`` does, and take its first picture."""
     from controller.stage.live.sources import FolderSource, open_source
 

@@ -105,7 +105,7 @@ class Cuts:
             if number % 2:
                 self.kiosk.begin_appearance("new", number)
             else:
-                self.kiosk.begin("recalibrate")
+                self.kiosk.begin("calibrate")
             time.sleep(self._chance.uniform(0.0, longest_s))
             job = self.kiosk.status()["job"] or {}
             took_s = cut_now(self.kiosk, self.kiosk.shows_installed)
@@ -157,7 +157,7 @@ def calibrate_to_the_end(kiosk: Kiosk) -> None:
     """What power cuts broke would show here at the latest."""
     kiosk.machine.wait_for(lambda: kiosk.state == "playing" and not kiosk.problems())
     number = kiosk.events()[-1]["number"]
-    kiosk.begin("recalibrate")
+    kiosk.begin("calibrate")
     kiosk.machine.wait_for(lambda: {"calibrated", "published"} <= set(kiosk.codes(number)))
     kiosk.machine.wait_for(kiosk.shows_installed)
 

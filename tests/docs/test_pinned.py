@@ -30,7 +30,7 @@ def test_every_package_of_a_kiosk_comes_from_a_lock_file_with_hashes_or_from_the
 
 
 def test_options_of_serve_in_the_documentation_are_those_of_the_program() -> None:
-    told = CliRunner().invoke(application(), ["serve", "--help"], env={"COLUMNS": "200"}).output
+    told = CliRunner().invoke(application(), ["kiosk", "serve", "--help"], env={"COLUMNS": "200"}).output
     known = set(re.findall(r"--[a-z][a-z-]+", told))
     assert "--certificate" in known
     pages = [ROOT / "docs" / "how-to" / name for name in ("run-a-kiosk.md", "panel.md")]

@@ -191,7 +191,7 @@ def test_a_lens_file_of_other_pictures_is_refused_before_a_lamp_is_struck(prepar
 def test_a_byte_order_mark_does_not_matter(prepared: Path) -> None:
     file = prepared / "stage.toml"
     file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
-    assert velatura("status", prepared).code == 0
+    assert velatura("kiosk", "status", prepared).code == 0
 
 
 def test_projectors_that_are_not_there_are_named_and_no_run_is_begun(prepared: Path) -> None:

@@ -98,7 +98,7 @@ def test_an_uninstall_leaves_nothing(wheel: Path, tmp_path: Path) -> None:
     (packages / "others.pth").write_text("\n".join(dict.fromkeys(ours)) + "\n")
     used = environment(VELATURA_CACHE=str(tmp_path / "cache"))
     out = tmp_path / "out"
-    for words in (["demo", "--prepare-only", "--out", out], ["states"], ["diagnostics", out / "stage"]):
+    for words in (["demo", "--prepare-only", "--out", out], ["--version"], ["kiosk", "diagnostics", out / "stage"]):
         done = called([python, "-m", "controller", *words], used, tmp_path)
         assert done.returncode == 0, done.stderr
     done = called([python, "-c", "import hal, controller.core.jit; print(hal.__file__)"], used, tmp_path)
@@ -115,7 +115,7 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return called(["bash", "-c", line], environment(PYTHONPATH=str(ROOT), XDG_STATE_HOME=str(folder / "state")), folder)
 
 
-@pytest.mark.parametrize("words", ["states", "states --mermaid", "--help", "status nowhere --json"])
+@pytest.mark.parametrize("words", ["--version", "bundle --help", "--help", "kiosk status nowhere --json"])
 def test_output_that_can_not_be_written_is_told_in_two_sentences(words: str, tmp_path: Path) -> None:
     done = shell(f"velatura {words} > /dev/full", tmp_path)
     assert done.returncode == 1
@@ -126,13 +126,13 @@ def test_output_that_can_not_be_written_is_told_in_two_sentences(words: str, tmp
 
 @pytest.mark.parametrize(("closed", "code"), [(">&-", 2), ("2>&-", 2), ("<&- >&- 2>&-", 2), ("<&-", 2)])
 def test_closed_streams_do_no_harm(closed: str, code: int, tmp_path: Path) -> None:
-    assert shell(f"velatura status nowhere {closed}", tmp_path).returncode == code
-    assert shell(f"velatura states {closed}", tmp_path).returncode == 0
+    assert shell(f"velatura kiosk status nowhere {closed}", tmp_path).returncode == code
+    assert shell(f"velatura --version {closed}", tmp_path).returncode == 0
     assert not (tmp_path / "state").exists()
 
 
 def test_a_reader_that_goes_away_is_no_crash(tmp_path: Path) -> None:
-    done = shell("velatura states | true; exit ${PIPESTATUS[0]}", tmp_path)
+    done = shell("velatura --help | true; exit ${PIPESTATUS[0]}", tmp_path)
     assert done.returncode in (0, 1)
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "state").exists()
@@ -151,12 +151,12 @@ def test_without_a_home_folder_everything_works_and_leaves_nothing(tmp_path: Pat
     )
     for words in (
         ["-m", "controller", "demo", "--prepare-only", "--out", out],
-        ["-m", "controller", "diagnostics", out / "stage"],
+        ["-m", "controller", "kiosk", "diagnostics", out / "stage"],
         ["-c", drawing],
     ):
         done = called([sys.executable, *words], env, tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
-    crash = "from controller.cli.error_reports import report_error; report_error(ZeroDivisionError(), as_json=False)"
+    crash = "from controller.cli.error_reports import report_error; report_error(ZeroDivisionError())"
     done = called([sys.executable, "-c", crash], env, tmp_path)
     assert str(temporary) in done.stderr
     assert [path.name for path in temporary.iterdir() if not path.name.startswith(("crash-", "velatura-"))] == []

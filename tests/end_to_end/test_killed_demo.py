@@ -46,7 +46,7 @@ def test_ctrl_c_while_the_bench_starts_ends_both(prepared_once: Path, tmp_path: 
     assert not (out / "stage" / "runs").exists()
 
 
-@pytest.mark.parametrize("command", ["demo", "calibrate", "appearance", "play", "emulate", "states"])
+@pytest.mark.parametrize("command", ["demo", "calibrate", "appearance", "play", "emulate", "kiosk"])
 def test_every_command_explains_itself(command: str) -> None:
     words = [sys.executable, "-m", "controller", command, "--help"]
     told = subprocess.run(words, capture_output=True, text=True, cwd=REPOSITORY, check=True).stdout

@@ -92,7 +92,7 @@ def ended(kiosk: StageKiosk, job: Job) -> Job:
 
 @contextmanager
 def moved(kiosk: StageKiosk) -> Iterator[None]:
-    """A thread moves its service, as that of ``velatura serve`` does."""
+    """A thread moves its service, as that of ``velatura kiosk serve`` does."""
 
     def move() -> None:
         kiosk.service.reconciler.step()

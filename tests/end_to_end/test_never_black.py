@@ -105,7 +105,7 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
     stage = prepare_mini(tmp_path)
     install_bundle(stage, 1, "old-1", "old-2")
     newest = install_bundle(stage, 2, "new-1", "new-2", "new-3")
-    with devices(stage), Command("serve", stage, "--no-panel") as kiosk:
+    with devices(stage), Command("kiosk", "serve", stage, "--no-panel") as kiosk:
         # The playlist, with its times and fades.
         assert until(stage, playing)["in_turn"] is True
         seen = watched(stage, 3.5 * SHOWN_MS / 1000)
@@ -182,12 +182,12 @@ def test_a_damaged_stage_toml_lamps_that_are_awaited_and_a_full_disk_are_said_as
             f'mail_port = {mail.port}\nmail_security = "none"\nwebhook = "{web.address}"\n'
         )
         (stage / FILE).write_text(f"{good}\n{alerts}")
-        with Command("serve", stage, "--no-panel", "--leave-lit") as kiosk:
+        with Command("kiosk", "serve", stage, "--no-panel", "--leave-lit") as kiosk:
             until(stage, playing)
             kiosk.interrupt()
         lines = (stage / FILE).read_text().count("\n")
         (stage / FILE).write_text((stage / FILE).read_text() + "[[projectors\n")
-        with Command("serve", stage, "--no-panel") as kiosk:
+        with Command("kiosk", "serve", stage, "--no-panel") as kiosk:
             now = until(stage, playing)
             (warning,) = [one for one in now["warnings"] if "last good settings" in one]
             assert f"line {lines + 1}" in warning

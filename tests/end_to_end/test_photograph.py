@@ -25,10 +25,10 @@ def test_the_kiosk_photographs_an_appearance_and_finds_what_the_demo_found(
     stage = copied(finished_demo.stage, tmp_path / "stage")
     rows = json.loads((finished_demo.out / "report.json").read_text())["appearances"]
     (then,) = (row for row in rows if row["name"] == NAME)
-    with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:
+    with BenchProcess(stage, cancel=threading.Event()), Command("kiosk", "serve", stage, "--no-panel") as kiosk:
         wait_for(lambda: bool(codes(stage)))
         wait_for(lambda: call_kiosk(stage, "status")["state"] == "playing")
-        outcome = velatura("compare", stage, NAME)
+        outcome = velatura("kiosk", "photograph", stage, NAME)
         assert outcome.code == 0, outcome.records[-1]
         (found,) = call_kiosk(stage, "comparisons")
         report = call_kiosk(stage, "report", run=found["history"][0]["run"])

@@ -25,11 +25,11 @@ pytestmark = pytest.mark.timeout(300)
 def test_boots_to_playing_survives_its_own_death_and_ends_with_cool_lamps(prepared: Path) -> None:
     install_grey(prepared)
     with BenchProcess(prepared, cancel=threading.Event()):
-        with Command("serve", prepared, "--no-panel") as first:
+        with Command("kiosk", "serve", prepared, "--no-panel") as first:
             assert wait_for(prepared, "playing")["playing"] == NAME
             first.kill()
         assert all(lamps(prepared).values())
-        with Command("serve", prepared, "--no-panel") as second:
+        with Command("kiosk", "serve", prepared, "--no-panel") as second:
             state = wait_for(prepared, "playing")
             assert [lamp["strikes"] for lamp in state["lamps"]] == [1, 1, 1]
             call_kiosk(prepared, "stop")
@@ -44,7 +44,7 @@ def test_the_first_password_is_never_printed_where_systemd_keeps_it(tmp_path: Pa
     stage, printed = tmp_path / "stage", tmp_path / "printed"
     stage.mkdir()
     address = f"127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "controller", "serve", str(stage), "--setup", "--panel", address]
+    command = [sys.executable, "-m", "controller", "kiosk", "serve", str(stage), "--setup", "--panel", address]
     with printed.open("wb") as out:
         told = os.fstat(out.fileno())
         # As systemd tells a service that its output goes to the journal (systemd.exec(5)).

@@ -64,7 +64,7 @@ def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_p
     text = bench.read_text()
     assert 'scenario = ""' in text
     bench.write_text(text.replace('scenario = ""', 'scenario = "bench/dead.toml"'))
-    with BenchProcess(stage, cancel=threading.Event()), Command("serve", stage, "--no-panel") as kiosk:
+    with BenchProcess(stage, cancel=threading.Event()), Command("kiosk", "serve", stage, "--no-panel") as kiosk:
         wait_for(lambda: "takeover-solved" in codes(stage))
         wait_for(lambda: shown(stage) == [True, True, False])
         state = call_kiosk(stage, "status")

@@ -135,7 +135,7 @@ def test_from_a_cold_stage_to_a_playing_one_by_one_click_over_a_cancel_a_second_
 ) -> None:
     stage = prepare_mini(tmp_path)
     address = f"127.0.0.1:{ports()[0]}"
-    served = ("serve", stage, "--panel", address)
+    served = ("kiosk", "serve", stage, "--panel", address)
     with devices(stage), chromium() as browser, tab(browser, f"http://{address}") as page:
         with Command(*served) as first:
             log_in(page, first_password(first))

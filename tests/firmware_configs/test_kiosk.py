@@ -69,7 +69,7 @@ def test_the_players_command_is_one_that_it_understands(tmp_path: Path) -> None:
 
 def test_the_controllers_command_serves_the_stage_and_says_when_it_is_ready() -> None:
     words = shlex.split(setting("velatura-controller.service", "ExecStart"))
-    assert words == ["/opt/velatura/bin/velatura", "serve", str(STAGE), "--setup", "$OPTIONS"]
+    assert words == ["/opt/velatura/bin/velatura", "kiosk", "serve", str(STAGE), "--setup", "$OPTIONS"]
     assert setting("velatura-controller.service", "Type") == "notify"
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from controller import __main__ as shell
-from controller.cli import sections
+from controller.cli import groups
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "lab" / "pyproject.toml").read_text())
-COMMANDS = PROJECT["project"]["entry-points"][sections.GROUP]
+COMMANDS = PROJECT["project"]["entry-points"][groups.ENTRY_POINTS]
 
 
 def test_every_package_of_the_lab_is_installed() -> None:
@@ -29,8 +29,8 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
 
 def installed(monkeypatch: pytest.MonkeyPatch, commands: dict[str, str]) -> None:
     """These commands are declared by a distribution, and no others."""
-    found = {name: EntryPoint(name, value, sections.GROUP) for name, value in commands.items()}
-    monkeypatch.setattr(sections, "installed_commands", lambda: found)
+    found = {name: EntryPoint(name, value, groups.ENTRY_POINTS) for name, value in commands.items()}
+    monkeypatch.setattr(groups, "installed_commands", lambda: found)
 
 
 def test_the_help_shows_installed_commands_in_a_section_of_their_own(
@@ -39,24 +39,24 @@ def test_the_help_shows_installed_commands_in_a_section_of_their_own(
     installed(monkeypatch, COMMANDS)
     assert shell.run(["--help"]) == 0
     shown = capsys.readouterr().out
-    section = shown[shown.index(f"\n{sections.INSTALLED}:\n") :]
+    section = shown[shown.index(f"\n{groups.INSTALLED}:\n") :]
     assert all(f"\n  {name} " in section for name in COMMANDS)
     assert shell.run(["study", "--list"]) == 0
 
 
-@pytest.mark.parametrize("name", sections.LAB)
+@pytest.mark.parametrize("name", groups.LAB)
 def test_without_the_lab_its_commands_say_where_they_are(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     installed(monkeypatch, {})
     assert shell.run(["--help"]) == 0
-    assert sections.INSTALLED not in capsys.readouterr().out
+    assert groups.INSTALLED not in capsys.readouterr().out
     assert shell.run([name, "--seed", "1"]) == 2
     assert "pip install velatura-lab" in capsys.readouterr().err
 
 
 def test_the_product_knows_the_labs_commands() -> None:
-    assert sorted(sections.LAB) == sorted(COMMANDS)
+    assert sorted(groups.LAB) == sorted(COMMANDS)
 
 
 def test_a_command_that_can_not_be_loaded_says_so_and_harms_no_other(
@@ -64,7 +64,7 @@ def test_a_command_that_can_not_be_loaded_says_so_and_harms_no_other(
 ) -> None:
     installed(monkeypatch, {"broken": "no_such_module_at_all:command"})
     assert shell.run(["--help"]) == 0
-    assert shell.run(["states"]) == 0
+    assert shell.run(["--version"]) == 0
     capsys.readouterr()
     assert shell.run(["broken"]) == 2
     assert "no_such_module_at_all" in capsys.readouterr().err

@@ -1,1 +1,4 @@
-"""The commands by groups. Each is thin: it parses, calls one function elsewhere, and shows the result."""
+"""All commands. A command parses its arguments, calls one function elsewhere and shows the result.
+
+Heavy imports are inside the commands, so that ``velatura --help`` is fast.
+"""

@@ -1,68 +1,120 @@
-"""Commands that use several operations of a kiosk. Commands of one operation are in ``controller.cli.derived``."""
+"""``velatura kiosk``: everything that the running kiosk does.
+
+Most of its commands are made from the table of operations (`controller.cli.derived`). Those here use several.
+"""
 
 from __future__ import annotations
 
 import base64
 import sys
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
 
 import typer
 
 from controller.cli import console
-from controller.cli.derived import job
-from controller.cli.running import Json, StageFolder
+from controller.cli.commands.service import install, serve, uninstall
+from controller.cli.derived import call, commands, job
+from controller.cli.groups import Members, StageFolder, group
 from controller.core.errors import UsageError
+from controller.core.text import printable
+
+NONE_YET: Final = "There are none yet."
+
+
+def status(stage: StageFolder) -> None:
+    """What the stage does now, and its faults."""
+    from controller.kiosk.api.offline_dispatch import status_of, status_text
+
+    content = status_of(stage)
+    console.show_result(content, status_text(content))
+
+
+def events(
+    stage: StageFolder,
+    after: Annotated[int, typer.Option(help="Only events after this number.", min=0)] = 0,
+    level: Annotated[Literal["info", "warning", "error"], typer.Option(help="Minimum level.")] = "info",
+) -> None:
+    """The kiosk's event log."""
+    from controller.kiosk.api.offline_dispatch import LEVELS
+
+    rows = [row for row in call(stage, "events", after=after) if LEVELS.index(row["level"]) >= LEVELS.index(level)]
+    lines = [f"{row['number']:>7} {_local(row['unix_s'])} {row['level']:<7} {printable(row['text'])}" for row in rows]
+    console.show_result({"events": rows}, "\n".join(lines))
+
+
+def schedule(
+    stage: StageFolder,
+    zone: Annotated[str | None, typer.Option(help="Time zone, e.g. Europe/Vienna.")] = None,
+    hours: Annotated[
+        list[str] | None,
+        typer.Option(help="DAY=HH:MM-HH:MM or DAY=closed; replaces all rows. DAY is mon, mon-fri, daily, or a date."),
+    ] = None,
+    drift_check: Annotated[str | None, typer.Option(help='HH:MM of the nightly check; "" for no check.')] = None,
+) -> None:
+    """Show the opening hours, or change them."""
+    from controller.kiosk.api.offline_dispatch import changed_schedule, schedule_text
+
+    now = call(stage, "schedule")
+    if zone is not None or hours is not None or drift_check is not None:
+        now = changed_schedule(now, zone, hours, drift_check)
+        call(stage, "set-schedule", **now)
+    console.show_result(now, schedule_text(now))
+
+
+def _local(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s, tz=datetime.now().astimezone().tzinfo).strftime("%Y-%m-%d %H:%M:%S")
 
 
 def results(
     stage: StageFolder,
     run: Annotated[str | None, typer.Argument(help="A run's name (default: all runs with results).")] = None,
-    as_json: Json = False,
 ) -> None:
-    """Show grade and figures of one calibration, or list all calibrations and the quality of the appearances."""
+    """Grade and figures of a calibration, or all calibrations and the quality of the appearances."""
     if run is None:
-        names, compared = _call(stage, "runs"), _call(stage, "comparisons")
-        lines = [*names, *(_achieved(result) for result in compared)]
-        found = {"runs": names, "comparisons": compared}
-        console.show_result(found if as_json else "\n".join(lines) or "There are none yet.", as_json=as_json)
+        names, compared = call(stage, "runs"), call(stage, "comparisons")
+        lines = [*names, *map(_achieved, compared)]
+        console.show_result({"runs": names, "comparisons": compared}, "\n".join(lines) or NONE_YET)
         return
-    found = _call(stage, "results", run=run)
-    grade = found["grade"]
+    content = call(stage, "results", run=run)
+    grade = content["grade"]
     lines = [] if grade is None else [f"Grade {grade['grade']}: {grade['note']}"]
-    lines += [f"{label}: {value}" for label, value in found["figures"]]
-    lines += [f"{name}: {path}" for name, path in found["pictures"].items()]
-    console.show_result(found if as_json else "\n".join(lines), as_json=as_json)
+    lines += [f"{label}: {value}" for label, value in content["figures"]]
+    lines += [f"{name}: {path}" for name, path in content["pictures"].items()]
+    console.show_result(content, "\n".join(lines))
 
 
-def _achieved(one: Mapping[str, Any]) -> str:
-    newest = one["history"][0]
+def _achieved(comparison: Mapping[str, Any]) -> str:
+    newest = comparison["history"][0]
     inside = newest.get("in_reach")
     part = "" if inside is None else f", {inside:.2f} on the {newest['in_reach_share']:.0%} in reach"
-    return (f"{one['name']}: colour difference {newest['delta_e']:.2f} (95 %: {newest['delta_e_p95']:.2f}){part}, "
-            f"sharpness {newest['sharpness']:.2f}, photographed in {newest['run']}")  # fmt: skip
+    difference = f"colour difference {newest['delta_e']:.2f} (95 %: {newest['delta_e_p95']:.2f}){part}"
+    return f"{comparison['name']}: {difference}, sharpness {newest['sharpness']:.2f}, photographed in {newest['run']}"
 
 
 def aim(
     stage: StageFolder,
     picture: Annotated[Path | None, typer.Option(help="Write the camera picture to this JPEG file.")] = None,
     shots: Annotated[bool, typer.Option("--shots", help="First take test shots with all lamps on.")] = False,
-    as_json: Json = False,
 ) -> None:
-    """Show what the projectors cover, and what is too dark, too oblique or out of focus. Needs a running kiosk."""
+    """Show what the projectors cover, and what is too dark, too oblique or out of focus. The kiosk must be running."""
     from controller.kiosk.api.offline_dispatch import aiming_text
 
     if shots:
-        job(stage, "test-shots", {}, as_json=as_json)
+        job(stage, "test-shots", {})
     if picture is not None:
-        data = _call(stage, "camera-picture")
+        data = call(stage, "camera-picture")
         if data is None:
-            raise UsageError("picture-unknown", what="The camera shows no picture now.",
-                             remedy="Check `velatura status`, or take a test shot on the aiming page.")  # fmt: skip
+            raise UsageError(
+                "picture-unknown",
+                what="The camera shows no picture now.",
+                remedy="Check `velatura kiosk status`, or take a test shot on the aiming page.",
+            )
         picture.write_bytes(base64.b64decode(data))
-    found = _call(stage, "aiming")
-    console.show_result(found if as_json else aiming_text(found), as_json=as_json)
+    content = call(stage, "aiming")
+    console.show_result(content, aiming_text(content))
 
 
 def settings(
@@ -70,43 +122,58 @@ def settings(
     check: Annotated[Path | None, typer.Option(help="Check this stage.toml only.")] = None,
     save: Annotated[Path | None, typer.Option(help="Check this stage.toml and use it.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask. Scripts are never asked.")] = False,
-    as_json: Json = False,
 ) -> None:
     """Print stage.toml, check another one, or replace it."""
-    if save is None and check is None:
-        text = _call(stage, "settings")
-        console.show_result({"text": text} if as_json else text, as_json=as_json)
-        return
     from controller.core.files import read_text
 
     file = save or check
-    assert file is not None
-    op, said = (
-        ("save-settings", "The new settings are in use.") if save else ("validate-settings", "The settings are valid.")
-    )
+    if file is None:
+        text = call(stage, "settings")
+        console.show_result({"text": text}, text)
+        return
     try:
         text = read_text(file)
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError("file-unreadable", what=f"{file} can't be read.", remedy="Give a text file.") from error
-    if (
-        save is not None
-        and not yes
-        and sys.stdin.isatty()
-        and (effect := _call(stage, "effect-of-settings", text=text))
-    ):
+    if save is None:
+        call(stage, "validate-settings", text=text)
+        console.show_result({"done": "validate-settings"}, "The settings are valid.")
+        return
+    if not yes and sys.stdin.isatty() and (effect := call(stage, "effect-of-settings", text=text)):
         typer.confirm(f"{effect} Save?", abort=True)
-    _done(stage, op, said, as_json=as_json, text=text)
+    call(stage, "save-settings", text=text)
+    console.show_result({"done": "save-settings"}, "The new settings are in use.")
 
 
-def _call(stage: Path, op: str, **arguments: Any) -> Any:
-    from controller.kiosk.api.offline_dispatch import call
+def list_(stage: StageFolder) -> None:
+    """List all accounts and tokens."""
+    accounts, tokens = call(stage, "accounts"), call(stage, "tokens")
+    lines = [
+        f"{account['name']:<32} {account['role']}{', one-time password' if account['one_time'] else ''}"
+        for account in accounts
+    ]
+    lines += [f"{token['name']:<32} {token['role']}, token" for token in tokens]
+    console.show_result({"accounts": accounts, "tokens": tokens}, "\n".join(lines) or NONE_YET)
 
-    return call(stage, op, **arguments)
+
+ACCOUNT: Final = group(
+    "account",
+    "People who may log in at the stage's panel, and tokens for programs.",
+    {"Commands": (list_, *commands("kiosk account").values())},
+)
+_SHOWN: Final = ("start", "stop", "show", "rotate", "next", "black", "pause", "brightness", "identify")
+_WORK: Final = ("calibrate", "photograph", "cancel", "appearances", "add", "remove", "canvas", "reach")
 
 
-def _done(stage: Path, op: str, sentence: str, *, as_json: bool, **arguments: Any) -> None:
-    _call(stage, op, **arguments)
-    console.show_result({"done": op} if as_json else sentence, as_json=as_json)
+def _members() -> Members:
+    derived = commands("kiosk")
+    shown, work = ([derived.pop(name) for name in names] for names in (_SHOWN, _WORK))
+    return {
+        "Run it": (serve, install, uninstall, status, events),
+        "What it shows": shown,
+        "Calibration and appearances": (*work, results, aim),
+        "Look after it": (schedule, settings, ACCOUNT, *derived.values()),
+    }
 
 
-COMMANDS = (results, aim, settings)
+KIOSK: Final = group("kiosk", "Run the stage by itself, and tell the running kiosk what to do.", _members())

@@ -149,7 +149,7 @@ def call_kiosk(stage: Path, op: str, *, timeout_s: float = 30.0, **arguments: An
         raise UsageError(
             "not-serving",
             what="No kiosk runs on this stage, or it does not answer.",
-            remedy="Start it with `velatura serve`.",
+            remedy="Start it with `velatura kiosk serve`.",
         ) from error
     if not answer.get("ok"):
         problem = answer.get("error") or {

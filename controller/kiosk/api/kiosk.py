@@ -73,7 +73,7 @@ class StageKiosk(AttachedKiosk):
         waits = service.reconciler.waits(number)
         if (job := service.jobs.known(number)) is None and not waits:
             raise WorkError("job-given-up", what="The job will not start: the kiosk cancelled it or restarted.",
-                            remedy="See `velatura events` for the reason, then start it again.")  # fmt: skip
+                            remedy="See `velatura kiosk events` for the reason, then start it again.")  # fmt: skip
         return job
 
     def cancel(self) -> None:

@@ -36,7 +36,8 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
     folder = load_stage(stage).folder
     operation = offline_operation(op)
     if operation is None:
-        raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy="Start it with `velatura serve`.")
+        remedy = "Start it with `velatura kiosk serve`."
+        raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy=remedy)
     values = local_values(operation, arguments)
     if operation.effect is Effect.LOOKS:
         return plain(operation.of(_holder(operation, folder), values))
@@ -140,6 +141,6 @@ def aiming_text(aiming: Mapping[str, Any]) -> str:
     lines.append(f"Lit by two or more {aiming['overlap']:.0%}, too dark {aiming['too_dark']:.0%}, "
                  f"too grazing {aiming['too_grazing']:.0%}")  # fmt: skip
     if not aiming["source"]:
-        lines = ["Nothing has been measured yet. Take test shots: `velatura aim STAGE --shots`."]
+        lines = ["Nothing has been measured yet. Take test shots: `velatura kiosk aim STAGE --shots`."]
     pictures = [f"Picture: {aiming['picture']}"] if aiming["picture"] else []
     return "\n".join(map(printable, [*lines, *aiming["hints"], *pictures]))

@@ -21,7 +21,9 @@ _MEASURE: Final = "Recalibrate (quick) when the stage is closed."
 _OLD_ONE: Final = "If the picture is worse than before, install the version of before."
 KINDS: Final = {
     "kernel": _Kind("The kernel", f"{_OLD_ONE} It is in the boot menu."),
-    "gpu driver": _Kind("The driver of the graphics card", f"Look at the outputs with `velatura identify`. {_OLD_ONE}"),
+    "gpu driver": _Kind(
+        "The driver of the graphics card", f"Look at the outputs: `velatura kiosk identify`. {_OLD_ONE}"
+    ),
     "gpu": _Kind("The graphics card", "Type `velatura kiosk install --outputs`, then look at the outputs."),
     "package": _Kind("The package", _OLD_ONE),
     "edid": _Kind(
@@ -36,7 +38,7 @@ KINDS: Final = {
     "output order": _Kind(
         "The place of output",
         "Put the cables as they were, or correct the outputs in stage.toml. "
-        "`velatura identify` shows which projector is which.",
+        "`velatura kiosk identify` shows which projector is which.",
     ),
     "serial adapter": _Kind(
         "The serial adapter",

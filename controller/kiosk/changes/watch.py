@@ -140,7 +140,7 @@ class InventoryWatch:
         if unreported:
             text = " ".join(one.sentence for one in unreported[:MOST_NAMED])
             more = f" And {len(unreported) - MOST_NAMED} more." if len(unreported) > MOST_NAMED else ""
-            remedy = "See `velatura changes`, or the page Changes in the panel."
+            remedy = "See `velatura kiosk changes`, or the page Changes in the panel."
             self._log.add(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))
 
 

@@ -39,6 +39,6 @@ def shipped(prefix: Path) -> dict[Path, str]:
 def controller_options(host: str) -> str:
     """The panel in the local network, with TLS; to be changed by people."""
     return (
-        "# Options of `velatura serve` for this kiosk; `velatura serve --help` explains them.\n"
+        "# Options of `velatura kiosk serve` for this kiosk; `velatura kiosk serve --help` explains them.\n"
         f"OPTIONS=--panel 0.0.0.0:8377 --certificate {CERTIFICATE} --key {KEY} --name {host} --name {host}.local\n"
     )

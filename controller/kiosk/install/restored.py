@@ -1,4 +1,4 @@
-"""`velatura kiosk restore`: a backup on a computer that was blank, with the cables in any order."""
+"""`velatura kiosk install --backup`: a backup on a computer that was blank, with the cables in any order."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def restore(
     """
     if system.read(STAGE / FILE) is not None:
         raise UsageError("kiosk-has-stage", what="This kiosk has a stage already.",
-                         remedy=f"Replace it: runuser -u {USER} -- velatura restore {STAGE} FILE")  # fmt: skip
+                         remedy=f"Replace it: runuser -u {USER} -- velatura kiosk restore {STAGE} FILE")  # fmt: skip
     archive.check_backup(file)
     steps.install(system, outputs_again=True, restart=False, say=say, prefix=prefix)
     if system.dry:

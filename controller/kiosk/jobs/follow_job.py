@@ -50,7 +50,7 @@ def ask_and_follow(
 def _ended(job: Mapping[str, Any]) -> Mapping[str, Any]:
     if job["failed"]:
         raise WorkError("job-failed", what=f"{job['name']}: {job['outcome']}",
-                        remedy="See `velatura events` for the decisions and their reasons.")  # fmt: skip
+                        remedy="See `velatura kiosk events` for the decisions and their reasons.")  # fmt: skip
     return {"job": job["name"], "outcome": job["outcome"], **({"run": job["run"]} if job["run"] else {})}
 
 

@@ -95,8 +95,8 @@ def _declared(name: str, about: str, effect: Effect, **more: Any) -> Operation:
 
 
 ACCOUNT_OPERATIONS: Final = (
-    _declared("accounts", "List the accounts", Effect.LOOKS, within="account list"),
-    _declared("tokens", "List the API tokens, without their secrets", Effect.LOOKS, within="account list"),
+    _declared("accounts", "List the accounts", Effect.LOOKS, within="kiosk account list"),
+    _declared("tokens", "List the API tokens, without their secrets", Effect.LOOKS, within="kiosk account list"),
     _declared("add-account", "Add an account", Effect.CHANGES, fields=(_NAME, _ROLE, _PASSWORD),
               answer=Answer.NOTHING, http=("POST", "/accounts"), command="account add", said="{name} may log in."),
     _declared("set-role", "Change an account's role, and end its sessions", Effect.CHANGES, fields=(_NAME, _ROLE),

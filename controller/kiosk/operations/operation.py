@@ -63,8 +63,9 @@ class Operation:
     ``gives``: the type of what ``part`` returns, where the method returns another.
     ``offline``: ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``http``: method and path below
     /api/v1; ``at_socket``, ``command``, ``verb``: its name at the socket, on the command line and for building control.
-    All names default to ``name``. ``within``: the hand-written command that includes it. ``said``: the sentence shown
-    when it is done, with the values as format fields; ``more``: what the help says after ``about``;
+    All names default to ``name``; the command follows "kiosk". ``within``: the command that includes it, or does more.
+    ``said``: the sentence shown when it is done, with the values as format fields; ``more``: what the help says after
+    ``about``;
     ``asks``: the question that a person has to answer with yes before, with the values as format fields
     """
 
@@ -104,8 +105,8 @@ class Operation:
 
     @property
     def words(self) -> str:
-        """The command after ``velatura``."""
-        return self.within or self.command or self.name
+        """The command after ``velatura``: a verb of ``velatura kiosk``, if it is not ``within`` another."""
+        return self.within or f"kiosk {self.command or self.name}"
 
     @property
     def building_verb(self) -> str:

@@ -271,7 +271,7 @@ def _not_ours() -> UsageError:
     return UsageError(
         "not-a-backup",
         what="This file is not a backup of a Velatura stage, or it is damaged.",
-        remedy="Use a file that was made by `velatura backup` or the panel.",
+        remedy="Use a file that was made by `velatura kiosk backup` or the panel.",
     )
 
 

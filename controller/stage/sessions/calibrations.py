@@ -92,7 +92,7 @@ def signing_key(checked: Checked) -> Path | None:
     raise UsageError(
         "no-signing-key",
         what=f"The stage has no signing key in {KEY_FILE}.",
-        remedy="Make one with `velatura keys STAGE`. It also shows the line to add to stage.toml.",
+        remedy="Make one with `velatura bundle key STAGE`. It also shows the line to add to stage.toml.",
     )
 
 
@@ -102,7 +102,7 @@ def _check_own_key(path: Path, trust: Trust) -> None:
     if public in trust.revoked:
         problem, remedy = (
             "is revoked",
-            f"Move {path} away, make a new key with `velatura keys STAGE`, and add it to trusted_keys.",
+            f"Move {path} away, make a new key with `velatura bundle key STAGE`, and add it to trusted_keys.",
         )
     elif public not in trust.keys and (trust.keys or not trust.allow_unsigned):
         problem, remedy = "is not trusted", f'Add "{public.hex()}" to trusted_keys under [bundle] in stage.toml.'

@@ -179,9 +179,9 @@ def install_grey(stage: Path) -> None:
 
 @contextlib.contextmanager
 def service(stage: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
-    """``velatura serve`` in a process of its own (without options without panel), its lamps left lit at the end."""
+    """``velatura kiosk serve`` in its own process (without options without panel), its lamps left lit at the end."""
     options = options or ("--no-panel",)
-    command = [sys.executable, "-m", "controller", "serve", str(stage), "--leave-lit", *options]
+    command = [sys.executable, "-m", "controller", "kiosk", "serve", str(stage), "--leave-lit", *options]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         try:
             yield process

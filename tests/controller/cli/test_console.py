@@ -24,7 +24,7 @@ def now(phase: Phase = Phase.RUNNING, step_fraction: float = 0.0, note: str = ""
 
 def test_machines_get_one_object_a_line() -> None:
     stream = io.StringIO()
-    with console.reporter(as_json=True, stream=stream) as reporter:
+    with console.json_lines(True), console.reporter(stream) as reporter:
         reporter.progress(now(note=HOSTILE))
         reporter.say("three lamps", Level.WARNING)
     progress, message = (json.loads(line) for line in stream.getvalue().splitlines())
@@ -36,7 +36,7 @@ def test_machines_get_one_object_a_line() -> None:
 
 def test_plain_output_has_a_line_for_each_change_not_for_each_call() -> None:
     stream = io.StringIO()
-    with console.reporter(as_json=False, stream=stream) as reporter:
+    with console.reporter(stream) as reporter:
         for hundredth in range(100):
             reporter.progress(now(step_fraction=hundredth / 100))
         reporter.progress(now(Phase.DONE))
@@ -48,7 +48,7 @@ def test_plain_output_has_a_line_for_each_change_not_for_each_call() -> None:
 
 def test_a_terminal_sees_step_percentage_and_time_left() -> None:
     terminal = Terminal()
-    with console.reporter(as_json=False, stream=terminal) as reporter:
+    with console.reporter(terminal) as reporter:
         reporter.progress(now(note="shot 7 of 35"))
         reporter.progress(now(Phase.SKIPPED))
     text = terminal.getvalue()
@@ -59,7 +59,7 @@ def test_a_terminal_sees_step_percentage_and_time_left() -> None:
 
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()], ids=["plain", "terminal"])
 def test_what_a_device_said_cannot_steer_the_terminal(stream: io.StringIO) -> None:
-    with console.reporter(as_json=False, stream=stream) as reporter:
+    with console.reporter(stream) as reporter:
         reporter.say(f"This is {HOSTILE}.")
         reporter.progress(now(note=HOSTILE))
     text = stream.getvalue()
@@ -70,13 +70,14 @@ def test_what_a_device_said_cannot_steer_the_terminal(stream: io.StringIO) -> No
 
 
 def test_errors_are_two_sentences_on_stderr_or_one_object_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    console.show_error("camera-gone", f"The camera {HOSTILE} left.", "Plug it in.", as_json=False)
+    console.show_error("camera-gone", f"The camera {HOSTILE} left.", "Plug it in.")
     people = capsys.readouterr()
     assert people.out == ""
     assert people.err.startswith("velatura: The camera EP910")
     assert people.err.endswith("left.\nPlug it in.\n")
     assert "\x1b" not in people.err
-    console.show_error("camera-gone", HOSTILE, "Plug it in.", as_json=True)
+    with console.json_lines(True):
+        console.show_error("camera-gone", HOSTILE, "Plug it in.")
     machines = capsys.readouterr()
     assert json.loads(machines.out) == {
         "error": {"code": "camera-gone", "what": printable(HOSTILE), "remedy": "Plug it in."}

@@ -36,7 +36,7 @@ from pathlib import Path
 from controller.stage.check import check_stage
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.cli.serve_command import serve
+from controller.cli.kiosk_process import serve
 from controller.kiosk.service import Service
 stage = Path(sys.argv[1])
 kiosk = StageKiosk(stage)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -11,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
-from controller.__main__ import COMMANDS, GROUPS, run
+from controller.__main__ import application, run
+from controller.cli.groups import words_of
 from controller.core.errors import VelaturaError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer
@@ -24,9 +25,7 @@ from tests.controller.kiosk.test_boot import STAGE
 
 
 def test_every_operation_has_a_command_that_exists() -> None:
-    known = {command.__name__.replace("_", "-") for command in COMMANDS}
-    known |= {f"{group} {one.__name__.replace('_', '-')}" for group, (_, ones) in GROUPS.items() for one in ones}
-    assert {operation.words for operation in OPERATIONS} <= known
+    assert {operation.words for operation in OPERATIONS} <= set(words_of(typer.main.get_command(application())))
 
 
 def answered(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
@@ -43,12 +42,12 @@ def test_accounts_of_a_stage_that_nobody_serves(
     os.close(write)
     with os.fdopen(read) as typed:
         monkeypatch.setattr(sys, "stdin", typed)
-        answered(capsys, "account", "add", tmp_path, "tina", "--role", "technician")
-    assert answered(capsys, "account", "add-token", tmp_path, "watch").startswith("velatura_")
-    assert answered(capsys, "account", "list", tmp_path).split("\n")[:2] == [
+        answered(capsys, "kiosk", "account", "add", tmp_path, "tina", "--role", "technician")
+    assert answered(capsys, "kiosk", "account", "add-token", tmp_path, "watch").startswith("velatura_")
+    assert answered(capsys, "kiosk", "account", "list", tmp_path).split("\n")[:2] == [
         f"{'tina':<32} technician", f"{'watch':<32} viewer, token",
     ]  # fmt: skip
-    assert run(["account", "remove", str(tmp_path), "tina"]) != 0, "the last technician stays"
+    assert run(["kiosk", "account", "remove", str(tmp_path), "tina"]) != 0, "the last technician stays"
 
 
 def test_settings_are_checked_before_they_are_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,20 +55,10 @@ def test_settings_are_checked_before_they_are_used(tmp_path: Path, capsys: pytes
     wrong, right = tmp_path / "wrong.toml", tmp_path / "right.toml"
     wrong.write_text(STAGE.replace("iso = 100", "iso = 1"))
     right.write_text(STAGE.replace("iso = 100", "iso = 200"))
-    assert run(["settings", str(tmp_path), "--save", str(wrong)]) != 0
-    assert answered(capsys, "settings", tmp_path) == STAGE + "\n"
-    answered(capsys, "settings", tmp_path, "--save", right)
-    assert "iso = 200" in answered(capsys, "settings", tmp_path)
-
-
-def test_the_shell_completes_names_from_stage_toml(tmp_path: Path) -> None:
-    (tmp_path / "stage.toml").write_text(STAGE)
-    words = f"velatura recalibrate {tmp_path} --projector l"
-    asked = os.environ | {"_VELATURA_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "4"}
-    told = subprocess.run(
-        [sys.executable, "-m", "controller"], env=asked, capture_output=True, text=True, check=False, timeout=60
-    )
-    assert told.stdout.split() == ["left"], told.stderr
+    assert run(["kiosk", "settings", str(tmp_path), "--save", str(wrong)]) != 0
+    assert answered(capsys, "kiosk", "settings", tmp_path) == STAGE + "\n"
+    answered(capsys, "kiosk", "settings", tmp_path, "--save", right)
+    assert "iso = 200" in answered(capsys, "kiosk", "settings", tmp_path)
 
 
 class ModelJob:

@@ -36,4 +36,4 @@ def test_the_keeper_tells_it_once_and_shows_it_as_long_as_it_plays(tmp_path: Pat
     else:
         assert warnings == [supervisor.view.warning]
         assert "origin is unknown" in warnings[0].text
-        assert "velatura keys" in warnings[0].remedy
+        assert "velatura bundle key" in warnings[0].remedy

@@ -1,4 +1,4 @@
-"""``velatura keys`` and ``velatura bundle``, by what they print, return and leave on disk."""
+"""``velatura bundle key`` and ``velatura bundle``, by what they print, return and leave on disk."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     folder = tmp_path / "stage"
     folder.mkdir()
     (folder / "stage.toml").write_text(STAGE)
-    shell.run(["keys", str(folder)])
+    shell.run(["bundle", "key", str(folder)])
     lines = capsys.readouterr().out.splitlines()[-2:]
     (folder / "stage.toml").write_text("\n".join([*lines, STAGE]))
     run = folder / "runs" / "20260101-000000-calibrate"
@@ -113,7 +113,7 @@ def test_the_lines_for_a_further_key_take_the_place_of_the_first(
     stage: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = stage / "stage.toml"
-    shell.run(["keys", str(stage), "--name", "second"])
+    shell.run(["bundle", "key", str(stage), "--name", "second"])
     said = capsys.readouterr().out
     assert "[bundle]" not in said
     number = int(re.search(r"replace trusted_keys in line (\d+)", said)[1])  # type: ignore[index]
@@ -123,7 +123,7 @@ def test_the_lines_for_a_further_key_take_the_place_of_the_first(
     file.write_text("\n".join(lines))
     assert len(load_stage(stage).tables.bundle.trusted_keys) == 2
     file.write_text(file.read_text().replace(lines[number - 1], "allow_unsigned = false"))
-    shell.run(["keys", str(stage), "--name", "third"])
+    shell.run(["bundle", "key", str(stage), "--name", "third"])
     said = capsys.readouterr().out
     assert "[bundle]\n" not in said
     number = int(re.search(r"add to \[bundle\] in line (\d+)", said)[1])  # type: ignore[index]

@@ -151,7 +151,7 @@ def test_a_damaged_inventory_is_as_none(days: Days, damage: str) -> None:
 
 
 def test_the_command_names_a_change_of_the_settings_while_no_kiosk_runs(days: Days) -> None:
-    nothing = CliRunner().invoke(application(), ["changes", str(days.stage)])
+    nothing = CliRunner().invoke(application(), ["kiosk", "changes", str(days.stage)])
     assert "There was no good day yet" in nothing.stdout
     kiosk = FolderKiosk(days.stage)
     assert kiosk.changes().good_unix_s is None
@@ -163,10 +163,10 @@ def test_the_command_names_a_change_of_the_settings_while_no_kiosk_runs(days: Da
     inventory.keep_good(days.stage, replace(good, taken_unix_s=NOON_S))
     text = (days.stage / "stage.toml").read_text()
     (days.stage / "stage.toml").write_text(text.replace("iso = 100", "iso = 200"))
-    shown = CliRunner().invoke(application(), ["changes", str(days.stage)])
+    shown = CliRunner().invoke(application(), ["kiosk", "changes", str(days.stage)])
     assert shown.exit_code == 0
     assert f"The last good day was 2026-05-04 20:00 ({FIRST})." in shown.stdout
     assert "In stage.toml, camera.iso was 100, and is now 200." in shown.stdout
-    answer = json.loads(CliRunner().invoke(application(), ["changes", str(days.stage), "--json"]).stdout)
+    answer = json.loads(CliRunner().invoke(application(), ["kiosk", "changes", str(days.stage), "--json"]).stdout)
     assert [one["kind"] for one in answer["result"]["changes"]] == ["settings"]
     assert answer["result"]["unknown"] == ["The camera"]

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from controller.cli import serve_command as program
+from controller.cli import kiosk_process as program
 from controller.core.errors import VelaturaError, WorkError
 from controller.core.storage import runtime_folder, write_atomically
 from controller.kiosk.api import kiosk as kiosk_module

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.cli import derived
-from controller.cli.running import group
+from controller.cli.groups import group
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer, call_kiosk
 from controller.kiosk.api.folder import FolderKiosk
@@ -71,7 +71,7 @@ def test_the_api_has_it_with_its_limits_and_its_role(kiosk: StageKiosk, tmp_path
 
 
 def test_socket_and_command_line_have_it(kiosk: StageKiosk) -> None:
-    program = group("velatura", "For this test.", derived.commands(operations=DECLARED))
+    program = group("kiosk", "For this test.", {"": tuple(derived.commands("kiosk", DECLARED).values())})
     table = socket_table(kiosk.holders(), DECLARED)
     with ControlServer(runtime_folder(kiosk.stage.resolve()) / NAME, table):
         assert call_kiosk(kiosk.stage, "chime", times=2) == {"rung": 2, "at": "hall"}
@@ -86,7 +86,7 @@ def test_socket_and_command_line_have_it(kiosk: StageKiosk) -> None:
 
 def test_where_no_kiosk_runs_it_is_done_on_the_folder(kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dispatch, "AT_SOCKET", DECLARED)
-    program = group("velatura", "For this test.", derived.commands(operations=DECLARED))
+    program = group("kiosk", "For this test.", {"": tuple(derived.commands("kiosk", DECLARED).values())})
     shown = CliRunner().invoke(program, ["chime", str(kiosk.stage), "5"])
     assert "rung" in shown.output, shown.exception
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.cli.serve_command import PanelAddress, _check_panel
+from controller.cli.kiosk_process import PanelAddress, _check_panel
 from controller.core.errors import UsageError
 from controller.kiosk.store.accounts import Role
 from controller.panel.api import PREFIX

@@ -97,7 +97,7 @@ def test_the_stages_own_key_signs_if_the_stage_trusts_it(stage: Path) -> None:
 
 
 def test_without_a_key_bundles_are_unsigned_only_if_the_stage_says_so(stage: Path) -> None:
-    with pytest.raises(UsageError, match="velatura keys") as wrong:
+    with pytest.raises(UsageError, match="velatura bundle key") as wrong:
         signing_key(check_stage(stage))
     assert wrong.value.code == "no-signing-key"
     write(stage, unsigned=True)

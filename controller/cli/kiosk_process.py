@@ -1,4 +1,4 @@
-"""Runs ``velatura serve``: the service, its socket and the panel, until it is asked to stop."""
+"""Runs ``velatura kiosk serve``: the service, its socket and the panel, until it is asked to stop."""
 
 from __future__ import annotations
 

@@ -1,0 +1,156 @@
+"""``velatura kiosk serve``, ``install`` and ``uninstall``."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controller.cli import console
+from controller.cli.groups import StageFolder, work
+from controller.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from controller.cli.kiosk_process import PanelAddress
+    from controller.panel.mqtt.options import BrokerOptions
+    from controller.run.progress import Reporter
+
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; print what would be done.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Where the panel listens, and how browsers reach it."""
+
+    panel: Annotated[str, typer.Option(help="HOST:PORT where the panel listens.")] = "127.0.0.1:8377"
+    no_panel: Annotated[bool, typer.Option("--no-panel", help="Do not start the panel.")] = False
+    name: Annotated[list[str] | None, typer.Option(help="Another host name for the panel; can be repeated.")] = None
+    certificate: Annotated[Path | None, typer.Option(help="TLS certificate (PEM) of the panel.")] = None
+    key: Annotated[Path | None, typer.Option(help="TLS key (PEM) of the panel.")] = None
+
+    def address(self, broker: BrokerOptions | None) -> PanelAddress | None:
+        """None without a panel. Raises UsageError("address-wrong", "mqtt-without-panel")."""
+        from controller.cli.kiosk_process import PanelAddress, parse_address
+
+        if not self.no_panel:
+            host, port = parse_address(self.panel)
+            return PanelAddress(host, port, self.certificate, self.key, tuple(self.name or ()), broker)
+        if broker is not None:
+            raise UsageError(
+                "mqtt-without-panel",
+                what="MQTT needs the panel, but --no-panel is given.",
+                remedy="Remove --no-panel; the panel listens only on this machine by default.",
+            )
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Broker:
+    """The MQTT broker of the building's control."""
+
+    mqtt: Annotated[str | None, typer.Option(help="HOST[:PORT] of the MQTT broker for building control.")] = None
+    mqtt_topic: Annotated[str, typer.Option(help="First part of all MQTT topics.")] = "velatura"
+    mqtt_user: Annotated[str | None, typer.Option(help="User name for the MQTT broker.")] = None
+    mqtt_password_file: Annotated[
+        Path | None, typer.Option(help="File that contains only the password for the MQTT broker.")
+    ] = None
+    mqtt_certificates: Annotated[
+        Path | None, typer.Option(help="CA certificates (PEM) to check the MQTT broker (default: no TLS).")
+    ] = None
+    mqtt_discovery: Annotated[
+        str, typer.Option(help="Let Home Assistant find the stage: its discovery prefix, usually homeassistant.")
+    ] = ""
+
+    def options(self) -> BrokerOptions | None:
+        """None without a broker. Raises UsageError("address-wrong")."""
+        from controller.cli.kiosk_process import parse_address
+        from controller.panel.mqtt.options import BrokerOptions
+
+        if self.mqtt is None:
+            return None
+        usual_port = 1883 if self.mqtt_certificates is None else 8883
+        address = parse_address(self.mqtt if ":" in self.mqtt else f"{self.mqtt}:{usual_port}")
+        return BrokerOptions(
+            *address, self.mqtt_topic, self.mqtt_user, self.mqtt_password_file, self.mqtt_certificates,
+            self.mqtt_discovery,
+        )  # fmt: skip
+
+
+def serve(
+    stage: StageFolder,
+    panel: Panel,
+    broker: Broker,
+    leave_lit: Annotated[
+        bool, typer.Option("--leave-lit", help="Leave the lamps on at exit, for a service that restarts.")
+    ] = False,
+    setup: Annotated[
+        bool, typer.Option("--setup", help="Start without a valid stage.toml, for set-up in the panel.")
+    ] = False,
+) -> None:
+    """Run the stage by its opening hours, with its panel, until Ctrl-C."""
+    address = panel.address(broker.options())
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.cli.kiosk_process import serve
+
+        return serve(stage=stage, panel=address, leave_lit=leave_lit, setup=setup, reporter=reporter, cancel=cancel)
+
+    work(do)
+
+
+def install(
+    backup: Annotated[
+        Path | None,
+        typer.Option(
+            help="Make this blank computer the kiosk of this backup (velatura-DATE.tar.gz). All projectors must be "
+            "switched on. Where serial numbers do not tell which is which, they show numbers, and you are asked.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    dry_run: DryRun = False,
+    outputs: Annotated[
+        bool, typer.Option("--outputs", help="Look again which projectors are plugged in; all must be switched on.")
+    ] = False,
+    restart: Annotated[
+        bool,
+        typer.Option("--restart", help="Start controller and player again, for a new version. Lamps stay lit."),
+    ] = False,
+) -> None:
+    """Make this computer a kiosk, and start it. As root, on Debian 12 or 13: user, services, X server and panel."""
+    from controller.kiosk.install import restored, steps
+    from controller.kiosk.install.system import System
+
+    _require_root(dry_run)
+    system = System(console.say, dry=dry_run)
+    if backup is not None:
+        restored.restore(system, backup.absolute(), ask=lambda text: str(typer.prompt(text)), say=console.say)
+    else:
+        steps.install(system, outputs_again=outputs, restart=restart, say=console.say)
+    text = "The kiosk runs, and starts with this computer."
+    if backup is not None:
+        text = "The backup is in place. `velatura kiosk changes` and `velatura doctor` tell what is different here."
+    console.show_result({"installed": not dry_run}, "Nothing was changed." if dry_run else text)
+
+
+def uninstall(
+    dry_run: DryRun = False,
+    purge: Annotated[bool, typer.Option("--purge", help="Remove the stage, the settings and the user, too.")] = False,
+) -> None:
+    """Stop the kiosk, and remove what `velatura kiosk install` wrote. The stage stays. As root."""
+    from controller.kiosk.install import steps
+    from controller.kiosk.install.system import System
+
+    _require_root(dry_run)
+    steps.uninstall(System(console.say, dry=dry_run), purge=purge)
+    console.show_result({"removed": not dry_run}, "Nothing was changed." if dry_run else "The kiosk is removed.")
+
+
+def _require_root(dry_run: bool) -> None:
+    if os.geteuid() != 0 and not dry_run:
+        raise UsageError("needs-root", what="Only root can do this.", remedy="Type it as root, or with sudo.")
