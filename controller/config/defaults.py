@@ -1,4 +1,7 @@
-"""Values that hold where stage.toml says nothing, and where there is no stage.toml."""
+"""Values that hold where stage.toml says nothing, and where there is no stage.toml.
+
+On their own because the solver needs them without pydantic.
+"""
 
 from __future__ import annotations
 

@@ -12,10 +12,8 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from controller.config.lines import KeyLines, KeyPath
-from controller.config.models import ConfigTable, OpenConfigTable, StageTables
-from controller.config.problems import Place
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable, ConfigTable, OpenConfigTable, StageTables
+from controller.config.problems import KeyLines, KeyPath, Place
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, read_bytes
 from controller.core.text import printable

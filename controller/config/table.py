@@ -1,11 +1,12 @@
-"""What the tables of a configuration file have in common: strictness, and where they stand in their file."""
+"""What the tables of a configuration file have in common: strictness, their place in the file, checked settings."""
 
 from __future__ import annotations
 
+import types
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, TypeAdapter, ValidationError
 
 from controller.config.problems import Place, check_keys
 
@@ -52,3 +53,43 @@ class OpenConfigTable(ConfigTable):
 def _plain(value: Any) -> Any:
     """As TOML has it: lists, not tuples."""
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+_NAMES: Mapping[Any, str] = {
+    float: "a number",
+    int: "a whole number",
+    str: "text in quotes",
+    bool: "true or false",
+}
+
+
+def checked_arguments(place: Place, values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
+    """``values`` of the table at ``place`` as the types in ``wanted`` have them; lists become tuples.
+
+    Raises UsageError("stage-key-type") with the line. Numbers must be finite.
+    """
+    return {key: _checked(place, key, value, wanted[key]) for key, value in values.items()}
+
+
+def allowed(kind: Any) -> str:
+    """A type in words: ``a list of 3, each a number``."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return "one of " + ", ".join(f'"{word}"' for word in inner)
+    if origin is tuple:
+        return f"a list of {len(inner)}, each {allowed(inner[0])}"
+    if origin in (Union, types.UnionType):
+        return " or ".join(allowed(part) for part in inner if part is not type(None))
+    return _NAMES.get(kind, "left out")
+
+
+def _checked(place: Place, key: str, value: Any, kind: Any) -> Any:
+    try:
+        adapter = TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False))
+        return adapter.validate_python(_tuples(value))
+    except ValidationError as error:
+        raise place.wrong_type(key, value, "is not allowed", allowed(kind)) from error
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

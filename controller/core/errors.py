@@ -1,7 +1,11 @@
-"""The controller's errors; their base and the errors of devices are in ``hal.errors``."""
+"""The controller's errors, and the codes of what a calibration may find wrong with devices, object or room.
+
+The base of the errors and the errors of devices are in ``hal.errors``.
+"""
 
 from __future__ import annotations
 
+import enum
 from typing import ClassVar, Final
 
 from hal.errors import CodedError
@@ -35,3 +39,21 @@ class CalibrationError(WorkError):
 
 class BundleError(WorkError):
     """A bundle is damaged, not trusted, or does not fit this stage."""
+
+
+class TroubleCode(enum.StrEnum):
+    """What a calibration may find wrong; the code of a ``Notice`` in the report."""
+
+    CAMERA_GLARE = "camera-glare"
+    COLOUR_FRINGES = "colour-fringes"
+    EXPOSURE_TIMES = "exposure-times"
+    GLOSS = "gloss"
+    HOT_PIXELS = "hot-pixels"
+    LENS_DISTORTION = "lens-distortion"
+    PAINT_COLOURS = "paint-colours"
+    PANEL_ALIGNMENT = "panel-alignment"
+    PIXEL_RESPONSE = "pixel-response"
+    PROJECTOR_GLARE = "projector-glare"
+    SURFACE_SPREAD = "surface-spread"
+    UNSTEADY_LAMP = "unsteady-lamp"
+    WHITE_SEGMENT = "white-segment"

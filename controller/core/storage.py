@@ -1,4 +1,4 @@
-"""Files that survive a power cut: temporary name, fsync, rename, fsync of the folder; hashes; locks."""
+"""Files that survive a power cut: temporary name, fsync, rename, fsync of the folder; hashes, locks, sockets."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import errno
 import fcntl
 import hashlib
 import os
+import socket
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 from controller.core import kiosk_places
 from controller.core.errors import UsageError, WorkError
@@ -152,3 +153,28 @@ def _refuse_unsafe(folder: Path) -> None:
             what=f"{folder} belongs to another user or is open to others.",
             remedy="Remove it, or set XDG_RUNTIME_DIR to a private folder, and start again.",
         )
+
+
+LONGEST_PATH_BYTES: Final = 106
+"""The system's 107, less the dot of the name that it has before it takes connections."""
+
+
+def listening(path: Path, backlog: int) -> socket.socket:
+    """A stream socket at ``path``, for this user alone, in the place of what was there.
+
+    It appears there when it takes connections: whoever sees it is not refused. Raises OSError.
+    """
+    before_it_listens = path.with_name(f".{path.name}")
+    before_it_listens.unlink(missing_ok=True)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    mask = os.umask(0o177)
+    try:
+        listener.bind(str(before_it_listens))
+        listener.listen(backlog)
+        before_it_listens.replace(path)
+    except OSError:
+        listener.close()
+        raise
+    finally:
+        os.umask(mask)
+    return listener

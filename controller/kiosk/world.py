@@ -16,8 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from controller.config.models import StageTables
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable, StageTables
 from controller.kiosk.alerts.alerts import Send, ways_out
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine

@@ -1,19 +1,23 @@
 """Runs steps in order: each once, with a deadline, stoppable at any time, resumed from the journal.
 
-Steps that only calculate run beside later ones that use devices, so that a camera need not wait for them.
+Steps that only calculate run beside later ones that use devices, so that a camera need not wait for them. The time
+that a step takes is estimated from the last runs of its kind.
 """
 
 from __future__ import annotations
 
+import contextlib
+import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.core.errors import VelaturaError, WorkError
 from controller.run.background import Advance, BackgroundSteps
-from controller.run.durations import measured
 from controller.run.journal import Artefact, Journal
 from controller.run.progress import Reporter, Silent, Tracker
 from controller.run.state_machine import Event, Machine
@@ -252,3 +256,26 @@ def _check_order(steps: Sequence[Step]) -> None:
         if step.id in seen or not seen.issuperset(step.after):
             raise ValueError(f"step {str(step.id)!r} is there twice, or stands before a step that it reads from")
         seen.add(step.id)
+
+
+RUNS: Final = 3
+"""So many runs of the same kind are asked, the newest first."""
+
+
+def measured(run: Path, steps: Sequence[StepId]) -> list[float | None]:
+    """Seconds that each step took in the last runs of this kind beside ``run`` (DATE-TIME-KIND); None: not known.
+
+    A step that no run had (a new appearance) takes as long as the others of its kind.
+    """
+    kind = run.name.rpartition("-")[2]
+    same: defaultdict[StepId, list[float]] = defaultdict(list)
+    alike: defaultdict[str, list[float]] = defaultdict(list)
+    others = (path for path in sorted(run.parent.glob(f"*-*-{kind}"), reverse=True) if path != run)
+    for folder in [path for path in others if (path / Journal.FILE).is_file()][:RUNS]:
+        # A journal that can't be read only makes the estimate worse.
+        with contextlib.suppress(VelaturaError), Journal(folder) as journal:
+            for step, seconds in journal.steps().items():
+                same[step].append(seconds)
+                alike[step.kind].append(seconds)
+    found = [same.get(step) or alike.get(step.kind) for step in steps]
+    return [None if seconds is None else max(0.01, statistics.median(seconds)) for seconds in found]

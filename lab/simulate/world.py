@@ -11,8 +11,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
-from controller.config.models import StageTables
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable, StageTables
 from controller.core.errors import WorkError
 from controller.kiosk.alerts.alerts import Send
 from controller.kiosk.changes.inventory import Fact, Inventory

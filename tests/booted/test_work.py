@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from controller.run.time_left import RISE, SLACK_S
+from controller.run.progress import RISE, SLACK_S
 from tests.booted.kiosk import PICTURE_S, Kiosk
 from tests.booted.machine import STAGE
 from tests.campaigns.power_cuts import cut_now, kept, lost

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.grade import read_troubles

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.alerts import channels
 from controller.kiosk.interface import EventRow

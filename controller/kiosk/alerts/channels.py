@@ -13,7 +13,7 @@ from email.message import EmailMessage
 from pathlib import Path
 from typing import Any, Final
 
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable
 from controller.core.errors import WorkError
 from controller.core.files import read_text
 from controller.core.text import printable

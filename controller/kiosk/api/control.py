@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
-from controller.core.sockets import listening
-from controller.core.storage import runtime_path
+from controller.core.storage import listening, runtime_path
 from controller.kiosk.operations.dispatch import CALLER
 from hal.errors import DeviceError
 

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from controller.config.upkeep import BackupTable
+from controller.config.models import BackupTable
 from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.backup.places import Folder, Place, Stick
 from controller.kiosk.backup.ssh import Server

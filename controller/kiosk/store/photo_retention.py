@@ -13,8 +13,7 @@ from typing import Final
 
 from controller.core.storage import sync_folder
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.run.journal import Journal
-from controller.run.journal_schema import JournalError
+from controller.run.journal import Journal, JournalError
 from controller.stage.artefacts.names import CAPTURES, run_kind
 
 GOING: Final = f"{CAPTURES}.going"

@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from controller.config.editing import rewrite_stage
-from controller.config.lines import KeyLines
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
 from controller.config.models import StageTables
-from controller.config.problems import Place
+from controller.config.problems import KeyLines, Place
+from controller.config.writer import rewrite_stage
 from controller.core.errors import UsageError
 from controller.core.files import LARGEST_TEXT, read_bytes
 from controller.core.storage import write_atomically

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from controller.config.upkeep import DiskTable
+from controller.config.models import DiskTable
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import DISK_FULL

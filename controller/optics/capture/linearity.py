@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import Float64, Mask
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.capture.demosaic import SensorLevels
 
 WELL_LIT = (0.2, 0.7)

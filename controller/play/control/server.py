@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from controller.core.errors import UsageError, WorkError
-from controller.core.sockets import LONGEST_PATH_BYTES, listening
-from controller.core.storage import exclusive
+from controller.core.storage import LONGEST_PATH_BYTES, exclusive, listening
 from controller.play.control.protocol import MAX_LINE_BYTES, InvalidRequest, error_line
 
 MAX_CLIENTS: Final = 16

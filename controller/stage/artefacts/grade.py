@@ -83,11 +83,8 @@ def read_grade_figures(run: Path) -> Any:
 
 def read_error_maps(run: Path) -> dict[str, ErrorMaps]:
     """By projector name, of a graded run."""
-    arrays, names = load_arrays(run / _MAPS), list(read_grade_figures(run))
-    if all(f"error-{name}" in arrays and f"reasons-{name}" in arrays for name in names):
-        return {name: ErrorMaps(arrays[f"error-{name}"], arrays[f"reasons-{name}"]) for name in names}
-    # As runs from before journal format 2 have them.
-    return {name: ErrorMaps(arrays[name], arrays[f"{name}-reasons"]) for name in names}
+    arrays = load_arrays(run / _MAPS)
+    return {name: ErrorMaps(arrays[f"error-{name}"], arrays[f"reasons-{name}"]) for name in read_grade_figures(run)}
 
 
 def graded(run: Path) -> dict[str, float] | None:

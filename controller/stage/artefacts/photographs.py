@@ -88,10 +88,7 @@ class PhotographSet:
     def read(self, run: Path) -> tuple[Taken, ...]:
         """The photographs in the index, with the run's corrected exposure times."""
         profile = load_profile(run)
-        index = self.index(run)
-        if self.batch is not None and not index.exists():  # as in journal format 1
-            index = run / f"{self.kind}-{self.projector}-{self.batch:03d}.json"
-        return tuple(self._taken(run, row, profile) for row in read_json(index))
+        return tuple(self._taken(run, row, profile) for row in read_json(self.index(run)))
 
     def by_name(self, run: Path) -> dict[str, Taken]:
         """As ``read``, by name; for a set of one projector or of none, whose names differ."""
@@ -101,21 +98,10 @@ class PhotographSet:
         """As ``read``, those of this name by their lit projector."""
         return {photograph.projector: photograph for photograph in self.read(run) if photograph.name == name}
 
-    def _taken(self, run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
-        name, projector = (row["name"], row["projector"]) if "projector" in row else self._of_format_1(row["name"])
+    @staticmethod
+    def _taken(run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
         exposure_s = true_exposure(profile, float(row["exposure_s"]))
-        return Taken(name, run / row["path"], exposure_s, profile=profile, projector=projector)
-
-    def _of_format_1(self, name: str) -> tuple[str, str | None]:
-        """Name and projector from an index of journal format 1, which has both in one text."""
-        if self.projector is not None:
-            return name.removeprefix(f"{self.projector}-"), self.projector
-        if self.kind == StepKind.DRIFT_PHOTOGRAPHS:
-            shown = name.removeprefix("drift-")
-            return (shown, None) if shown in ("white", "black") else (PATTERN, shown)
-        if self.kind == StepKind.VERIFICATION_PHOTOGRAPHS:
-            return PATTERN, name.removeprefix("verify-")
-        return name, None
+        return Taken(row["name"], run / row["path"], exposure_s, profile=profile, projector=row["projector"])
 
 
 def noise_of(taken: Taken) -> CameraNoise:

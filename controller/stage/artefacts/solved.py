@@ -203,16 +203,14 @@ def read_solved(run: Path, name: str, projectors: Sequence[str]) -> Solved:
         )
     arrays = load_arrays(npz_path(run, StepKind.APPEARANCE, name))
     figures: Mapping[str, object] = read_json(json_path(run, StepKind.APPEARANCE, name))
-    # Runs from before journal format 2 have the frames by the projectors' names only.
-    prefix = "device-" if all(f"device-{projector}" in arrays for projector in projectors) else ""
     target, reachable, asked = arrays["target"], arrays["reachable"], None
     if "asked-target" in arrays:
         asked = RequestedTarget(arrays["asked-target"], arrays["asked-reachable"], arrays["asked-valid"])
     if (refining := read_refining(run, name)) is not None:
-        arrays, prefix = load_arrays(npz_path(run, StepKind.REFINED, name)), "device-"
+        arrays = load_arrays(npz_path(run, StepKind.REFINED, name))
         figures = {**figures, "refined": refining}
     return Solved(
-        frames={projector: arrays[f"{prefix}{projector}"] for projector in projectors},
+        frames={projector: arrays[f"device-{projector}"] for projector in projectors},
         linear={projector: arrays[f"linear-{projector}"] for projector in projectors},
         target=target,
         reachable=reachable,

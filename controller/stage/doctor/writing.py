@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.config import Stage, StageTables, write_stage
-from controller.config.editing import KeyChange, rewrite_stage
+from controller.config.writer import KeyChange, rewrite_stage
 from controller.core.errors import UsageError
 from controller.stage.doctor.values import Examination
 from hal.finding import Found

@@ -14,7 +14,7 @@ from typing import Any
 import jinja2
 
 from controller.core.arrays import ByteImage
-from controller.core.lettering import font_file
+from controller.core.plotting import font_file
 from controller.core.storage import write_atomically
 from controller.optics.solve.result.metrics import as_rows
 from controller.stage.artefacts.names import REPORT_FIGURES, REPORT_PAGE

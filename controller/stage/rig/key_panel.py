@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import SEND_DIAGNOSTICS
-from controller.core.lettering import text_size, write
+from controller.core.plotting import text_size, write
 from controller.run.state_machine import Event, State, allowed_events
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError

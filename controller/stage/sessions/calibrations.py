@@ -10,8 +10,7 @@ from pathlib import Path
 from controller.bundle.signing import Trust, load_signing_key
 from controller.config import Stage
 from controller.core.errors import UsageError
-from controller.run.journal import Journal
-from controller.run.journal_schema import JournalError
+from controller.run.journal import Journal, JournalError
 from controller.run.progress import Reporter
 from controller.stage.artefacts.grade import passes
 from controller.stage.artefacts.kinds import CALIBRATED

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.run.runner import Context
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import write_troubles

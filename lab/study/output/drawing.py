@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.core.lettering import write
-from controller.core.plotting import figure_of, picture_of
+from controller.core.plotting import figure_of, picture_of, write
 from controller.stage.report.pictures import Crop, crop_around, fitted, to_screen
 
 LARGEST_BYTES = 190_000

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.demo.job import demo
 from controller.demo.stage import APPEARANCES, prepare
 from controller.run.progress import Silent

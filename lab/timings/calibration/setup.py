@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
-from controller.config.editing import KeyChange, rewrite_stage
+from controller.config.writer import KeyChange, rewrite_stage
 from controller.demo.stage import DEFAULT_ROOM
 from controller.run.progress import Phase, Progress, Silent
 from controller.stage.services.calibrate import calibrate, make_appearances

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.config import load_stage, toml_text
-from controller.config.editing import KeyChange, edited, rewrite_stage
+from controller.config.writer import KeyChange, edited, rewrite_stage
 from controller.core.errors import UsageError
 from tests.controller.stage.sessions.run_models import STAGE
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.core.sockets import LONGEST_PATH_BYTES, listening
+from controller.core.storage import LONGEST_PATH_BYTES, listening
 
 
 def test_whoever_sees_it_is_not_refused(tmp_path: Path) -> None:

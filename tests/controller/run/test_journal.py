@@ -8,8 +8,7 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
-from controller.run.journal import Journal
-from controller.run.journal_schema import JournalError
+from controller.run.journal import Journal, JournalError
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import ShotId, StepId
 from hal.notices import Level
@@ -177,7 +176,7 @@ def test_another_version_and_another_programs_database_are_told_apart(tmp_path: 
 
 
 def test_a_journal_that_another_process_writes_to_is_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("controller.run.journal_schema.BUSY_S", 0.05)
+    monkeypatch.setattr("controller.run.journal.BUSY_S", 0.05)
     with Journal(tmp_path) as journal:
         other = sqlite3.connect(journal.path)
         other.execute("BEGIN IMMEDIATE")

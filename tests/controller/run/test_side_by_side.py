@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from controller.run.side_by_side import beside, side_by_side, threads_at_once
+from controller.run.background import beside, side_by_side, threads_at_once
 
 LITTLE, ALL = 1, 1 << 60
 

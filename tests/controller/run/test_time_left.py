@@ -10,12 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.run.durations import measured
 from controller.run.journal import Journal
-from controller.run.progress import Tracker
-from controller.run.runner import Context, Runner, Step
+from controller.run.progress import RISE, SLACK_S, Tracker
+from controller.run.runner import Context, Runner, Step, measured
 from controller.run.step_id import StepId
-from controller.run.time_left import RISE, SLACK_S
 from hal.deadline import in_seconds
 from tests.controller.run.listening import Listening
 from tests.controller.run.test_progress import Hands

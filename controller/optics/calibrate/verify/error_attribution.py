@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage, Mask
-from controller.core.lettering import write
+from controller.core.plotting import write
 from controller.optics.calibrate.values import Calibration
 from controller.optics.calibrate.verify.drift import TransportModel
 from controller.optics.calibrate.verify.error_causes import COLOURS, WORDS, ErrorCause

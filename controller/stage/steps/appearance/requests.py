@@ -11,8 +11,8 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from controller.config import Stage
-from controller.config.arguments import allowed, checked_arguments
 from controller.config.models import AppearanceTable
+from controller.config.table import allowed, checked_arguments
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of

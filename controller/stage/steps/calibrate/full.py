@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.core.errors import CalibrationError
-from controller.core.troubles import TroubleCode
+from controller.core.errors import CalibrationError, TroubleCode
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.colour_alignment import (
     ColourPlaces,

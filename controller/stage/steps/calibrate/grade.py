@@ -9,7 +9,7 @@ from typing import Final
 
 from controller.bundle.describe import png
 from controller.core.arrays import ByteImage, FloatImage
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.calibrate.photometry.glare import veiled, veiling_glare
 from controller.optics.calibrate.photometry.reflectance import gloss_strength, glossy
 from controller.optics.calibrate.photometry.surface_spread import spreading, typical_spread
@@ -24,8 +24,8 @@ from controller.optics.calibrate.verify.grade import Verification, verify
 from controller.optics.capture.pattern_frames import device_frame, frame
 from controller.optics.capture.patterns import Pattern
 from controller.optics.solve.scaling.dither import to_light
+from controller.run.background import side_by_side
 from controller.run.runner import Context, Step
-from controller.run.side_by_side import side_by_side
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import Exposures

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.photometry.colour_tiles import tile_code
 from controller.optics.calibrate.photometry.radiometry import painted, tell_direct_light

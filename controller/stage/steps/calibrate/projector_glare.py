@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.calibrate.photometry.glare import spread_by_lens
 from controller.optics.calibrate.photometry.projector_glare import DarkPart, lens_veils, projector_glare
 from controller.optics.calibrate.values import Geometry

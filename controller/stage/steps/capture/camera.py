@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.core.arrays import ByteImage, FloatImage
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.capture.acquire import Shot
 from controller.optics.capture.jpeg_response import measure_response, nominal_response
 from controller.optics.capture.latency import LONGEST_S, measure_latency

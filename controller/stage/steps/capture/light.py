@@ -20,8 +20,8 @@ from controller.optics.calibrate.correspondence.gray_code import decode_colours
 from controller.optics.calibrate.correspondence.known_map import MapCheck, check_map
 from controller.optics.capture.pattern_frames import device_frame
 from controller.optics.capture.patterns import Code, Pattern, PatternKind, PatternPlan, plan_patterns
+from controller.run.background import beside
 from controller.run.runner import Context
-from controller.run.side_by_side import beside
 from controller.stage.artefacts.calibration import merge_photographs, read_black
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.pattern_plans import PhotographOptions, PlanUsed, known_map

@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
-from controller.config.lines import KeyLines
 from controller.config.loader import parse_stage
-from controller.config.problems import Place
-from controller.config.upkeep import AlertsTable
+from controller.config.models import AlertsTable
+from controller.config.problems import KeyLines, Place
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.alerts.alerts import AGAIN_S, GATHER_S, PAUSE_S, Alerts
 from controller.kiosk.store.event_log import Decision, EventLog

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.config.upkeep import BackupTable
+from controller.config.models import BackupTable
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.backup.nightly import AGAIN_S, NightlyBackup, places
 from controller.kiosk.backup.places import copied

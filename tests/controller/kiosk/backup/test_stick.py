@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.config.upkeep import BackupTable
+from controller.config.models import BackupTable
 from controller.core.errors import WorkError
 from controller.kiosk.backup.nightly import NightlyBackup
 from controller.kiosk.backup.places import Stick

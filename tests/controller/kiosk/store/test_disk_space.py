@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from controller.bundle.signing import Trust
-from controller.config.upkeep import DiskTable
+from controller.config.models import DiskTable
 from controller.kiosk.store import archive
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import GOING, make_room

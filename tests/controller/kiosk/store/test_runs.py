@@ -15,8 +15,7 @@ from controller.core.errors import UsageError
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
 from controller.kiosk.store.event_log import EventLog
-from controller.run.journal import Journal
-from controller.run.journal_schema import JournalError
+from controller.run.journal import Journal, JournalError
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import graded_run, vase

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.capture.linearity import (
     black_offset,
     camera_faults,

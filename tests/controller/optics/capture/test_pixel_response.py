@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import Float64, FloatImage
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.optics.capture.linearity import NAMED_SPREAD, camera_faults
 from controller.optics.capture.pixel_response import ENOUGH_SAMPLES, response_spread, some_rows
 

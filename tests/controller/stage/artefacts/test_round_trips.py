@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.depth_edges import edged, write_terms
 from controller.stage.artefacts.geometry import projectors_of, read_geometry, write_geometry
 from controller.stage.artefacts.grade import ErrorMaps, graded, read_error_maps, write_grade
-from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, Taken, light_of
+from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, Taken
 from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels
 from controller.stage.artefacts.solved import Solved, SolvedBase, is_solved, read_solved, remove_solved
 from controller.stage.steps.modes import DotOptions, mode_step
@@ -164,39 +163,6 @@ def test_terms_at_depth_edges_are_those_of_the_projectors_asked_for(names: list[
             found = cast("EdgedTransport", edged(model, run, some)).terms
             assert [term.differences.shape for term in found] == [(3, 2 * sizes[name][1]) for name in some]
             assert [term.differences[0, 0] for term in found] == [float(sizes[name][1]) for name in some]
-
-
-def test_runs_from_before_read_as_they_did(tmp_path: Path) -> None:
-    """Bare projector names as keys of arrays, one text as a photograph's name, numbers at the end of file names."""
-    names = ["left", "top-left"]
-    maps = {f"{name}{kind}": image(n) for n, name in enumerate(names) for kind in ("", "-reasons")}
-    save_arrays(tmp_path / "verification.npz", maps)
-    (tmp_path / "verification.json").write_text(json.dumps({name: {"relative_rms": 0.1} for name in names}))
-    assert [float(one.error[0, 0, 0]) for one in read_error_maps(tmp_path).values()] == [0.0, 1.0]
-    arrays: dict[str, Any] = {name: np.full((2, 3, 3), n, np.uint8) for n, name in enumerate(names)}
-    arrays |= {f"linear-{name}": image(n) for n, name in enumerate(names)} | {"target": image(1), "reachable": image(1)}
-    save_arrays(tmp_path / "appearance-gold.npz", arrays)
-    (tmp_path / "appearance-gold.json").write_text(json.dumps({"exposure": 3.0}))
-    assert [int(one[0, 0, 0]) for one in read_solved(tmp_path, "gold", names).frames.values()] == [0, 1]
-
-    def listed(index: str, *shown: str) -> None:
-        rows = [{"name": name, "path": f"captures/{name}.dng", "exposure_s": 0.5} for name in shown]
-        (tmp_path / f"{index}.json").write_text(json.dumps(rows))
-
-    listed("light-top-left", "top-left-white-0", "top-left-gray-x-00")
-    assert list(light_of("top-left").by_name(tmp_path)) == ["white-0", "gray-x-00"]
-    assert light_of("top-left").read(tmp_path)[0].path == tmp_path / "captures" / "top-left-white-0.dng"
-    listed("dots-left-001", "left-16-dot-00-00")
-    assert list(PhotographSet("dots", "left", 1).by_name(tmp_path)) == ["16-dot-00-00"]
-    listed("drift-photographs", "drift-left", "drift-top-left", "drift-white", "drift-black")
-    assert set(DRIFT.by_projector(tmp_path)) == set(names)
-    assert [one.name for one in DRIFT.read(tmp_path) if one.projector is None] == ["white", "black"]
-    listed("verification-photographs", "verify-left")
-    assert set(VERIFICATION.by_projector(tmp_path)) == {"left"}
-    rows = {name: np.ones((2, 2), np.float32) for name in (
-        "projector_px", "modulation", "seen", "centre_px", "covariance_px2", "valid")}  # fmt: skip
-    save_arrays(tmp_path / "pixels-left.npz", rows)
-    assert Pixels.read(tmp_path, "left").phase_map is None
 
 
 def test_colours_that_lie_apart_are_kept_with_the_phase_map(tmp_path: Path) -> None:

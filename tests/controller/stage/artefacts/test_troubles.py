@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import read_troubles, write_troubles
 from controller.stage.artefacts.kinds import StepKind

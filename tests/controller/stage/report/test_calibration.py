@@ -15,8 +15,7 @@ import pytest
 
 from controller.bundle.describe import png
 from controller.core.arrays import save_arrays
-from controller.core.errors import UsageError
-from controller.core.troubles import TroubleCode
+from controller.core.errors import TroubleCode, UsageError
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration
