@@ -67,7 +67,6 @@ def decode(
     captures: Captures,
     plan: PatternPlan,
     *,
-    refine: bool = True,
     camera_blur_px: float = 0.0,
     scratch: Path | None = None,
     known_px: FloatImage | None = None,
@@ -76,12 +75,13 @@ def decode(
 ) -> Correspondence:
     """Decode one projector's Gray-code and sinusoid captures.
 
+    Each pixel is replaced by the plane through its neighbours on the same surface; pixels that are not on it, such as
+    those that see two surfaces at once, are dropped.
+
     Parameters
     ----------
     captures : linear photographs by pattern name, (rows, columns) or (rows, columns, 3); needs ``black``, ``gray-*``,
         ``phase-*`` and ``blur-*``; each is asked for once and not kept. A plan with few: ``completed``, with ``white``
-    refine : replace each pixel by the plane through its neighbours on the same surface, and drop pixels that are
-        not on it, such as those that see two surfaces at once
     camera_blur_px : standard deviation of the camera's own blur, camera px; where known, positions are freed of the
         pull towards the paler paint within a camera pixel's reach
     scratch : a folder on a disk, for the sums of a large camera (40 bytes a pixel), which then need not stay in memory
@@ -121,8 +121,7 @@ def decode(
     as_seen = position
     if camera_blur_px > 0:
         position = correct_for_paint(position, valid, half, camera_blur_px**2)
-    if refine:
-        position, valid = fit_planes(position, valid)
+    position, valid = fit_planes(position, valid)
     as_seen[~valid] = np.nan
     position[~valid] = np.nan
     return Correspondence(position, np.where(valid, modulation, 0).astype(np.float32), valid, as_seen)

@@ -17,7 +17,7 @@ from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
 from controller.optics.calibrate.geometry import pose_initialisation as hypotheses
-from controller.optics.calibrate.geometry.surface_points import object_points
+from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
 from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction, parameter_names
 from controller.optics.calibrate.values import Correspondence
 
@@ -134,7 +134,7 @@ def reconstruct(
     UsageError  "correspondence-wrong-size", "camera-intrinsics-wrong-size"
     CalibrationError  "one-projector", "overlap-too-small", "scene-flat", "correspondences-inconsistent",
         "surface-broken-up", "camera-prior-contradicted", "geometry-uncertain",
-        "distance-point-unknown", "distances-contradict" (see ``scale``),
+        "distance-point-unknown", "distances-contradict" (see ``metres_per_unit``),
         "geometry-ambiguous" (two shapes explain the pictures equally well, e.g. one with its depth reversed)
     """
     _check(correspondences, camera_size, projector_sizes, prior)
@@ -153,28 +153,20 @@ def reconstruct(
     _refuse_if_contradicted(problem, adjusted.state)
     shape_sigma = _shape_sigma(problem, adjusted)
     _refuse_if_uncertain(shape_sigma, margin, pairs)
-    found = object_points(
-        adjusted.state,
-        problem.noise_px,
-        shape_sigma,
-        correspondences,
-        camera_size,
-        projector_sizes,
-        prior,
-        smoothing_px,
-    )
+    stage = AdjustedStage(adjusted.state, problem.noise_px, shape_sigma, camera_size, projector_sizes)
+    points = object_points(stage, correspondences, prior, smoothing_px)
     report(1.0)
     return Reconstruction(
-        geometry=found.geometry,
-        covariance=_in_metres(adjusted.covariance, found.unit_m, len(projector_sizes)),
+        geometry=points.geometry,
+        covariance=_in_metres(adjusted.covariance, points.unit_m, len(projector_sizes)),
         parameter_names=parameter_names(len(projector_sizes)),
         noise_px=problem.noise_px,
         shape_rel_sigma=shape_sigma,
-        scale_rel_sigma=found.unit_rel_sigma,
+        scale_rel_sigma=points.unit_rel_sigma,
         stages_tried=tried,
         margin=margin,
         inlier_share=kept_share,
-        sigma_m=found.sigma_m,
+        sigma_m=points.sigma_m,
     )
 
 

@@ -238,15 +238,24 @@ class ObjectPoints:
     sigma_m: FloatImage
 
 
+@dataclass(frozen=True, slots=True)
+class AdjustedStage:
+    """Camera and projectors as the bundle adjustment leaves them.
+
+    ``noise_px`` standard deviation of one projector coordinate
+    ``shape_rel_sigma`` expected rms error of the points by wrong parameters, as a share of their distance, scale apart
+    ``camera_size``, ``projector_sizes`` (width, height) of the pictures
+    """
+
+    state: ba.AdjustmentState
+    noise_px: float
+    shape_rel_sigma: float
+    camera_size: tuple[int, int]
+    projector_sizes: Sequence[tuple[int, int]]
+
+
 def object_points(
-    state: ba.AdjustmentState,
-    noise_px: float,
-    shape_rel_sigma: float,
-    correspondences: Sequence[Correspondence],
-    camera_size: tuple[int, int],
-    projector_sizes: Sequence[tuple[int, int]],
-    prior: CameraPrior,
-    smoothing_px: int,
+    stage: AdjustedStage, correspondences: Sequence[Correspondence], prior: CameraPrior, smoothing_px: int
 ) -> ObjectPoints:
     """Triangulate every camera pixel and set the scale by what ``prior`` says was measured.
 
@@ -254,12 +263,13 @@ def object_points(
     off the surface around them, stay unknown. ``reprojection_rms_px`` is over all others. ``sigma_m`` holds the noise
     of the correspondences, not lessened by smoothing, since neighbours err together, and the parameters' part.
 
-    Raises CalibrationError as ``scale.metres_per_unit``, and "geometry-uncertain".
+    Raises CalibrationError as ``metres_per_unit``, and "geometry-uncertain".
     """
-    rays = _ray_map(state.camera, camera_size)
+    state = stage.state
+    rays = _ray_map(state.camera, stage.camera_size)
     seen = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
     slopes = projector_rays(np.stack([c.projector_px for c in correspondences]), np.ascontiguousarray(state.intrinsics))
-    noise_px = max(noise_px, LEAST_NOISE_PX)
+    noise_px = max(stage.noise_px, LEAST_NOISE_PX)
     raw, residual, leverage = inverse_depth_map(
         rays,
         slopes,
@@ -281,12 +291,12 @@ def object_points(
     directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1), dtype=np.float32)], axis=2)
     points: FloatImage = (directions / smooth[..., None]).astype(np.float32)
     unit_m, unit_rel_sigma = metres_per_unit(points, prior.distance_m, prior.distance_rel_sigma, prior.distances)
-    relative = np.hypot(np.maximum(residual, noise_px) * leverage / smooth, np.float32(shape_rel_sigma))
+    relative = np.hypot(np.maximum(residual, noise_px) * leverage / smooth, np.float32(stage.shape_rel_sigma))
     geometry = Geometry(
-        camera=_pinhole(state.camera, np.eye(3), np.zeros(3), camera_size),
+        camera=_pinhole(state.camera, np.eye(3), np.zeros(3), stage.camera_size),
         projectors=tuple(
             _pinhole(state.intrinsics[n], state.rotations[n], state.centres[n] * unit_m, size)
-            for n, size in enumerate(projector_sizes)
+            for n, size in enumerate(stage.projector_sizes)
         ),
         points_m=(points * unit_m).astype(np.float32),
         normals=normals,

@@ -16,6 +16,8 @@ from controller.optics.calibrate.geometry.normal_equations import straightening
 
 LANES: Final = 256
 """Pixels of a row whose planes are fitted together."""
+XX, XY, YY, X, Y, ONE, X_VALUE, Y_VALUE, VALUE = range(9)
+"""Sums over a neighbourhood, times the neighbours' weights: of products of their places and values."""
 _SHARPEST = 0.02  # relative depth step between neighbours beyond which they lie on different surfaces
 
 
@@ -64,50 +66,67 @@ def inverse_depth_map(
     NaN where none sees the pixel, or where several do and fewer than two agree
     """
     projectors, rows, columns = seen.shape
-    inverse = np.full((rows, columns), np.nan, dtype=np.float32)
-    residual = np.full((rows, columns), np.nan, dtype=np.float32)
-    leverage = np.full((rows, columns), np.nan, dtype=np.float32)
+    inverse = np.empty((rows, columns), np.float32)
+    residual, leverage = np.empty_like(inverse), np.empty_like(inverse)
     turned = np.empty((projectors, 3))
     for n in range(projectors):
         turned[n] = rotations[n] @ centres[n]
-    scale, limit = (2.4 * noise_px) ** 2, 2.0 * (4.0 * noise_px) ** 2
     for row in numba.prange(rows):
         for column in range(columns):
-            rx, ry = rays[row, column, 0], rays[row, column, 1]
-            rho = 0.0
-            for iteration in range(6):
-                top, bottom, squares, count, agreeing = 0.0, 0.0, 0.0, 0, 0
-                for n in range(projectors):
-                    if not seen[n, row, column]:
-                        continue
-                    R = rotations[n]
-                    focal = focal_px[n]
-                    u, v = slopes[n, row, column, 0], slopes[n, row, column, 1]
-                    qx = R[0, 0] * rx + R[0, 1] * ry + R[0, 2]
-                    qy = R[1, 0] * rx + R[1, 1] * ry + R[1, 2]
-                    qz = R[2, 0] * rx + R[2, 1] * ry + R[2, 2]
-                    # q - rho turned is parallel to (u, v, 1): two equations, linear in rho; focal / depth makes pixels
-                    ax, ay = qx - u * qz, qy - v * qz
-                    bx, by = turned[n, 0] - u * turned[n, 2], turned[n, 1] - v * turned[n, 2]
-                    depth = qz - rho * turned[n, 2]
-                    gain = (focal / depth) ** 2 if depth > 1e-6 else 1e-12
-                    error = gain * ((ax - rho * bx) ** 2 + (ay - rho * by) ** 2)
-                    weight = gain if iteration < 2 else gain / (1.0 + error / scale)
-                    top += weight * (ax * bx + ay * by)
-                    bottom += weight * (bx * bx + by * by)
-                    count += 1
-                    if error < limit:
-                        squares += error
-                        agreeing += 1
-                if count == 0 or bottom <= 0.0:
-                    break
-                if iteration < 5:
-                    rho = top / bottom
-                elif agreeing >= min(count, 2):
-                    inverse[row, column] = rho
-                    residual[row, column] = np.sqrt(squares / (2 * agreeing))
-                    leverage[row, column] = 1.0 / np.sqrt(bottom)
+            ray, here = rays[row, column], (slopes[:, row, column], seen[:, row, column])
+            found = _inverse_depth(ray, here, focal_px, rotations, turned, noise_px)
+            inverse[row, column], residual[row, column], leverage[row, column] = found
     return inverse, residual, leverage
+
+
+@compiled()
+def _inverse_depth(
+    ray: FloatImage,
+    observed: tuple[FloatImage, Mask],
+    focal_px: Float64,
+    rotations: Float64,
+    turned: Float64,
+    noise_px: float,
+) -> tuple[float, float, float]:
+    """As ``inverse_depth_map``, of one camera pixel.
+
+    ``ray`` (2,); ``observed``: slopes (N, 2) in each projector, and by which (N,) the pixel is seen; ``turned`` (N, 3):
+    the projectors' centres in their own frames
+    """
+    slopes, seen = observed
+    scale, limit = (2.4 * noise_px) ** 2, 2.0 * (4.0 * noise_px) ** 2
+    inverse = 0.0
+    for iteration in range(6):
+        top, bottom, squares, count, agreeing = 0.0, 0.0, 0.0, 0, 0
+        for n in range(seen.size):
+            if not seen[n]:
+                continue
+            turn, u, v = rotations[n], slopes[n, 0], slopes[n, 1]
+            # the camera's ray in the projector's frame
+            x = turn[0, 0] * ray[0] + turn[0, 1] * ray[1] + turn[0, 2]
+            y = turn[1, 0] * ray[0] + turn[1, 1] * ray[1] + turn[1, 2]
+            z = turn[2, 0] * ray[0] + turn[2, 1] * ray[1] + turn[2, 2]
+            # (x, y, z) - inverse turned is parallel to (u, v, 1): two equations, linear in the inverse depth
+            wanted_x, wanted_y = x - u * z, y - v * z
+            factor_x, factor_y = turned[n, 0] - u * turned[n, 2], turned[n, 1] - v * turned[n, 2]
+            depth = z - inverse * turned[n, 2]
+            # of squares in projector pixels
+            gain = (focal_px[n] / depth) ** 2 if depth > 1e-6 else 1e-12
+            error = gain * ((wanted_x - inverse * factor_x) ** 2 + (wanted_y - inverse * factor_y) ** 2)
+            weight = gain if iteration < 2 else gain / (1.0 + error / scale)
+            top += weight * (wanted_x * factor_x + wanted_y * factor_y)
+            bottom += weight * (factor_x * factor_x + factor_y * factor_y)
+            count += 1
+            if error < limit:
+                squares += error
+                agreeing += 1
+        if count == 0 or bottom <= 0.0:
+            break
+        if iteration < 5:
+            inverse = top / bottom
+        elif agreeing >= min(count, 2):
+            return inverse, np.sqrt(squares / (2 * agreeing)), 1.0 / np.sqrt(bottom)
+    return np.nan, np.nan, np.nan
 
 
 @compiled(parallel=True)
@@ -174,65 +193,55 @@ def _refit(
     ``count`` (pixels,): how many neighbours; 0 where they fix no plane. The innermost loops run along a row, so that
     they use vectors.
     """
-    n = spread.size
-    x, y, value, weight = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    sums = np.zeros((9, n))
+    place, value, weight = np.empty((2, spread.size)), np.empty(spread.size), np.empty(spread.size)
+    sums = np.zeros((9, spread.size))
     count[:] = 0.0
     for i in range(max(0, row - radius), min(surface[0].shape[0], row + radius + 1)):
         for shift in range(-radius, radius + 1):
-            _compare(surface, row, i, first, shift, x, y, value, weight)
-            _accumulate(
-                x, y, value, weight, plane[0], plane[1], plane[2], spread, sums[0], sums[1], sums[2], sums[3], sums[4],
-                sums[5], sums[6], sums[7], sums[8], count,
-            )  # fmt: skip
-    for k in range(n):
-        sxx, sxy, syy, sx, sy = sums[0, k], sums[1, k], sums[2, k], sums[3, k], sums[4, k]
-        s, tx, ty, t = sums[5, k], sums[6, k], sums[7, k], sums[8, k]
-        pxx, pxy, pyy = sxx - sx * sx / s, sxy - sx * sy / s, syy - sy * sy / s
-        qx, qy = tx - sx * t / s, ty - sy * t / s
-        determinant = pxx * pyy - pxy * pxy
-        if count[k] < 3 or not determinant > 1e-6 * pxx * pyy:
+            _compare(surface, row, i, first, shift, place, value, weight)
+            _accumulate(place, value, weight, plane, spread, sums, count)
+    for k in range(spread.size):
+        total, sum_x, sum_y, sum_value = sums[ONE, k], sums[X, k], sums[Y, k], sums[VALUE, k]
+        xx = sums[XX, k] - sum_x * sum_x / total
+        xy = sums[XY, k] - sum_x * sum_y / total
+        yy = sums[YY, k] - sum_y * sum_y / total
+        x_value = sums[X_VALUE, k] - sum_x * sum_value / total
+        y_value = sums[Y_VALUE, k] - sum_y * sum_value / total
+        determinant = xx * yy - xy * xy
+        if count[k] < 3 or not determinant > 1e-6 * xx * yy:
             count[k] = plane[0, k] = plane[1, k] = plane[2, k] = 0.0
             continue
-        a, b = (qx * pyy - qy * pxy) / determinant, (qy * pxx - qx * pxy) / determinant
-        plane[0, k], plane[1, k], plane[2, k] = a, b, (t - a * sx - b * sy) / s
+        across = (x_value * yy - y_value * xy) / determinant
+        down = (y_value * xx - x_value * xy) / determinant
+        plane[0, k], plane[1, k], plane[2, k] = across, down, (sum_value - across * sum_x - down * sum_y) / total
 
 
 @compiled()
 def _accumulate(
-    x: Float64,
-    y: Float64,
-    value: Float64,
-    weight: Float64,
-    a: Float64,
-    b: Float64,
-    c: Float64,
-    spread: Float64,
-    sxx: Float64,
-    sxy: Float64,
-    syy: Float64,
-    sx: Float64,
-    sy: Float64,
-    s: Float64,
-    tx: Float64,
-    ty: Float64,
-    t: Float64,
-    count: Float64,
+    place: Float64, value: Float64, weight: Float64, plane: Float64, spread: Float64, sums: Float64, count: Float64
 ) -> None:
-    """Add one neighbour of each pixel to the sums; all (pixels,)."""
-    for k in range(x.size):
-        off = value[k] - (a[k] * x[k] + b[k] * y[k] + c[k])
+    """Add one neighbour of each pixel to ``sums`` (9, pixels), in the order of ``XX`` to ``VALUE``.
+
+    ``place`` (2, pixels): x and y; ``value``, ``weight`` (pixels,); the others as in ``_refit``
+    """
+    x, y = place[0], place[1]
+    across, down, middle = plane[0], plane[1], plane[2]
+    xx, xy, yy = sums[XX], sums[XY], sums[YY]
+    sum_x, sum_y, total = sums[X], sums[Y], sums[ONE]
+    x_value, y_value, sum_value = sums[X_VALUE], sums[Y_VALUE], sums[VALUE]
+    for k in range(value.size):
+        off = value[k] - (across[k] * x[k] + down[k] * y[k] + middle[k])
         w = weight[k] / (1.0 + off * off / (4.0 * spread[k] + 1e-20))
         wx, wy = w * x[k], w * y[k]
-        sxx[k] += wx * x[k]
-        sxy[k] += wx * y[k]
-        syy[k] += wy * y[k]
-        sx[k] += wx
-        sy[k] += wy
-        s[k] += w
-        tx[k] += wx * value[k]
-        ty[k] += wy * value[k]
-        t[k] += w * value[k]
+        xx[k] += wx * x[k]
+        xy[k] += wx * y[k]
+        yy[k] += wy * y[k]
+        sum_x[k] += wx
+        sum_y[k] += wy
+        total[k] += w
+        x_value[k] += wx * value[k]
+        y_value[k] += wy * value[k]
+        sum_value[k] += w * value[k]
         count[k] += weight[k]
 
 
@@ -243,29 +252,29 @@ def _compare(
     other: int,
     first: int,
     shift: int,
-    x: Float64,
-    y: Float64,
+    place: Float64,
     value: Float64,
     weight: Float64,
 ) -> None:
     """Where neighbours of pixels of a row lie, and their inverse depth; 0 with no weight for those that do not count.
 
-    A neighbour is ``shift`` columns beside in the row ``other``; it counts inside the picture, on the same surface.
+    ``place`` (2, pixels): x and y from the pixel; ``value``, ``weight`` (pixels,). A neighbour is ``shift`` columns
+    beside in the row ``other``; it counts inside the picture, on the same surface.
     """
-    x[:], y[:], value[:], weight[:] = 0.0, 0.0, 0.0, 0.0
+    place[:], value[:], weight[:] = 0.0, 0.0, 0.0
     inverse, across, down = surface
-    a, e = max(0, -first - shift), min(x.size, inverse.shape[1] - first - shift)
+    a, e = max(0, -first - shift), min(value.size, inverse.shape[1] - first - shift)
     if a < e:
         at, there = slice(first + a, first + e), slice(first + a + shift, first + e + shift)
-        _differ(across[row, at], across[other, there], x[a:e])
-        _differ(down[row, at], down[other, there], y[a:e])
+        _differ(across[row, at], across[other, there], place[0, a:e])
+        _differ(down[row, at], down[other, there], place[1, a:e])
         _on_surface(inverse[row, at], inverse[other, there], value[a:e], weight[a:e])
 
 
 @compiled()
-def _differ(here: FloatImage, other: FloatImage, found: Float64) -> None:
-    for k in range(found.size):
-        found[k] = other[k] - here[k]
+def _differ(here: FloatImage, other: FloatImage, difference: Float64) -> None:
+    for k in range(difference.size):
+        difference[k] = other[k] - here[k]
 
 
 @compiled()
@@ -278,30 +287,25 @@ def _on_surface(here: FloatImage, other: FloatImage, value: Float64, weight: Flo
 @compiled()
 def _spread(surface: Surface, radius: int, row: int, first: int, plane: Float64, spread: Float64) -> None:
     """Mean squared distance of neighbourhoods from planes; arrays as in ``_refit``."""
-    n = spread.size
-    x, y, value, weight, count = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    place, value, weight = np.empty((2, spread.size)), np.empty(spread.size), np.empty(spread.size)
+    count = np.zeros(spread.size)
     spread[:] = 0.0
     for i in range(max(0, row - radius), min(surface[0].shape[0], row + radius + 1)):
         for shift in range(-radius, radius + 1):
-            _compare(surface, row, i, first, shift, x, y, value, weight)
-            _add_squares(x, y, value, weight, plane[0], plane[1], plane[2], spread, count)
-    for k in range(n):
+            _compare(surface, row, i, first, shift, place, value, weight)
+            _add_squares(place, value, weight, plane, spread, count)
+    for k in range(spread.size):
         spread[k] /= max(count[k], 1.0)
 
 
 @compiled()
 def _add_squares(
-    x: Float64,
-    y: Float64,
-    value: Float64,
-    weight: Float64,
-    a: Float64,
-    b: Float64,
-    c: Float64,
-    squares: Float64,
-    count: Float64,
+    place: Float64, value: Float64, weight: Float64, plane: Float64, squares: Float64, count: Float64
 ) -> None:
-    for k in range(x.size):
-        off = value[k] - a[k] * x[k] - b[k] * y[k] - c[k]
+    """Add the squared distance of one neighbour of each pixel from its plane; arrays as in ``_accumulate``."""
+    x, y = place[0], place[1]
+    across, down, middle = plane[0], plane[1], plane[2]
+    for k in range(value.size):
+        off = value[k] - across[k] * x[k] - down[k] * y[k] - middle[k]
         squares[k] += weight[k] * off * off
         count[k] += weight[k]

@@ -34,6 +34,19 @@ MOST_VARIANCE_PX2 = 16.0
 
 
 @dataclass(frozen=True, slots=True)
+class _CameraView:
+    """What the camera's pixels, (rows, columns, ...), see of a projector.
+
+    ``black``: light at black; ``position_px`` (..., 2): where they look in the projector's image, NaN where not known
+    ``cells``: row-major number of the projector pixel there, -1 for none
+    """
+
+    black: FloatImage
+    position_px: FloatImage
+    cells: npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
 class BlurContrasts:
     """Around each projector pixel, (rows, columns), NaN where nothing was seen.
 
@@ -76,11 +89,11 @@ def measure_contrasts(
 ) -> BlurContrasts:
     """What ``blur_of`` needs; parameters and errors as ``measure_blur``."""
     cells = cells_of(correspondence, plan.size_px)
-    black = grey(captures, "black")
+    view = _CameraView(grey(captures, "black"), correspondence.projector_px, cells)
 
     def contrast(prefix: str, frequency: tuple[float, float]) -> FloatImage:
         left = np.empty((0, 0), np.float32) if colours is None else colours.contrast(frequency)
-        return _contrast(captures, plan, prefix, frequency, black, correspondence, cells, left)
+        return _contrast(captures, plan, prefix, frequency, view, left)
 
     fine = np.stack([contrast(f"blur-{name}", frequency) for name, frequency in BLUR_FREQUENCIES.items()])
     coarse = np.stack([contrast("phase-x", (1 / PERIOD_PX, 0.0)), contrast("phase-y", (0.0, 1 / PERIOD_PX))])
@@ -122,9 +135,7 @@ def _contrast(
     plan: PatternPlan,
     prefix: str,
     frequency: tuple[float, float],
-    black: FloatImage,
-    correspondence: Correspondence,
-    cells: npt.NDArray[np.int32],
+    view: _CameraView,
     left: FloatImage,
 ) -> FloatImage:
     """Modulation around each projector pixel, (rows, columns); NaN where nothing was seen.
@@ -135,14 +146,13 @@ def _contrast(
     """
     width, height = plan.size_px
     wave, light = np.zeros(width * height), np.zeros(width * height)
-    position, along = correspondence.projector_px, np.array(frequency)
-    steps = plan.sinusoids(prefix)
-    images = [grey(captures, pattern.name, black.shape) for pattern in steps]
+    along, steps = np.array(frequency), plan.sinusoids(prefix)
+    images = [grey(captures, pattern.name, view.black.shape) for pattern in steps]
     # a wave of which a step is missing would have another contrast
-    whole = np.where(np.isfinite(sum(images, -black)), cells, np.int32(-1))
+    cells = np.where(np.isfinite(sum(images, -view.black)), view.cells, np.int32(-1))
     alone = not plan.measures_phase(prefix)
     for pattern, image in zip(steps, images, strict=True):
-        _add_step(image, black, position, whole, along, pattern.phase_rad, alone, left, wave, light)
+        _add_step(image, view.black, view.position_px, cells, along, pattern.phase_rad, alone, left, wave, light)
     # n pictures of W/2 (1 + M cos) each: the light adds up to n W/2, the wave to n W M/4; one step and its opposite
     # have a wave of W M cos^2, and light that is weighted by the same square adds up to 2 W cos^2
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)

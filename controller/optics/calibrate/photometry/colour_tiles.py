@@ -74,32 +74,29 @@ def measure_tiles(
     black: FloatImage,
     white: FloatImage,
     *,
+    code: tuple[Cells, Cells],
     indirect: KnownIndirect | None = None,
-    known_px: FloatImage | None = None,
-    noise: CameraNoise | None = None,
-    code: tuple[Cells, Cells] | None = None,
 ) -> TileMeasurements:
     """Find the tiles by the code and measure each.
 
     Parameters
     ----------
-    captures : needs ``gray-*`` and ``mosaic-*``
+    captures : needs ``mosaic-*``
     black, white : (rows, columns, 3) linear light of black, and of white above black; NaN where not known
+    code : the cells of both axes, from ``tile_code``
     indirect : is taken away from tiles and white
-    known_px, noise : as for ``decode``
-    code : the cells of both axes, from ``tile_code``; read from the photographs if omitted
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
     tiles_patterns = plan.of_kind(PatternKind.COLOUR_TILES)
     side = tiles_patterns[0].tile_cells
-    axes = code or tile_code(captures, plan, black, white, known_px=known_px, noise=noise)
     across, down = cells_of_frame(plan.size_px)
-    tile = (axes[1].cell // side) * -(-across // side) + axes[0].cell // side
-    framed = (axes[0].cell < across) & (axes[1].cell < down)
-    seen = (axes[0].weak == 0) & (axes[1].weak == 0) & framed
+    column, row = code
+    tile = (row.cell // side) * -(-across // side) + column.cell // side
+    framed = (column.cell < across) & (row.cell < down)
+    seen = (column.weak == 0) & (row.weak == 0) & framed
     # At a border of cells: of two tiles, or of two cells of one tile. Their neighbours tell which.
-    between = axes[0].sure & axes[1].sure & framed & ~seen
+    between = column.sure & row.sure & framed & ~seen
     if indirect is not None:
         white = white - indirect.white
     inside = _interior(np.where(seen, tile, -1).astype(np.int32), between, lit_pixels(white))
@@ -145,7 +142,16 @@ def tile_code(
     known_px: FloatImage | None = None,
     noise: CameraNoise | None = None,
 ) -> tuple[Cells, Cells]:
-    """The cells by which tiles are found, for several measurements. Parameters and errors as for ``measure_tiles``."""
+    """The cells of both axes by which tiles are found.
+
+    Parameters
+    ----------
+    captures : needs ``gray-*``, unless ``known_px`` stands for the code
+    black, white : as for ``measure_tiles``
+    known_px, noise : as for ``decode``
+
+    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    """
     half = np.asarray(channels.total(white) / 2, np.float32)
     return read_code(captures, plan, channels.total(black) + half, half, known_px, noise or CameraNoise())
 

@@ -18,7 +18,7 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.correspondence.captures import Captures, coloured
 from controller.optics.calibrate.correspondence.gray_code import Cells
-from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
+from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles, tile_code
 from controller.optics.calibrate.photometry.separation import SinusoidContrast, indirect_share, shown_contrast
 from controller.optics.calibrate.photometry.tile_fit import evened, fit_tiles, with_paint
 from controller.optics.calibrate.photometry.waveform import Wave, held_to
@@ -74,7 +74,7 @@ def measure_radiometry(
     captures : linear RGB photographs in one unit: ``black white``, ``gray-*`` and ``mosaic-*``; NaN where saturated
     indirect : what is known of it by an earlier measurement; the response is then fitted to direct light alone
     known_px, noise : as for ``decode``
-    code : as for ``measure_tiles``
+    code : the cells of both axes, from ``tile_code``; read from the photographs if omitted
 
     Returns
     -------
@@ -89,7 +89,8 @@ def measure_radiometry(
     """
     black = coloured(captures, "black")
     white = coloured(captures, "white", black.shape[:2]) - black
-    tiles = measure_tiles(captures, plan, black, white, indirect=indirect, known_px=known_px, noise=noise, code=code)
+    code = code or tile_code(captures, plan, black, white, known_px=known_px, noise=noise)
+    tiles = measure_tiles(captures, plan, black, white, code=code, indirect=indirect)
     if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles
+from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles, tile_code
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry
 from controller.optics.calibrate.values import Radiometry
 from controller.optics.capture.pattern_frames import device_frame
@@ -74,8 +74,8 @@ def test_tiles_of_several_cells_are_measured_across_the_borders_of_their_cells()
     sharp = scene(projector_blur_px=0.1)
     stage = Stage(sharp)
     captures = {p.name: stage.photograph(device_frame(p, SIZE_PX)) for p in plan if not p.needs_response}
-    black = captures["black"]
-    tiles = measure_tiles(captures, plan, black, captures["white"] - black)
+    black, white = captures["black"], captures["white"] - captures["black"]
+    tiles = measure_tiles(captures, plan, black, white, code=tile_code(captures, plan, black, white))
     assert len(tiles.ratio) >= 60
     light = [sharp.response()[channel][tiles.levels[:, channel]] for channel in range(3)]
     shown = np.stack(light, axis=1) @ np.array(sharp.mixing).T
