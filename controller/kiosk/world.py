@@ -22,12 +22,12 @@ from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.watch import take
 from controller.kiosk.decide.clock import synchronised
-from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_supervisor import Process, launched
 from controller.play.control.launch import PlayerSettings
 from controller.stage.rig.lamp_ledger import SystemClock
 from controller.stage.sessions.recording import open_context
 from hal.deadline import Deadline
+from hal.player import PlayerClient
 from hal.registry import Drivers, OpenContext
 
 
@@ -127,9 +127,9 @@ class World(SystemClock):
         """A player that is being started. Raises VelaturaError and OSError."""
         return launched(runtime, settings)
 
-    def channel(self) -> PlayerChannel:
+    def channel(self) -> PlayerClient:
         """The way to ask the player."""
-        return PlayerChannel()
+        return PlayerClient()
 
     def ways_out(self, table: AlertsTable) -> dict[str, Send]:
         """What sends alerts to each receiver that the settings name."""

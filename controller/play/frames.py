@@ -11,7 +11,6 @@ import fcntl
 import mmap
 import os
 import re
-import struct
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -24,6 +23,15 @@ import numpy.typing as npt
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import stream_atomically
+from hal.codecs.player import (
+    LONGEST_HEAD_BYTES,
+    LONGEST_NAME_BYTES,
+    MOST_OUTPUTS,
+    FrameLayout,
+    MappedFrames,
+    parse_layout,
+)
+from hal.errors import ProtocolError
 
 _COPIED_ROWS = 256
 """At most so many rows are one part: several threads can share a picture of which nothing is known."""
@@ -66,14 +74,6 @@ def differing(shape: tuple[int, ...], one: Tiles | None, other: Tiles | None) ->
     return found
 
 
-MAGIC: Final = b"VELFRAME"
-VERSION: Final = 1
-HEAD: Final = struct.Struct("<8sIIQdQ24x")
-ENTRY: Final = struct.Struct("<40sIIQQ")
-ALIGNMENT: Final = 4096
-SEQUENCE_AT: Final = 16
-PRESENTED_AT: Final = 24
-MAX_OUTPUTS: Final = 16
 MAX_SIDE_PX: Final = 16384
 _ALONE_BYTES: Final = 4 * 1024 * 1024
 """So little is copied sooner by one thread than other threads are woken."""
@@ -98,11 +98,11 @@ def parse_outputs(text: str) -> tuple[OutputSize, ...]:
     outputs = []
     for part in text.split(","):
         found = _OUTPUT.fullmatch(part)
-        if found is None or len(found[1].encode()) >= 40 or not found[1].isprintable():
+        if found is None or len(found[1].encode()) > LONGEST_NAME_BYTES or not found[1].isprintable():
             raise _outputs_wrong(f"{part!r} is not NAME:WIDTHxHEIGHT")
         outputs.append(OutputSize(found[1], int(found[2]), int(found[3])))
-    if len({output.name for output in outputs}) != len(outputs) or len(outputs) > MAX_OUTPUTS:
-        raise _outputs_wrong(f"there are more than {MAX_OUTPUTS}, or two have the same name")
+    if len({output.name for output in outputs}) != len(outputs) or len(outputs) > MOST_OUTPUTS:
+        raise _outputs_wrong(f"there are more than {MOST_OUTPUTS}, or two have the same name")
     if any(not 1 <= side <= MAX_SIDE_PX for output in outputs for side in output.shape[:2]):
         raise _outputs_wrong(f"a side is not 1 to {MAX_SIDE_PX} pixels")
     return tuple(outputs)
@@ -144,16 +144,9 @@ class FrameSet:
         return sum(image.nbytes for image in self.pixels)
 
 
-def layout_bytes(outputs: Sequence[OutputSize]) -> tuple[bytes, tuple[int, ...]]:
-    """The constant head of a frame file (sequence and time zero), and the offset of each output's pixels."""
-    position = HEAD.size + ENTRY.size * len(outputs)
-    entries, offsets = [], []
-    for output in outputs:
-        position += -position % ALIGNMENT
-        offsets.append(position)
-        entries.append(ENTRY.pack(output.name.encode(), output.width_px, output.height_px, position, 0))
-        position += output.width_px * output.height_px * 3
-    return HEAD.pack(MAGIC, VERSION, len(outputs), 0, 0.0, position) + b"".join(entries), tuple(offsets)
+def layout_of(outputs: Sequence[OutputSize]) -> FrameLayout:
+    """The layout of a frame file for these outputs."""
+    return FrameLayout.of((output.name, output.width_px, output.height_px) for output in outputs)
 
 
 class FrameFile:
@@ -170,45 +163,36 @@ class FrameFile:
         Raises WorkError("no-space" or "cannot-write"), UsageError("frames-in-use") if another process writes to it.
         """
         self.path = path
-        head, offsets = layout_bytes(outputs)
-        size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
-        if not _has_layout(path, head, size):
+        layout = layout_of(outputs)
+        if not _has_layout(path, layout):
             _refuse_in_use(path)
-            stream_atomically(path, lambda file: _fill(file.fileno(), head, size), mode=0o600)
+            stream_atomically(path, lambda file: _fill(file.fileno(), layout), mode=0o600)
         self._file = path.open("r+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._map = mmap.mmap(self._file.fileno(), size)
+            self._mapped = MappedFrames(mmap.mmap(self._file.fileno(), layout.size), layout)
         except BlockingIOError as error:
             self._file.close()
             raise _in_use(path) from error
         self._written: tuple[Tiles, ...] | None = None
-        # One aligned 64-bit store each: a byte-wise store could be read half done.
-        self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
-        self._presented_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
-        self._pixels = tuple(
-            np.frombuffer(self._map, np.uint8, output.width_px * output.height_px * 3, offset).reshape(output.shape)
-            for output, offset in zip(outputs, offsets, strict=True)
-        )
 
     @property
     def sequence(self) -> int:
-        return int(self._sequence[0])
+        return self._mapped.sequence
 
     @property
     def presented_at(self) -> float:
-        return float(self._presented_at[0])
+        return self._mapped.presented_at_s
 
     def write(self, frames: FrameSet, pool: Executor | None = None) -> None:
         """Replace the set in the file, and say the monotonic time at which it was whole.
 
         On the threads of ``pool`` if given. Tiles that the set of the last call had as well are left alone.
         """
-        sequence = self.sequence | 1
-        self._sequence[0] = sequence
+        self._mapped.begin()
         written, self._written = self._written, None
         parts = []
-        for number, (target, image) in enumerate(zip(self._pixels, frames.pixels, strict=True)):
+        for number, (target, image) in enumerate(zip(self._mapped.pixels, frames.pixels, strict=True)):
             for part in differing(image.shape, _tiles_of(frames.tiles, number), _tiles_of(written, number)):
                 parts.append((target[part], image[part]))
         if pool is None or sum(image.nbytes for _, image in parts) < _ALONE_BYTES:
@@ -217,8 +201,7 @@ class FrameFile:
         else:
             list(pool.map(lambda pair: np.copyto(*pair), parts))
         self._written = frames.tiles
-        self._presented_at[0] = time.monotonic()
-        self._sequence[0] = sequence + 1
+        self._mapped.finish(time.monotonic())
 
     def read(self, into: FrameSet) -> int:
         """Copy the set out and return its sequence number.
@@ -226,7 +209,7 @@ class FrameFile:
         Raises WorkError("frames-changing") if it was being written meanwhile.
         """
         before = self.sequence
-        for image, source in zip(into.pixels, self._pixels, strict=True):
+        for image, source in zip(into.pixels, self._mapped.pixels, strict=True):
             np.copyto(image, source)
         if before % 2 or self.sequence != before:
             raise WorkError(
@@ -238,9 +221,7 @@ class FrameFile:
 
     def close(self) -> None:
         """Release the mapping; the file stays."""
-        del self._sequence, self._presented_at, self._pixels
-        with contextlib.suppress(BufferError):
-            self._map.close()
+        self._mapped.close()
         self._file.close()
 
 
@@ -265,20 +246,17 @@ def _refuse_in_use(path: Path) -> None:
             raise _in_use(path) from error
 
 
-def _has_layout(path: Path, head: bytes, size: int) -> bool:
+def _has_layout(path: Path, layout: FrameLayout) -> bool:
     try:
         with path.open("rb") as file:
-            found = file.read(len(head))
-            right_size = os.fstat(file.fileno()).st_size == size
-    except FileNotFoundError:
+            return (
+                parse_layout(file.read(LONGEST_HEAD_BYTES)) == layout and os.fstat(file.fileno()).st_size == layout.size
+            )
+    except (FileNotFoundError, ProtocolError):
         return False
-    counted = slice(SEQUENCE_AT, PRESENTED_AT + 8)
-    return (
-        right_size and found[: counted.start] == head[: counted.start] and found[counted.stop :] == head[counted.stop :]
-    )
 
 
-def _fill(handle: int, head: bytes, size: int) -> None:
+def _fill(handle: int, layout: FrameLayout) -> None:
     # Blocks are reserved now: a full disk must stop us here and not kill the process at a store into the mapping.
-    os.posix_fallocate(handle, 0, size)
-    os.pwrite(handle, head, 0)
+    os.posix_fallocate(handle, 0, layout.size)
+    os.pwrite(handle, layout.head(), 0)

@@ -6,14 +6,13 @@ holds an flock on it, so that its end is noticed however it ends; the last whole
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import mmap
 import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol, Self, runtime_checkable
+from typing import Any, BinaryIO, Final, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +20,10 @@ import numpy.typing as npt
 from controller.bundle.live_maps import LiveMaps
 from controller.core.errors import UsageError, WorkError
 from controller.play.display.outputs import Output
-from controller.play.frames import ENTRY, HEAD, PRESENTED_AT, SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
+from controller.play.frames import FrameSet, OutputSize, layout_of
 from controller.play.presenting import Intervals, PendingPresentation, PresentedSet
+from hal.codecs.player import LONGEST_HEAD_BYTES, FrameLayout, MappedFrames, parse_layout
+from hal.errors import ProtocolError
 
 TARGET: Final = "target"
 SILENT_S: Final = 1.0
@@ -35,38 +36,32 @@ class LiveFile:
     def __init__(self, path: Path, outputs: Sequence[OutputSize]) -> None:
         """Raises UsageError("live-file-unfit"), naming what the file has and what it should have."""
         self._path, self._outputs = path, tuple(outputs)
-        head, offsets = layout_bytes(outputs)
-        size = offsets[-1] + outputs[-1].width_px * outputs[-1].height_px * 3
+        layout = layout_of(outputs)
         try:
             self._file = path.open("rb")
         except OSError as error:
             raise _unfit(path, f"it can't be opened ({error.strerror})", outputs) from error
         try:
-            found = self._file.read(len(head))
             self._inode = os.fstat(self._file.fileno())
-            if _constant(found) != _constant(head) or self._inode.st_size != size:
-                raise _unfit(path, _described(found), outputs)
-            self._map = mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ)
+            there = _layout_in(self._file, path, outputs)
+            if there != layout or self._inode.st_size != layout.size:
+                sizes = ", ".join(f"{slot.name} {slot.width_px}x{slot.height_px}" for slot in there.slots)
+                raise _unfit(path, f"it holds {sizes}", outputs)
+            self._mapped = MappedFrames(mmap.mmap(self._file.fileno(), layout.size, access=mmap.ACCESS_READ), layout)
         except BaseException:
             self._file.close()
             raise
-        self._sequence = np.frombuffer(self._map, "<u8", 1, SEQUENCE_AT)
-        self._written_at = np.frombuffer(self._map, "<f8", 1, PRESENTED_AT)
-        self._pixels = [
-            np.frombuffer(self._map, np.uint8, output.width_px * output.height_px * 3, offset).reshape(output.shape)
-            for output, offset in zip(outputs, offsets, strict=True)
-        ]
         self._seen = 0
 
     def newest(self, into: FrameSet) -> float | None:
         """Copy the set out if it is another than before and whole; when it was written, None if there is none."""
-        before = int(self._sequence[0])
+        before = self._mapped.sequence
         if before % 2 or before == self._seen:
             return None
-        written_at = float(self._written_at[0])
-        for image, source in zip(into.pixels, self._pixels, strict=True):
+        written_at = self._mapped.presented_at_s
+        for image, source in zip(into.pixels, self._mapped.pixels, strict=True):
             np.copyto(image, source)
-        if int(self._sequence[0]) != before:
+        if self._mapped.sequence != before:
             return None
         self._seen = before
         return written_at
@@ -93,25 +88,15 @@ class LiveFile:
 
     def close(self) -> None:
         """Release the mapping; the file stays."""
-        del self._sequence, self._written_at, self._pixels
-        with contextlib.suppress(BufferError):
-            self._map.close()
+        self._mapped.close()
         self._file.close()
 
 
-def _constant(head: bytes) -> bytes:
-    return head[:SEQUENCE_AT] + head[PRESENTED_AT + 8 :]
-
-
-def _described(head: bytes) -> str:
-    """What a frame file that begins like this holds."""
-    if len(head) < HEAD.size + ENTRY.size or head[:8] != b"VELFRAME":
-        return "it is not a frame file"
-    entries = (ENTRY.unpack_from(head, at) for at in range(HEAD.size, len(head) - ENTRY.size + 1, ENTRY.size))
-    sizes = [
-        f"{name.rstrip(bytes(1)).decode(errors='replace')} {width}x{height}" for name, width, height, _, _ in entries
-    ]
-    return f"it holds {', '.join(sizes)}"
+def _layout_in(file: BinaryIO, path: Path, outputs: Sequence[OutputSize]) -> FrameLayout:
+    try:
+        return parse_layout(file.read(LONGEST_HEAD_BYTES))
+    except ProtocolError as error:
+        raise _unfit(path, "it is not a frame file", outputs) from error
 
 
 def _unfit(path: Path, why: str, wanted: Sequence[OutputSize]) -> UsageError:

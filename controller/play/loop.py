@@ -16,13 +16,13 @@ from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, unsigned_warning
 from controller.core.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
-from controller.play.control import protocol
 from controller.play.control.notify import Notifier, log
 from controller.play.display.mixing import dimmed
 from controller.play.display.outputs import Output
 from controller.play.frames import FrameSet, OutputSize
 from controller.play.live_stream import LiveStream, open_live
 from controller.play.presenting import Grid, PendingPresentation, Presenter, ResultCallback
+from hal.codecs import player as player_codec
 
 
 class Playlist:
@@ -305,7 +305,7 @@ class Player:
             "interval_longest_s": presenter.intervals.percentile(100),
             "bundle": self.bundle_identity,
             "signed_by": None if signed_by is None else signed_by.hex(),
-            "warning": None if self._warning is None else protocol.error_fields(self._warning),
+            "warning": None if self._warning is None else player_codec.error_fields(self._warning),
             "rss_bytes": pages * os.sysconf("SC_PAGESIZE"),
         }
 

@@ -15,6 +15,8 @@ from controller.bundle.signing import ANY_SIGNER, Trust, load_public_key
 from controller.core.errors import VelaturaError, WorkError
 from controller.play.control import protocol
 from controller.play.control.launch import PlayerSettings
+from hal.codecs import player as player_codec
+from hal.deadline import Deadline
 from lab.simulate.disk import Disk
 from lab.simulate.scheduler import Scheduler
 
@@ -89,8 +91,8 @@ class Screen:
         self.process = SimulatedPlayer(self, settings)
         return self.process
 
-    def connect(self, path: Path, timeout_s: float) -> Any:
-        """As ``player_channel.connected``."""
+    def connect(self, path: Path, deadline: Deadline) -> Any:
+        """As ``hal.player.connected``."""
         process = self.process
         if process is None or not process.alive or self.scheduler.now_s < process.ready_at_s:
             raise ConnectionRefusedError
@@ -282,7 +284,7 @@ class SimulatedPlayer:
 
 
 class Connection:
-    """As far as ``PlayerChannel`` uses a socket: lines of JSON, on which things go wrong."""
+    """As far as ``PlayerClient`` uses a socket: lines of JSON, on which things go wrong."""
 
     def __init__(self, screen: Screen, process: SimulatedPlayer) -> None:
         self._screen, self._process = screen, process
@@ -306,9 +308,9 @@ class Connection:
         delay_s = 0.0
         try:
             answer, delay_s = process.do(request)
-            line = protocol.answer_line(ticket, answer)
+            line = player_codec.answer_line(ticket, answer)
         except VelaturaError as error:
-            line = protocol.error_line(ticket, error)
+            line = player_codec.error_line(ticket, error)
         self._send(line, screen.scheduler.now_s + delay_s + screen.rng.uniform(0.001, 0.02))
 
     def _send(self, line: bytes, at_s: float) -> None:

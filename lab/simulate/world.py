@@ -16,12 +16,12 @@ from controller.core.errors import WorkError
 from controller.kiosk.alerts.alerts import Send
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.interface import EventRow
-from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.world import Lock as AnyLock
 from controller.kiosk.world import Thread, World
 from controller.play.control.launch import PlayerSettings
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone
+from hal.player import PlayerClient
 from hal.registry import Driver, Drivers, OpenContext
 from hal.values import CameraCapabilities, DeviceIdentity, OutputInfo
 from lab.simulate.disk import STAGE, TOTAL_BYTES, Disk
@@ -236,8 +236,8 @@ class SimulatedWorld(World):
     def launch(self, runtime: Path, settings: PlayerSettings) -> SimulatedPlayer:
         return self.screen.launch(runtime, settings)
 
-    def channel(self) -> PlayerChannel:
-        return PlayerChannel(self.screen.connect, self.monotonic)
+    def channel(self) -> PlayerClient:
+        return PlayerClient(self.screen.connect, self)
 
     def ways_out(self, table: AlertsTable) -> dict[str, Send]:
         return {"webhook": self._alert} if table.webhook is not None else {}

@@ -16,13 +16,14 @@ import tomlkit
 from controller.config import load_stage
 from controller.config.loader import FILE
 from controller.config.models import StageTables
-from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.core.kiosk_places import PLAYER_SOCKET, STAGE, STATE, USER
 from controller.kiosk.install import steps
 from controller.kiosk.install.outputs import Connected, placed
 from controller.kiosk.install.system import System
 from controller.kiosk.store import archive
-from controller.kiosk.supervisors.player_channel import PlayerChannel
+from hal.errors import DeviceError
+from hal.player import PlayerClient
 
 MOST_QUESTIONS: Final = 3
 ANSWER_S: Final = 10.0
@@ -153,15 +154,15 @@ def _asked(
 @contextlib.contextmanager
 def _numbers(player: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Numbers on the projectors meanwhile; a player that does not answer is no reason to stop."""
-    channel = PlayerChannel()
+    channel = PlayerClient()
     try:
-        channel.request(player, {"op": "identify"}, ANSWER_S)
-    except (OSError, ValueError, VelaturaError):
+        channel.request(player, {"op": "identify"}, channel.within(ANSWER_S))
+    except DeviceError:
         say("The projectors can't show numbers now. Distinguish them by their connectors.")
     try:
         yield
     finally:
-        channel.close()
+        channel.hang_up()
 
 
 def _with_places(text: str, found: Mapping[str, str], there: Sequence[Connected]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.play.display.identification import write_text
-from controller.play.frames import SEQUENCE_AT, FrameSet, OutputSize, layout_bytes
+from controller.play.frames import FrameSet, OutputSize
+from hal.player import Inbox
+from hal.values import OutputInfo
 
 _TALL: Final = 14
 """The picture's height over that of a line; a line that is too long is written smaller."""
@@ -56,15 +57,10 @@ def _draw_code(image: npt.NDArray[np.uint8], address: str) -> int:
     return int(above + len(code))
 
 
-def put(inbox: Path, outputs: Sequence[OutputSize], frames: FrameSet) -> int:
-    """Write a set into the inbox; returns the sequence number for ``show``. Raises OSError."""
-    _, offsets = layout_bytes(outputs)
-    with inbox.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
-        sequence = np.frombuffer(mapped, "<u8", 1, SEQUENCE_AT)
-        odd = int(sequence[0]) | 1
-        sequence[0] = odd
-        for offset, image in zip(offsets, frames.pixels, strict=True):
-            mapped[offset : offset + image.nbytes] = image.tobytes()
-        sequence[0] = odd + 1
-        del sequence
-    return odd + 1
+def put(path: Path, outputs: Sequence[OutputSize], frames: FrameSet) -> int:
+    """Write a set into the inbox at ``path``; returns the sequence number for ``show``. Raises as ``Inbox``."""
+    inbox = Inbox(path, [OutputInfo(output.name, output.width_px, output.height_px) for output in outputs])
+    try:
+        return inbox.put({output.name: image for output, image in zip(outputs, frames.pixels, strict=True)})
+    finally:
+        inbox.close()

@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from controller.bundle.install import Starts, before_it, chosen, is_readable
-from controller.core.errors import VelaturaError, WorkError
+from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
-from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_patience import Patience
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
+from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.player import PlayerClient
 
 ANSWER_S: Final = 0.8
 READY_S: Final = 8.0
@@ -82,7 +83,7 @@ class PlayerSupervisor:
         monotonic: Callable[[], float] = time.monotonic,
         attach: Callable[[PlayerSettings], AttachedPlayer] | None = None,
         launch: Callable[[Path, PlayerSettings], Process] = launched,
-        channel: PlayerChannel | None = None,
+        channel: PlayerClient | None = None,
     ) -> None:
         self._runtime, self._settings, self._tell, self._monotonic = runtime, settings, tell, monotonic
         self.want: Showing | None = BLACK
@@ -91,7 +92,7 @@ class PlayerSupervisor:
         self._attach = attach
         self._launch = launch
         self._process: Process | None = None
-        self._channel = channel or PlayerChannel()
+        self._channel = channel or PlayerClient()
         self._view = PlayerView()
         self._identities: dict[str, Path] = {}
         self._patience, self._failed = Patience(), 0
@@ -125,16 +126,16 @@ class PlayerSupervisor:
             self._patience.begins()
             if self._waits_in_vain():
                 self._restart(_WITHOUT_BUNDLE)
-        except TimeoutError:
+        except DeviceTimeout:
             if self._ends_for_silence():
                 self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
-        except (OSError, ValueError, KeyError):
-            self._channel.close()
+        except (DeviceGone, ProtocolError, KeyError):
+            self._channel.hang_up()
             if self._ends_for_silence(refused=True):
                 self._restart(
                     Decision("player-gone", "The player refused the connection.", "It is started again.", "error")
                 )
-        except WorkError as error:
+        except DeviceRefused as error:
             self._patience.begins()
             # It says why it can't show that, so it does answer: an end changes nothing.
             self._reached = (self.want,)
@@ -150,9 +151,9 @@ class PlayerSupervisor:
         self._closed = True
         if self._attach is not None and self._process is not None and self.want == BLACK:
             # One that does not answer is its starter's to end.
-            with contextlib.suppress(OSError, ValueError, KeyError, VelaturaError):
+            with contextlib.suppress(KeyError, DeviceError):
                 self._ask({"op": "stop"}, 3.0)
-        self._channel.close()
+        self._channel.hang_up()
         if (process := self._process) is not None:
             process.terminate()
 
@@ -195,7 +196,7 @@ class PlayerSupervisor:
     def _restart(self, why: Decision) -> None:
         assert self._process is not None
         self._tell(why)
-        self._channel.close()
+        self._channel.hang_up()
         if self._process.alive:
             # It had its time to answer; SIGTERM would be one more thing that it does not hear.
             self._process.kill()
@@ -288,7 +289,7 @@ class PlayerSupervisor:
 
     def _put(self, want: Showing, loaded: Path | None) -> None:
         if not want.appearance or want.bundle is None:
-            with contextlib.suppress(TimeoutError) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
+            with contextlib.suppress(DeviceTimeout) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
                 self._ask({"op": "stop", "fade_s": want.fade_s}, PUT_S)
             return
         if loaded != want.bundle:
@@ -301,7 +302,7 @@ class PlayerSupervisor:
             request = {"op": "sequence", "items": items, "repeat": 0, "first_fade_s": want.fade_s}
         request["brightness"] = want.brightness
         # The answer comes when the picture has faded in; until then the status tells what comes.
-        with contextlib.suppress(TimeoutError) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
+        with contextlib.suppress(DeviceTimeout) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
             if self._ask(request, PUT_S)["ok"]:
                 self._dark, self._starts_without_picture = False, 0
         self._turns = want.in_turn
@@ -350,9 +351,14 @@ class PlayerSupervisor:
         self._view = replace(self._view, problem=problem, shown=None)
 
     def _ask(self, request: dict[str, Any], timeout_s: float = ANSWER_S) -> dict[str, Any]:
-        """Raises as ``PlayerChannel.request``."""
+        """The answer, {"ok": False} for a request that a later one replaced. Raises as ``PlayerClient.request``."""
         assert self._process is not None
-        return self._channel.request(self._process.socket, request, timeout_s)
+        try:
+            return self._channel.request(self._process.socket, request, self._channel.within(timeout_s))
+        except DeviceRefused as error:
+            if error.code == "superseded":
+                return {"ok": False}
+            raise
 
 
 def _outputs_problem(status: dict[str, Any]) -> Decision | None:

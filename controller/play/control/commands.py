@@ -23,6 +23,7 @@ from controller.play.display.identification import identification
 from controller.play.frames import FrameFile, FrameSet
 from controller.play.loop import Player, Playlist
 from controller.play.presenting import PresentedSet
+from hal.codecs import player as player_codec
 
 SUFFIX: Final = ".playing"
 _BLACK: Final = b'{"op": "stop"}\n'
@@ -98,19 +99,19 @@ class Commands:
             if not isinstance(request, protocol.Hello | protocol.Status | protocol.LoadBundle):
                 self._kept.accepted(request, line)
         except protocol.InvalidRequest as error:
-            self._server.send(client, protocol.error_line(error.ticket, error))
+            self._server.send(client, player_codec.error_line(error.ticket, error))
         except VelaturaError as error:
-            self._server.send(client, protocol.error_line(ticket, error))
+            self._server.send(client, player_codec.error_line(ticket, error))
         else:
             if values is not None:
-                self._server.send(client, protocol.answer_line(ticket, values))
+                self._server.send(client, player_codec.answer_line(ticket, values))
 
     def _answer(self, client: Client, ticket: Any, outcome: PresentedSet | VelaturaError) -> None:
         if isinstance(outcome, VelaturaError):
-            self._server.send(client, protocol.error_line(ticket, outcome))
+            self._server.send(client, player_codec.error_line(ticket, outcome))
         else:
             values = {"sequence": outcome.sequence, "presented_at": outcome.at_s}
-            self._server.send(client, protocol.answer_line(ticket, values))
+            self._server.send(client, player_codec.answer_line(ticket, values))
 
     def _do(
         self, request: protocol.Request, on_result: Callable[[PresentedSet | VelaturaError], None]
@@ -162,7 +163,7 @@ class Commands:
         player = self._player
         return {
             "player": "velatura",
-            "protocol": protocol.PROTOCOL,
+            "protocol": player_codec.PROTOCOL,
             "minor": protocol.MINOR,
             "pid": os.getpid(),
             "rate_hz": player.rate_hz,

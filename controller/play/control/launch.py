@@ -1,9 +1,8 @@
-"""Starts, watches and ends a player process; for the program that supervises it. Standard library only."""
+"""Starts, watches and ends a player process; for the program that supervises it. Light: no solver, no window."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import select
 import signal
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from controller.core.errors import WorkError
+from hal.codecs.player import parse_answer, request_line
 
 SOCKET_NAME: Final = "player.sock"
 LOG_NAME: Final = "player.log"
@@ -156,9 +156,9 @@ def hello(path: Path, timeout_s: float) -> dict[str, Any]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(max(0.01, timeout_s))
         channel.connect(str(path))
-        channel.sendall(b'{"op":"hello"}\n')
+        channel.sendall(request_line(None, {"op": "hello"}))
         line = channel.makefile("rb").readline()
-    return dict(json.loads(line)) if line.endswith(b"\n") else {}
+    return parse_answer(line) if line.endswith(b"\n") else {}
 
 
 def _environment() -> dict[str, str]:

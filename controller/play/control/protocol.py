@@ -1,4 +1,7 @@
-"""The player's socket messages: JSON lines to typed requests and back (docs/reference/player-protocol.md). No I/O."""
+"""The player's socket messages: JSON lines to typed requests (docs/reference/player-protocol.md). No I/O.
+
+``hal.codecs.player`` has the lines of its answers.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
-from controller.core.errors import UsageError, VelaturaError
+from controller.core.errors import UsageError
 
-PROTOCOL: Final = 1
 MINOR: Final = 4
 """Raised when the protocol gets an addition that older clients can ignore."""
 MAX_LINE_BYTES: Final = 256 * 1024
@@ -240,18 +242,3 @@ _READERS: Final[dict[str, Any]] = {
     "load-bundle": _load_bundle,
     "quit": Quit,
 }
-
-
-def answer_line(ticket: Any, values: dict[str, Any]) -> bytes:
-    """A good answer, as one line."""
-    return json.dumps({"id": ticket, "ok": True, **values}).encode() + b"\n"
-
-
-def error_line(ticket: Any, error: VelaturaError) -> bytes:
-    """A bad answer, as one line."""
-    return json.dumps({"id": ticket, "ok": False, "error": error_fields(error)}).encode() + b"\n"
-
-
-def error_fields(error: VelaturaError) -> dict[str, str]:
-    """An error or a warning, as answers have it."""
-    return {"code": error.code, "what": error.what, "remedy": error.remedy}

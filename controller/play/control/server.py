@@ -13,7 +13,8 @@ from typing import Final, Self
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import LONGEST_PATH_BYTES, exclusive, listening
-from controller.play.control.protocol import MAX_LINE_BYTES, InvalidRequest, error_line
+from controller.play.control.protocol import MAX_LINE_BYTES, InvalidRequest
+from hal.codecs.player import error_line
 
 MAX_CLIENTS: Final = 16
 _BACKLOG: Final = 64

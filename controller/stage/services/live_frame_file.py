@@ -6,9 +6,10 @@ import time
 from pathlib import Path
 
 from controller.core.errors import UsageError
-from controller.play.frames import MAGIC, FrameSet, OutputSize
+from controller.play.frames import FrameSet, OutputSize
 from controller.play.live_stream import SILENT_S, LiveFile
 from controller.stage.live.sources import LivePicture
+from hal.codecs.player import MAGIC
 
 
 def holds_frames(path: Path) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import threading
 import time
 from collections import deque
@@ -19,14 +18,11 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from hal.codecs.player import LONGEST_HEAD_BYTES, FrameLayout, parse_layout, parse_set
+from hal.errors import ProtocolError
+
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 
-MAGIC: Final = b"VELFRAME"
-VERSION: Final = 1
-HEADER: Final = struct.Struct("<8sIIQdQ")
-ENTRIES_AT: Final = 64
-ENTRY: Final = struct.Struct("<40sIIQQ")
-MOST_OUTPUTS: Final = 16
 MOST_BYTES: Final = 1 << 30
 TRIES: Final = 20
 KEPT: Final = 32
@@ -69,16 +65,18 @@ class FrameReader:
         identity = (status.st_dev, status.st_ino)
         known = self._last[1] if self._last is not None and self._last[0] == identity else None
         for _ in range(TRIES):
-            header = _header(os.pread(handle, ENTRIES_AT, 0))
-            if header is None:
+            head = os.pread(handle, LONGEST_HEAD_BYTES, 0)
+            try:
+                layout = parse_layout(head)
+            except ProtocolError:
                 return None
-            count, sequence, presented_at_s = header
+            sequence, presented_at_s = parse_set(head)
             if known is not None and known.sequence == sequence:
                 return known
             if sequence % 2 == 0:
-                frames = _frames(handle, count, status.st_size)
-                after = _header(os.pread(handle, ENTRIES_AT, 0))
-                if after is not None and after[1] == sequence:
+                frames = _frames(handle, layout, status.st_size)
+                after = os.pread(handle, LONGEST_HEAD_BYTES, 0)
+                if len(after) == len(head) and parse_set(after)[0] == sequence:
                     if frames is None:
                         return None
                     found = VisibleFrameSet(sequence, presented_at_s, frames)
@@ -88,29 +86,16 @@ class FrameReader:
         return known
 
 
-def _header(data: bytes) -> tuple[int, int, float] | None:
-    if len(data) < ENTRIES_AT:
-        return None
-    magic, version, count, sequence, presented_at_s, _ = HEADER.unpack_from(data)
-    if magic != MAGIC or version != VERSION or not 1 <= count <= MOST_OUTPUTS:
-        return None
-    return count, sequence, presented_at_s
-
-
-def _frames(handle: int, count: int, file_size: int) -> dict[str, ByteImage] | None:
-    """Every output's pixels, or None where an entry points outside the file."""
-    table = os.pread(handle, count * ENTRY.size, ENTRIES_AT)
-    if len(table) < count * ENTRY.size:
-        return None
+def _frames(handle: int, layout: FrameLayout, file_size: int) -> dict[str, ByteImage] | None:
+    """Every output's pixels, or None where a slot points outside the file."""
     frames: dict[str, ByteImage] = {}
-    for name, width, height, offset, _ in ENTRY.iter_unpack(table):
-        size = width * height * 3
-        if not 0 < size <= MOST_BYTES or offset + size > file_size:
+    for slot in layout.slots:
+        if slot.nbytes > MOST_BYTES or slot.offset + slot.nbytes > file_size:
             return None
-        pixels = np.empty((height, width, 3), dtype=np.uint8)
-        if os.preadv(handle, [pixels.reshape(-1).data], offset) != size:
+        pixels = np.empty(slot.shape, dtype=np.uint8)
+        if os.preadv(handle, [pixels.reshape(-1).data], slot.offset) != slot.nbytes:
             return None
-        frames[name.rstrip(b"\0").decode("utf-8", "replace")] = pixels
+        frames[slot.name] = pixels
     return frames
 
 

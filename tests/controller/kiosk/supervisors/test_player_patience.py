@@ -10,9 +10,9 @@ from typing import Any, cast
 
 from controller.kiosk.decide.interfaces import BLACK, Showing
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.player import PlayerClient
 
 MARBLE = Showing(Path("b.vel"), "marble")
 STEP_S = 0.25
@@ -29,9 +29,15 @@ class Computer:
         self.supervisor = PlayerSupervisor(
             Path(), lambda _: PlayerSettings([("P1", 8, 8)], Path("f")), self.told.append,
             monotonic=lambda: self.now_s, launch=lambda *_: cast("Any", self._launched()),
-            channel=PlayerChannel(lambda *_: cast("Any", self.process), lambda: self.now_s),
+            channel=PlayerClient(lambda *_: cast("Any", self.process), self),
         )  # fmt: skip
         self.supervisor.want = BLACK
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float, /) -> None:
+        self.now_s += seconds
 
     def _launched(self) -> Player:
         self.process = Player(self)

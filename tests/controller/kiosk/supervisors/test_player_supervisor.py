@@ -11,9 +11,9 @@ import pytest
 from controller.kiosk.decide.interfaces import Showing
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors import player_supervisor as player_keeper
-from controller.kiosk.supervisors.player_channel import PlayerChannel
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.player import PlayerClient
 
 
 class ModelProcess:
@@ -86,7 +86,7 @@ def test_an_output_without_a_picture_is_told_beside_a_damaged_bundle(tmp_path: P
     supervisor = PlayerSupervisor(
         tmp_path, lambda _: PlayerSettings([("P1", 8, 8), ("P2", 8, 8)], tmp_path / "outputs.frame"), told.append,
         monotonic=lambda: now_s[0], launch=lambda runtime, settings: cast("Any", ReadyProcess(runtime, settings)),
-        channel=PlayerChannel(lambda *_: cast("Any", wire)),
+        channel=PlayerClient(lambda *_: cast("Any", wire)),
     )  # fmt: skip
     supervisor.want = Showing(tmp_path / "b.vel", "1")
     supervisor.identifying = False
