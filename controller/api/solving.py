@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.arrays import as_image, as_images
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, Radiometry
 from controller.optics.solve import appearance
 from controller.optics.solve.appearance import Base
-from controller.optics.solve.bounded.equations import Solution
-from controller.optics.solve.bounded.solver import MOST_ITERATIONS, SMOOTHNESS, TOLERANCE, solve_bounded
+from controller.optics.solve.bounded.equations import MOST_ITERATIONS, TOLERANCE, Solution, SolveSettings
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.feasibility import expose_target, target_radiance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import LightTransport
@@ -107,11 +108,13 @@ def solve(
         transport,
         wanted,
         _black(black, wanted),
-        smoothness=smoothness,
-        weights=None if weights is None else as_image(weights),
-        start=None if start is None else as_images(start),
-        tolerance=tolerance,
-        most_iterations=most_iterations,
+        SolveSettings(
+            smoothness,
+            None if weights is None else as_image(weights),
+            None if start is None else as_images(start),
+            tolerance,
+            most_iterations,
+        ),
     )
 
 
@@ -154,7 +157,7 @@ def solve_base(
     """
     wanted = as_image(image)
     dark = _black(black, wanted)
-    return appearance.solve_base(transport, wanted, dark, smoothness=smoothness, tolerance=tolerance)
+    return appearance.solve_base(transport, wanted, dark, SolveSettings(smoothness, tolerance=tolerance))
 
 
 def scale(

@@ -15,8 +15,8 @@ from scipy.ndimage import map_coordinates
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
 from controller.optics.calibrate.values import Calibration, ProjectorCalibration
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.feasibility import direct_part
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import LightTransport, build_transport
@@ -138,7 +138,7 @@ def _bounded(
 ) -> list[ByteImage]:
     wanted = direct_part(transport, target.radiance, black, indirect)
     weights = appearance_weights(target.radiance, target.in_reach, target.white)
-    solution = solve_bounded(transport, np.maximum(wanted, black), black, weights=weights, smoothness=SMOOTHNESS)
+    solution = solve_bounded(transport, np.maximum(wanted, black), black, SolveSettings(weights=weights))
     return _device(calibration, solution.frames)
 
 

@@ -312,10 +312,8 @@ def agrees_with_the_processor(found: Computed, kiosk: StageKiosk, target: Path) 
     names, options = kiosk.service.checked.names, options_of(SolveTable(mode="scale"))
     calibrated = Calibrated(finished_calibration(kiosk.stage), names)
     black, transport = calibrated.calibration.black, calibrated.transport
-    made = solve_appearance(
-        transport, solved_base(calibrated, options), black, load_target(target, CAMERA_PX), options,
-        drive=calibrated.drive, indirect=calibrated.indirect,
-    )  # fmt: skip
+    base = solved_base(calibrated, options)
+    made = solve_appearance(calibrated.light, base, load_target(target, CAMERA_PX), options)
     seen = calibrated.predicted_light(made.frames) + black
     exposure, whole = float(made.figures["exposure"] or 0), visible_object(transport.object_mask)
     judged = by_pixels(

@@ -28,7 +28,7 @@ from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.kiosk.preview.computed import no_device
 from controller.kiosk.preview.pictures import write_picture
 from controller.kiosk.store.targets import fitted, png_size
-from controller.optics.solve.bounded.engine import Processor
+from controller.optics.solve.bounded.engine import Processor, SolveContext
 from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.optics.solve.request import AppearanceResult, solve_appearance
@@ -84,9 +84,12 @@ class Solver:
         calibrated = self._calibrated
         calibration = calibrated.calibration
         made = solve_appearance(
-            calibrated.transport, calibrated.base, calibration.black, self._target(Path(task.target)), self._options,
-            drive=calibrated.drive, indirect=calibrated.indirect, engine=calibrated.engine, folder=calibrated.folder,
-        )  # fmt: skip
+            calibrated.light,
+            calibrated.base,
+            self._target(Path(task.target)),
+            self._options,
+            SolveContext(calibrated.engine, folder=calibrated.folder),
+        )
         seen = calibrated.predicted_light(made.frames) + calibration.black
         return {
             **self._judged(made, seen, Path(task.picture)),

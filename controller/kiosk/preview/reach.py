@@ -74,16 +74,15 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     from controller.kiosk.preview.pictures import write_picture
     from controller.kiosk.preview.preview_light import preview_light
+    from controller.optics.solve.appearance import StageLight
     from controller.optics.solve.request import aim_at
     from controller.optics.solve.result.metrics import visible_object
     from controller.stage.steps.appearance.solving import options_of
 
     light = preview_light(checked.stage.folder, run, checked.names)
     wanted = _wanted(light, target)
-    aim = aim_at(
-        light.transport, light.black, wanted.image, options_of(checked.stage.tables.solve),
-        drive=light.drive, indirect=light.indirect,
-    )  # fmt: skip
+    stage_light = StageLight(light.transport, light.black, light.indirect, light.drive)
+    aim = aim_at(stage_light, wanted.image, options_of(checked.stage.tables.solve))
     lit = light.transport.object_mask
     seen = visible_object(lit)
     kinds = kinds_of(aim.asked_possible, lit & wanted.mask)

@@ -18,11 +18,11 @@ from typing import Any, Final, ParamSpec
 import numpy as np
 import numpy.typing as npt
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import ByteImage, Float64, Mask
 from controller.core.plotting import figure_of, picture_of
 from controller.optics.plan.search import PlacementPlan
 from controller.optics.plan.values import Illumination, Placement, PlanGoal, Surface
-from controller.optics.solve.bounded.solver import SMOOTHNESS
 
 MEAN: Final = 0.5
 FAINT: Final = 0.1

@@ -144,13 +144,23 @@ class Measure:
         return np.asarray(self.at_points(rest, others) @ self.weight)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanScene:
+    """What is there before any projector: the object's ``surface``, what casts ``shadows``, where the audience stands.
+
+    ``audience_m`` (N, 3): positions of eyes
+    """
+
+    surface: Surface
+    shadows: Shadows
+    audience_m: Float64
+
+
 def candidates_of(
     models: Sequence[ProjectorModel],
     mounting_points: Sequence[MountingPoint],
-    surface: Surface,
-    shadows: Shadows,
+    scene: PlanScene,
     goal: PlanGoal,
-    audience_m: Float64,
     *,
     tell: ProgressCallback = lambda share, text: None,
     cancel: threading.Event | None = None,
@@ -160,6 +170,7 @@ def candidates_of(
     Where its body would stand between audience and object is no place. Raises UsageError("plan-no-place") if a model
     has none, WorkError("cancelled").
     """
+    surface = scene.surface
     known: dict[ProjectorModel, list[Candidate]] = {}
     different = list(dict.fromkeys(models))
     for number, (model, mounting_point) in enumerate(itertools.product(different, mounting_points)):
@@ -167,9 +178,9 @@ def candidates_of(
         tell(number / (len(different) * len(mounting_points)), f"{model.name} at {mounting_point.name}")
         found = known.setdefault(model, [])
         placement = aimed(model, mounting_point, surface, goal.fill)
-        if placement is None or in_the_way(placement.position_m, audience_m, surface, goal.body_m):
+        if placement is None or in_the_way(placement.position_m, scene.audience_m, surface, goal.body_m):
             continue
-        lit = lit_by(placement, surface, shadows)
+        lit = lit_by(placement, surface, scene.shadows)
         useful = lit.useful(goal.steepest_degrees)
         if np.any(useful & (surface.area_m2 > 0)):
             found.append(Candidate(placement, lit, useful))

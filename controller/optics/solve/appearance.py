@@ -11,7 +11,7 @@ at each pixel (Nayar 2003, Grossberg 2004). It ignores neighbours, other project
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -25,9 +25,10 @@ from controller.core.channels import largest
 from controller.core.checks import check_image
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.bounded.engine import Engine, Processor
-from controller.optics.solve.bounded.equations import Solution
-from controller.optics.solve.bounded.solver import SMOOTHNESS, TOLERANCE, check_target, solve_bounded
+from controller.optics.solve.bounded.engine import ALONE, Engine, Processor, SolveContext
+from controller.optics.solve.bounded.equations import DEFAULT_SETTINGS, Solution, SolveSettings
+from controller.optics.solve.bounded.solver import check_target, solve_bounded
+from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import ExposedTarget, expose_target
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
@@ -48,6 +49,21 @@ MOST_LOST, LITTLE_LOST = 1.7, 0.02
 """Base x scale may miss so many times what the base misses, or so much of the light; else the solve is a full one."""
 WELL_BELOW: Final = 0.5
 """Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageLight:
+    """What is known of the light of a stage.
+
+    ``transport``: T; ``black`` (rows, columns, 3): the black image K
+    ``indirect``: light by way of other surfaces, G; None: there is none
+    ``drive``: levels of this transport, where they are already known
+    """
+
+    transport: LightTransport
+    black: FloatImage
+    indirect: IndirectLight | None = None
+    drive: DriveLevels | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,19 +158,11 @@ def solve_base(
     transport: LightTransport,
     image: FloatImage,
     black: FloatImage,
-    *,
-    smoothness: float = SMOOTHNESS,
-    tolerance: float = TOLERANCE,
-    progress: Callable[[int, float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    engine: Engine | None = None,
+    settings: SolveSettings = DEFAULT_SETTINGS,
+    context: SolveContext = ALONE,
 ) -> Base:
     """Solve the frames of a base ``image`` (``base_image``) and prepare to scale them; errors as ``solve_bounded``."""
-    solution = solve_bounded(
-        transport, image, black, smoothness=smoothness, tolerance=tolerance, progress=progress, cancelled=cancelled,
-        engine=engine,
-    )  # fmt: skip
-    return prepare_base(transport, image, black, solution)
+    return prepare_base(transport, image, black, solve_bounded(transport, image, black, settings, context))
 
 
 def prepare_base(transport: LightTransport, image: FloatImage, black: FloatImage, solution: Solution) -> Base:
@@ -207,14 +215,7 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
     return float(np.sqrt(fine / whole)) if whole > 0 else 0.0
 
 
-def _as_good(
-    transport: LightTransport,
-    base: Base,
-    frames: Sequence[FloatImage],
-    target: FloatImage,
-    black: FloatImage,
-    reachable: Mask,
-) -> bool:
+def _as_good(light: StageLight, base: Base, frames: Sequence[FloatImage], target: FloatImage, reachable: Mask) -> bool:
     """Whether scaled frames come about as near their target in reach as the base's own frames come to the base image.
 
     Beside the shadow of a projector, and around what is out of reach, the pixels of one projector have to make up for
@@ -223,7 +224,7 @@ def _as_good(
     if not reachable.any():
         return True
     lost, least = (
-        _lost(transport.forward(shown) + black, wanted, reachable)
+        _lost(light.transport.forward(shown) + light.black, wanted, reachable)
         for shown, wanted in ((frames, target), (base.solution.frames, base.image))
     )
     return lost < max(MOST_LOST * least, LITTLE_LOST)
@@ -252,46 +253,31 @@ def _pitch(transport: LightTransport, n: int) -> float:
 
 
 def make_appearance(
-    transport: LightTransport,
+    light: StageLight,
     base: Base,
     target: FloatImage,
-    black: FloatImage,
+    settings: SolveSettings = DEFAULT_SETTINGS,
+    context: SolveContext = ALONE,
     *,
     mode: Mode = "auto",
-    smoothness: float = SMOOTHNESS,
-    weights: FloatImage | None = None,
     reachable: Mask | None = None,
-    start: Sequence[FloatImage] | None = None,
-    tolerance: float = TOLERANCE,
-    progress: Callable[[int, float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    engine: Engine | None = None,
 ) -> Appearance:
     """Frames for a target radiance: by base and scale, by a full solve, or depending on target and result.
 
+    ``target`` (rows, columns, 3): to be made by direct light, black image included; ``settings`` are of a full solve
     ``reachable`` (rows, columns): where base and scale must come near the target, for the mode "auto" to keep them;
-    None: they are judged by the target's detail alone. ``start``: frames of a similar target, for a full solve.
+    None: they are judged by the target's detail alone
 
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 8).
     """
+    transport, black = light.transport, light.black
     check_target(transport, target)
     detail = fine_detail(transport, base, target, black)
     if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
-        scaled = scale_frames(transport, base, target, black, engine=engine)
-        if mode == "scale" or reachable is None or _as_good(transport, base, scaled, target, black, reachable):
+        scaled = scale_frames(transport, base, target, black, engine=context.engine)
+        if mode == "scale" or reachable is None or _as_good(light, base, scaled, target, reachable):
             return Appearance(tuple(scaled), "scale", detail, None)
-    solution = solve_bounded(
-        transport,
-        target,
-        black,
-        smoothness=smoothness,
-        weights=weights,
-        start=start,
-        tolerance=tolerance,
-        progress=progress,
-        cancelled=cancelled,
-        engine=engine,
-    )
+    solution = solve_bounded(transport, target, black, settings, context)
     return Appearance(solution.frames, "full", detail, solution)
 
 

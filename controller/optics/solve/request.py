@@ -7,8 +7,7 @@ machine, and gives the same.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -22,13 +21,13 @@ from controller.optics.solve.appearance import (
     Base,
     BaseChoice,
     Mode,
+    StageLight,
     high_pass_base,
     make_appearance,
     solve_base,
 )
-from controller.optics.solve.bounded.engine import Engine
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import TOLERANCE
+from controller.optics.solve.bounded.engine import ALONE, SolveContext
+from controller.optics.solve.bounded.equations import TOLERANCE, SolveSettings, appearance_weights
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import (
@@ -39,8 +38,6 @@ from controller.optics.solve.reach.feasibility import (
     target_radiance,
 )
 from controller.optics.solve.targets.values import Target
-from controller.optics.transport import LightTransport
-from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 ADVICE_FULL_SOLVE = (
     'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
@@ -49,6 +46,7 @@ ADVICE_FULL_SOLVE = (
 
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
+LET_GO: Final = np.empty((0, 0, 3), np.float32)
 FIRST_TOLERANCE: Final = 2 * TOLERANCE
 """Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
@@ -101,41 +99,20 @@ class AppearanceResult:
 
 
 def solve_appearance(
-    transport: LightTransport,
-    base: Base,
-    black: FloatImage,
-    requested: Target,
-    options: SolveOptions,
-    *,
-    drive: DriveLevels | None = None,
-    indirect: IndirectLight | None = None,
-    progress: Callable[[int, float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    engine: Engine | None = None,
-    folder: Path | None = None,
+    light: StageLight, base: Base, requested: Target, options: SolveOptions, context: SolveContext = ALONE
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
 
-    ``indirect``: light by way of other surfaces, of which the frames then leave room in the target.
-    ``engine``: what does the heavy loops (``solve.engines``); None: the processor
-    ``folder``: for nameless files of what need not stay in memory during the solve; None: it stays there
-
+    With ``light.indirect`` the frames leave room in the target for the light by way of other surfaces.
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
     """
-    drive = DriveLevels(transport, folder) if drive is None else drive
-    picture, valid = requested.image, requested.mask
-    del requested
-    aim = aim_at(transport, black, picture, options, drive=drive, indirect=indirect, folder=folder)
-    del picture
+    if light.drive is None:
+        light = replace(light, drive=DriveLevels(light.transport, context.folder))
+    aim = aim_at(light, requested.image, options, context.folder)
+    valid = requested.mask
+    del requested  # the picture is large, and of no more use
     began_s = time.perf_counter()
-    solve = partial(_solved, transport, base, black, options, aim, progress=progress, cancelled=cancelled,
-                    engine=engine)  # fmt: skip
-    made = solve(aim.direct, tolerance=TOLERANCE if indirect is None else FIRST_TOLERANCE)
-    if indirect is not None:
-        # what can't be reached throws back other light than was wanted of it
-        frames = made.frames
-        del made
-        made = solve(_left_to_make(transport, aim.wanted, black, frames, indirect), start=frames)
+    made = _solved(light, base, aim, options, context)
     figures = aim.figures | {
         "mode": made.mode,
         "seconds": time.perf_counter() - began_s,
@@ -144,7 +121,7 @@ def solve_appearance(
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
-    reachable, asked_reachable = (found.reachable & valid for found in (aim.possible, aim.asked_possible))
+    reachable, asked_reachable = (part.reachable & valid for part in (aim.possible, aim.asked_possible))
     return AppearanceResult(made.frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
 
 
@@ -166,89 +143,89 @@ class Aim:
     figures: dict[str, float | int | str | None]
 
 
-def aim_at(
-    transport: LightTransport,
-    black: FloatImage,
-    picture: FloatImage,
-    options: SolveOptions,
-    *,
-    drive: DriveLevels,
-    indirect: IndirectLight | None = None,
-    folder: Path | None = None,
-) -> Aim:
+class _ExposedPicture:
+    """A picture on its way to an aim.
+
+    All parts are as large as the camera's picture, so what is of no more use is let go before the next one is made.
+
+    ``asked``, ``wanted``: the picture at its exposure, and bent into what the stage can make
+    ``needed``: what of ``wanted`` has to come from the projectors directly, with the black image
+    ``possible``: how ``needed`` lies in what they can make
+    """
+
+    def __init__(self, light: StageLight, picture: FloatImage, share: float, folder: Path | None) -> None:
+        exposed = expose_target(
+            light.transport, picture, light.black, share=share, drive=light.drive, indirect=light.indirect
+        )
+        self._light, self._folder = light, folder
+        self.asked = self.wanted = moved_to_file(exposed.wanted, folder)
+        self.exposure, self.needed, self.possible = exposed.exposure, exposed.needed, exposed.possible
+
+    def adapt(self, strength: float) -> None:
+        """Bend ``wanted`` into what the stage can make, around what ``needed`` throws back."""
+        self.wanted = self._bent(strength)
+        self.needed = direct_part(self._light.transport, self.wanted, self._light.black, self._light.indirect)
+
+    def _bent(self, strength: float) -> FloatImage:
+        floor = self._floor()
+        self.wanted = self.needed = LET_GO
+        bent = adapted_target(self._light.transport, self.asked, floor, strength=strength, drive=self._light.drive)
+        return moved_to_file(bent, self._folder)
+
+    def _floor(self) -> FloatImage:
+        """What is there (rows, columns, 3) without any projector's direct light, where ``needed`` is shown around."""
+        light = self._light
+        if light.indirect is None:
+            return light.black
+        return light.black + light.indirect.forward(np.clip(self.needed - light.black, 0, light.transport.reach()))
+
+
+def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder: Path | None = None) -> Aim:
     """Expose a picture, see what of it is in reach, and adapt it if asked.
 
-    With ``indirect`` light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
-    dark, too, where more indirect light falls than is wanted. ``folder``: as of ``solve_appearance``. Raises what
+    With indirect light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
+    dark, too, where more indirect light falls than is wanted. ``folder``: as of ``SolveContext``. Raises what
     ``choose_exposure`` raises.
     """
-    found = expose_target(transport, picture, black, share=options.share, drive=drive, indirect=indirect)
-    asked, exposure, asked_possible = moved_to_file(found.wanted, folder), found.exposure, found.possible
-    wanted, needed, possible = asked, found.needed, asked_possible
-    del found
-    figures: dict[str, float | int | str | None] = {"exposure": exposure, "reachable_share": possible.share}
+    exposed = _ExposedPicture(light, picture, options.share, folder)
+    asked_possible = exposed.possible
+    figures: dict[str, float | int | str | None] = {
+        "exposure": exposed.exposure,
+        "reachable_share": asked_possible.share,
+    }
     if options.adapt > 0:
-        for _ in range(1 if indirect is None else ADAPTATIONS):
-            floor = black if indirect is None else _least(transport, black, needed, indirect)
-            # Each is as large as the camera's picture, so none stays while the next one is made.
-            del wanted, needed
-            wanted = adapted_target(transport, asked, floor, strength=options.adapt, drive=drive)
-            wanted = moved_to_file(wanted, folder)
-            del floor
-            needed = direct_part(transport, wanted, black, indirect)
-        possible = feasibility(transport, needed, black, drive=drive)
-        figures |= {"adapted_share": possible.share}
-    direct = moved_to_file(target_radiance(needed, black, 1.0), folder)
-    return Aim(wanted, direct, possible, asked, asked_possible, exposure, figures)
+        for _ in range(1 if light.indirect is None else ADAPTATIONS):
+            exposed.adapt(options.adapt)
+        exposed.possible = feasibility(light.transport, exposed.needed, light.black, drive=light.drive)
+        figures |= {"adapted_share": exposed.possible.share}
+    direct = moved_to_file(target_radiance(exposed.needed, light.black, 1.0), folder)
+    return Aim(exposed.wanted, direct, exposed.possible, exposed.asked, asked_possible, exposed.exposure, figures)
 
 
-def _left_to_make(
-    transport: LightTransport, wanted: FloatImage, black: FloatImage, frames: Sequence[FloatImage],
-    indirect: IndirectLight,
-) -> FloatImage:  # fmt: skip
-    """The radiance (rows, columns, 3) that direct light has to make beside the indirect light of ``frames``."""
-    return target_radiance(wanted - indirect.forward(transport.forward(frames)), black, 1.0)
+def _solved(light: StageLight, base: Base, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:
+    """Frames for an aim; with indirect light by two solves."""
+    wanted = target_radiance(aim.wanted, light.black, 1.0)
+    weights = appearance_weights(wanted, aim.possible.reachable, aim.exposure)
+    del wanted
+    settings = SolveSettings(options.smoothness, weights)
+    solve = partial(_solved_directly, light, base, aim, options, context)
+    if light.indirect is None:
+        return solve(aim.direct, settings)
+    first = solve(aim.direct, replace(settings, tolerance=FIRST_TOLERANCE)).frames
+    # what can't be reached throws back other light than was wanted of it
+    indirect = light.indirect.forward(light.transport.forward(first))
+    left = target_radiance(aim.wanted - indirect, light.black, 1.0)
+    del indirect
+    return solve(left, replace(settings, start=first))
 
 
-def _least(transport: LightTransport, black: FloatImage, needed: FloatImage, indirect: IndirectLight) -> FloatImage:
-    """What is there (rows, columns, 3) without any projector's direct light, where ``needed`` is shown around."""
-    shown = np.clip(needed - black, 0, transport.reach())
-    return black + indirect.forward(shown)
-
-
-def _solved(
-    transport: LightTransport,
-    base: Base,
-    black: FloatImage,
-    options: SolveOptions,
-    aim: Aim,
-    target: FloatImage,
-    *,
-    start: Sequence[FloatImage] | None = None,
-    tolerance: float = TOLERANCE,
-    progress: Callable[[int, float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    engine: Engine | None = None,
-) -> Appearance:
-    """Frames for a target radiance, in direct light."""
+def _solved_directly(
+    light: StageLight, base: Base, aim: Aim, options: SolveOptions, context: SolveContext,
+    target: FloatImage, settings: SolveSettings,
+) -> Appearance:  # fmt: skip
+    """Frames for a ``target`` radiance (rows, columns, 3), in direct light."""
     if options.base == "high-pass":
-        image = high_pass_base(transport, base.image, target, black)
-        base = solve_base(
-            transport, image, black, smoothness=options.smoothness, progress=progress, cancelled=cancelled,
-            engine=engine,
-        )  # fmt: skip
-    return make_appearance(
-        transport,
-        base,
-        target,
-        black,
-        mode=options.mode,
-        smoothness=options.smoothness,
-        weights=appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure),
-        reachable=aim.possible.reachable,
-        start=start,
-        tolerance=tolerance,
-        progress=progress,
-        cancelled=cancelled,
-        engine=engine,
-    )
+        image = high_pass_base(light.transport, base.image, target, light.black)
+        base = solve_base(light.transport, image, light.black, SolveSettings(options.smoothness), context)
+    reachable = aim.possible.reachable
+    return make_appearance(light, base, target, settings, context, mode=options.mode, reachable=reachable)

@@ -8,7 +8,7 @@ from pathlib import Path
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.appearance import Base, prepare_base
+from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.engine import Engine, Processor
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.transport import LightTransport, build_transport
@@ -102,6 +102,11 @@ class Calibrated:
         if self._drive is None:
             self._drive = DriveLevels(self.transport, self.folder)
         return self._drive
+
+    @property
+    def light(self) -> StageLight:
+        """All that is known of the stage's light."""
+        return StageLight(self.transport, self.calibration.black, self.indirect, self.drive)
 
     @property
     def reflectance(self) -> FloatImage:

@@ -18,7 +18,7 @@ import xxhash
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
-from controller.optics.solve.appearance import Base, prepare_base
+from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
@@ -103,9 +103,8 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
             _kept[key] = base, DriveLevels(stage.transport)
         base, drive = _kept[key]
-        return solve_appearance(
-            stage.transport, base, stage.black, asked, options, drive=drive, indirect=stage.indirect
-        )
+        light = StageLight(stage.transport, stage.black, stage.indirect, drive)
+        return solve_appearance(light, base, asked, options)
 
     return _outcome_of(work)
 

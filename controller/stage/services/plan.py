@@ -16,7 +16,7 @@ from controller.core.storage import write_atomically
 from controller.optics.plan.figures import combined_light, figures_of, layout, value_map
 from controller.optics.plan.optics import lit_by
 from controller.optics.plan.plan_file import EXAMPLE, PlanTables, read_plan
-from controller.optics.plan.search import PlacementPlan, candidates_of, choose_placements
+from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_placements
 from controller.optics.plan.target_object import TargetObject, read_target_object, sampled, seen_from
 from controller.optics.plan.values import Placement, PlanGoal, Surface
 from controller.run.progress import Reporter, Tracker
@@ -59,16 +59,8 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
     tracker.end()
     tracker.begin(1)
     places = tables.mounting_points()
-    candidates = candidates_of(
-        tables.models(),
-        places,
-        surface,
-        target_object,
-        goal,
-        audience,
-        tell=tracker.advance,
-        cancel=cancel,
-    )
+    scene = PlanScene(surface, target_object, audience)
+    candidates = candidates_of(tables.models(), places, scene, goal, tell=tracker.advance, cancel=cancel)
     tracker.end()
     tracker.begin(2)
     best = choose_placements(candidates, surface, goal, tell=tracker.advance, cancel=cancel)

@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.metapixels.regularize import fill_holes, regularize
 from controller.optics.calibrate.values import Calibration, Metapixels
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.gaussians.patches import patches_of_weights
 from controller.stage.report.pictures import crop_around
@@ -45,7 +46,9 @@ def _ways(subject: Subject, wanted: ReachableTarget) -> list[tuple[str, Callable
 
     def solved(transport: LightTransport, smoothness: float) -> Sequence[FloatImage]:
         weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-        return solve_bounded(transport, wanted.direct, black, smoothness=smoothness, weights=weights).frames
+        return solve_bounded(
+            transport, wanted.direct, black, SolveSettings(smoothness=smoothness, weights=weights)
+        ).frames
 
     def gaussians(metapixels: Sequence[Metapixels]) -> LightTransport:
         return build_transport(with_metapixels(plain, metapixels))

@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.feasibility import choose_exposure, feasibility
 from controller.optics.solve.result.ghosting import Ghosting, ghosting
@@ -71,7 +71,7 @@ def _at_exposure(
         return screen(np.where(shown[..., None], image, 0).astype(np.float32), matrix, white, crop)
 
     for way, asked in targets.items():
-        frames = solve_bounded(transport, asked, black, smoothness=SMOOTHNESS).frames
+        frames = solve_bounded(transport, asked, black).frames
         picture = subject.light.photograph(f"{share:.2f}-{way.replace(' ', '-')}", frames, white=white)
         results.append(
             AdaptationResult(

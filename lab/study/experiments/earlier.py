@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import traditional_compensation
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.transport import LightTransport, build_transport
 from controller.stage.report.pictures import crop_around, error_picture
@@ -53,7 +54,9 @@ def _ways(subject: Subject, wanted: ReachableTarget, best: int) -> list[tuple[st
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
 
     def bounded(transport: LightTransport, smoothness: float) -> Sequence[FloatImage]:
-        return solve_bounded(transport, wanted.direct, black, weights=weights, smoothness=smoothness).frames
+        return solve_bounded(
+            transport, wanted.direct, black, SolveSettings(weights=weights, smoothness=smoothness)
+        ).frames
 
     return [
         ("one projector, division at each pixel", lambda: traditional_compensation(calibration, wanted.radiance, best)),

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask
-from controller.optics.solve.bounded.regions import solve_regions
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings
+from controller.optics.solve.bounded.regions import RegionCut, solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
 from lab.study.output.drawing import LabelledPicture, detail, maps, screen, strip
 from lab.study.subject.measuring import predicted
@@ -50,14 +52,19 @@ def regions(subject: Subject) -> Result:
 
     for number, size_px in enumerate(SIZES):
 
-        def progress(share: float, number: int = number, size_px: int = size_px) -> None:
-            subject.advance((number + share) / (len(SIZES) + 1), f"regions of {size_px}")
+        def progress(_: int, left: float, number: int = number, size_px: int = size_px) -> None:
+            subject.advance((number + 1 - left) / (len(SIZES) + 1), f"regions of {size_px}")
 
         found = solve_regions(
-            transport, wanted.direct, black, solver=solver, size_px=size_px, weights=weights, progress=progress
+            transport,
+            wanted.direct,
+            black,
+            SolveSettings(weights=weights),
+            SolveContext(progress=progress),
+            cut=RegionCut(solver=solver, size_px=size_px),
         )
         keep(f"regions of {size_px}", found.frames, found.seconds, found.objective)
-    whole = solve_bounded(transport, wanted.direct, black, weights=weights)
+    whole = solve_bounded(transport, wanted.direct, black, SolveSettings(weights=weights))
     keep("global", whole.frames, whole.seconds, whole.objective)
     again = subject.light.photograph("again", whole.frames, white=wanted.white)
     inner = np.zeros(subject.mask.shape, np.bool_)

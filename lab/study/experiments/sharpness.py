@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.bounded.equations import appearance_weights
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.targets.patterns import checkerboard
 from controller.optics.solve.targets.values import through_camera
@@ -88,7 +88,7 @@ def _frames(subject: Subject, which: Sequence[int], wanted: ReachableTarget, *, 
         raw = raw_transport(paper_model(calibration), [subject.light.dots(n).shares for n in which])
         return unbounded_inverse(raw, wanted.direct, black)
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-    return solve_bounded(build_transport(calibration), wanted.direct, black, weights=weights).frames
+    return solve_bounded(build_transport(calibration), wanted.direct, black, SolveSettings(weights=weights)).frames
 
 
 def _behind(results: Sequence[SharpnessResult]) -> FloatImage:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.appearance import Base
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.appearance import Base, StageLight
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.scaling.dither import to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import scaling_maps
@@ -37,7 +37,7 @@ def photograph_target(subject: Subject) -> Target:
 def live_frames(subject: Subject, base: Base, radiance: FloatImage) -> Sequence[FloatImage]:
     """What ``velatura live`` shows of ``radiance`` (rows, columns, 3): base times scale by narrower means, 8 bits."""
     radiometries = [part.radiometry for part in subject.calibration.projectors]
-    maps = scaling_maps(subject.transport, base, subject.calibration.black, radiometries, indirect=subject.indirect)
+    maps = scaling_maps(StageLight(subject.transport, subject.calibration.black, subject.indirect), base, radiometries)
     frames = Interactive(maps, subject.transport.camera_shape).frames(radiance)
     return [to_light(frame, radiometry) for frame, radiometry in zip(frames, radiometries, strict=True)]
 
@@ -47,7 +47,7 @@ def run_trial(subject: Subject, name: str) -> Trial:
     wanted = subject.wanted(photograph_target(subject))
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
     black = subject.calibration.black
-    solution = solve_bounded(subject.transport, wanted.direct, black, weights=weights, smoothness=SMOOTHNESS)
+    solution = solve_bounded(subject.transport, wanted.direct, black, SolveSettings(weights=weights))
     return photograph_frames(subject, name, wanted, solution.frames)
 
 

@@ -21,7 +21,8 @@ import numpy.typing as npt
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.core.arrays import ByteImage, FloatImage
 from controller.optics.calibrate.values import Calibration, Radiometry
-from controller.optics.solve.appearance import base_image, scale_frames, solve_base
+from controller.optics.solve.appearance import StageLight, base_image, scale_frames, solve_base
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.scaling.dither import to_device, to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import reduced, reduction, scaling_maps
@@ -54,21 +55,21 @@ def measure(size: str) -> list[Row]:
     paper = size == "paper"
     calibration = synthetic_calibration(size)
     transport = build_transport(calibration)
-    base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-2)
+    base = solve_base(transport, base_image(calibration, "white"), calibration.black, SolveSettings(tolerance=1e-2))
     radiometries = [part.radiometry for part in calibration.projectors]
-    maps = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"])
+    maps = scaling_maps(StageLight(transport, calibration.black), base, radiometries, ["P1", "P2", "P3"])
     wanted = synthetic_target(transport.camera_shape)
     small = reduced(wanted, reduction(transport.camera_shape))
     target = np.asarray(np.rint(255 * linear_to_srgb(small)), np.uint8)
     scaler = Interactive(maps, transport.camera_shape)
     rows = _speeds(scaler, np.float32(BRIGHTNESS) * wanted, target, paper=paper)
     thrown = synthetic_indirect(calibration, transport.object_mask)
-    with_g = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"], indirect=thrown)
+    with_g = scaling_maps(StageLight(transport, calibration.black, thrown), base, radiometries, ["P1", "P2", "P3"])
     rows += _indirect(scaler, Interactive(with_g, transport.camera_shape), target)
     rows += _errors(scaler, target, paper=paper)
     radiance = np.float32(BRIGHTNESS) * wanted
     exact = scale_frames(transport, base, radiance, calibration.black)
-    papers = scaling_maps(transport, base, calibration.black, radiometries, ["P1", "P2", "P3"], spread=1.0)
+    papers = scaling_maps(StageLight(transport, calibration.black), base, radiometries, ["P1", "P2", "P3"], spread=1.0)
     papers_way = Interactive(papers, transport.camera_shape)
     rows.append(_error_of_maps(papers_way, exact, radiometries, radiance))
     rows.append(_nearer(transport, calibration, {"ours": scaler, "eq. 6": papers_way}))

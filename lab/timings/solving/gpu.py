@@ -21,8 +21,8 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.optics.solve.appearance import base_image, prepare_base, scale_frames
-from controller.optics.solve.bounded.engine import Engine, Processor
-from controller.optics.solve.bounded.equations import Solution
+from controller.optics.solve.bounded.engine import Engine, Processor, SolveContext
+from controller.optics.solve.bounded.equations import Solution, SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.gpu.device import Device, adapters
 from controller.optics.solve.gpu.engine import GpuEngine
@@ -86,11 +86,8 @@ class Stage:
 
     def solved(self, engine: Engine, wanted: FloatImage, sweeps: int | None = None) -> Solution:
         """As it stops by itself, or after so many sweeps."""
-        if sweeps is None:
-            return solve_bounded(self.transport, wanted, self.black, engine=engine)
-        return solve_bounded(
-            self.transport, wanted, self.black, tolerance=0, most_iterations=sweeps, engine=engine
-        )  # fmt: skip
+        settings = SolveSettings() if sweeps is None else SolveSettings(tolerance=0, most_iterations=sweeps)
+        return solve_bounded(self.transport, wanted, self.black, settings, SolveContext(engine))
 
 
 def measured(stage: Stage, engines: Sequence[Engine], goals_s: tuple[float | None, float | None]) -> Iterator[Row]:

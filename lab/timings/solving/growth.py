@@ -17,6 +17,8 @@ from typing import Final
 import numpy as np
 
 from controller.optics.solve.appearance import base_image
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from lab.timings import Row, at_most, peak_bytes
@@ -79,9 +81,8 @@ def _solved(fraction: float) -> tuple[LightTransport, list[float]]:
         transport,
         image,
         calibration.black,
-        tolerance=0,
-        most_iterations=SWEEPS + 1,
-        progress=lambda iteration, kkt: at.append(time.perf_counter()),
+        SolveSettings(tolerance=0, most_iterations=SWEEPS + 1),
+        SolveContext(progress=lambda iteration, kkt: at.append(time.perf_counter())),
     )
     return transport, at
 

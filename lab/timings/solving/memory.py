@@ -23,7 +23,8 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.appearance import Base, base_image, prepare_base
+from controller.optics.solve.appearance import Base, StageLight, base_image, prepare_base
+from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.memory_need import solve_peak_bytes, stage_size
 from controller.optics.solve.request import SolveOptions, solve_appearance
@@ -121,7 +122,12 @@ def one_run(run: Path, names: list[str]) -> dict[str, Any]:
     transport = step("transport", lambda: build_transport(calibration))
     black = calibration.black
     base = _base(step, calibration, transport).in_files(run)
-    made = step("appearance", lambda: solve_appearance(transport, base, black, _target(black), OPTIONS, folder=run))
+    made = step(
+        "appearance",
+        lambda: solve_appearance(
+            StageLight(transport, black), base, _target(black), OPTIONS, context=SolveContext(folder=run)
+        ),
+    )
     watch.end()
     return {
         "pixels": transport.pixels,
@@ -159,7 +165,7 @@ def _warm() -> None:
         calibration = read_calibration(Path(folder), names)
         transport, image = build_transport(calibration), base_image(calibration, "white")
         base = prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
-        solve_appearance(transport, base, calibration.black, _target(calibration.black), OPTIONS)
+        solve_appearance(StageLight(transport, calibration.black), base, _target(calibration.black), OPTIONS)
         np.percentile(image, 50)
 
 

@@ -17,8 +17,16 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.bounded.equations import build_problem, initial_point
-from controller.optics.solve.bounded.regions import PHASES, SIZE_PX, BoxProblem, Regions, solve_box, solve_regions
+from controller.optics.solve.bounded.equations import SolveSettings, build_problem, initial_point
+from controller.optics.solve.bounded.regions import (
+    PHASES,
+    SIZE_PX,
+    BoxProblem,
+    RegionCut,
+    Regions,
+    solve_box,
+    solve_regions,
+)
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
 from controller.optics.transport import LightTransport, build_transport
@@ -139,12 +147,12 @@ def _nearness(calibration: Calibration) -> tuple[list[Row], float]:
     for crop in _crops(calibration):
         transport = build_transport(crop)
         target = _target(transport, crop.black)
-        exact = solve_regions(transport, target, crop.black, solver=solver, size_px=2 * CROP_PX)
-        best = solve_bounded(transport, target, crop.black, tolerance=1e-7, most_iterations=2000)
+        exact = solve_regions(transport, target, crop.black, cut=RegionCut(solver=solver, size_px=2 * CROP_PX))
+        best = solve_bounded(transport, target, crop.black, SolveSettings(tolerance=1e-7, most_iterations=2000))
         apart.append(abs(best.objective / exact.objective - 1))
         unknowns = max(unknowns, exact.unknowns)
         for size_px in SIZES_PX:
-            found = solve_regions(transport, target, crop.black, solver=solver, size_px=size_px)
+            found = solve_regions(transport, target, crop.black, cut=RegionCut(solver=solver, size_px=size_px))
             above[size_px].append(found.objective / exact.objective - 1)
             differing[size_px].append(np.sqrt(np.mean((found.light - exact.light) ** 2) / np.mean(exact.light**2)))
     rows = [

@@ -8,6 +8,7 @@ import numpy as np
 
 from controller.core.arrays import ByteImage, FloatImage
 from controller.optics.calibrate.values import Radiometry
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
 from controller.optics.solve.scaling.dither import to_device
@@ -39,7 +40,7 @@ def compensation_frames(size: str, appearances: int) -> list[dict[str, ByteImage
         target = _turned(synthetic_target(shape), number)
         exposure = choose_exposure(transport, target, calibration.black)
         wanted = target_radiance(target, calibration.black, exposure)
-        solution = solve_bounded(transport, wanted, calibration.black, most_iterations=MOST_ITERATIONS)
+        solution = solve_bounded(transport, wanted, calibration.black, SolveSettings(most_iterations=MOST_ITERATIONS))
         if uhd:
             found.append(_four_uhd(solution.frames, calibration.projectors[0].radiometry))
         else:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
 from controller.optics.solve.bounded.equations import Problem, build_problem, initial_point, objective_of
-from controller.optics.solve.bounded.solver import SMOOTHNESS
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import frame_planes
 from lab.timings import Timing

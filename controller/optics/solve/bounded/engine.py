@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
@@ -40,7 +41,7 @@ RECOMPUTE_EVERY: Final = 50
 
 @dataclass(frozen=True, slots=True)
 class IterationControl:
-    """When to stop, and what to call each sweep; see ``solve_bounded``.
+    """When to stop, and what to call each sweep; see ``SolveSettings`` and ``SolveContext``.
 
     ``on_iterate`` gets each sweep's number and point (3, pixels), to be read before it returns
     """
@@ -131,6 +132,25 @@ class Engine(Protocol):
         ``light`` (3, rows, columns): the target's, without the black image; overwritten. ``inverse``, ``mixed`` and
         ``coverage``: those of ``appearance.Base``, which an engine may keep; not to be written to
         """
+
+
+@dataclass(frozen=True, slots=True)
+class SolveContext:
+    """What a solve runs in.
+
+    ``engine``: what does the heavy loops (``solve.engines``); None: the processor
+    ``progress``: called with (iteration, kkt); ``cancelled``: asked once an iteration, or once in a few of them
+    ``folder``: for nameless files of what need not stay in memory during a solve; None: it stays there
+    """
+
+    engine: Engine | None = None
+    progress: Callable[[int, float], None] | None = None
+    cancelled: Callable[[], bool] | None = None
+    folder: Path | None = None
+
+
+ALONE: Final = SolveContext()
+"""On the processor, in memory, from beginning to end."""
 
 
 class Processor:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
@@ -22,6 +23,11 @@ from controller.optics.solve.bounded.gradient import EdgeWeights, add_smoothness
 from controller.optics.solve.bounded.initial_estimate import initial_estimate
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import planes_above
+
+TOLERANCE: Final = 3e-5
+"""Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
+calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0004)."""
+MOST_ITERATIONS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +54,27 @@ class Problem:
     def target(self) -> FloatImage:
         """(3, camera rows, columns): the light to be made. A new array each time: a sweep does not need it."""
         return planes_above(self.picture, self.black)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolveSettings:
+    """How a solve is done.
+
+    ``smoothness``: >= 0, relative to the mean of the data's majorising diagonal
+    ``weights`` (rows, columns) >= 0: how much each camera pixel counts; None: 1 everywhere
+    ``start``: frames to start from, for example those of a similar target; None: ``initial_estimate``
+    ``tolerance``: stop when the rms scaled projected gradient step falls below it
+    ``most_iterations``: and at the latest after so many sweeps
+    """
+
+    smoothness: float = SMOOTHNESS
+    weights: FloatImage | None = None
+    start: Sequence[FloatImage] | None = None
+    tolerance: float = TOLERANCE
+    most_iterations: int = MOST_ITERATIONS
+
+
+DEFAULT_SETTINGS: Final = SolveSettings()
 
 
 @dataclass(frozen=True, slots=True)

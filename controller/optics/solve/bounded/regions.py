@@ -30,8 +30,17 @@ import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.optics.solve.bounded.equations import Problem, SolveInput, build_problem, initial_point, objective_of
-from controller.optics.solve.bounded.solver import SMOOTHNESS, check_input
+from controller.optics.solve.bounded.engine import ALONE, SolveContext
+from controller.optics.solve.bounded.equations import (
+    DEFAULT_SETTINGS,
+    Problem,
+    SolveInput,
+    SolveSettings,
+    build_problem,
+    initial_point,
+    objective_of,
+)
+from controller.optics.solve.bounded.solver import check_input
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import CameraBox, plane_frames, plane_image, planes_above
 
@@ -210,6 +219,21 @@ PHASES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
 @dataclass(frozen=True, slots=True)
+class RegionCut:
+    """How the camera image is cut: regions of ``size_px`` camera pixels that overlap by that part.
+
+    ``solver``: the name of one of ``SOLVERS``
+    """
+
+    solver: str = "lsq_linear"
+    size_px: int = SIZE_PX
+    overlap: float = OVERLAP
+
+
+PAPER_CUT: Final = RegionCut()
+
+
+@dataclass(frozen=True, slots=True)
 class RegionSolution:
     """Result of the regions.
 
@@ -298,22 +322,14 @@ def solve_regions(
     transport: LightTransport,
     target: FloatImage,
     black: FloatImage,
-    *,
-    solver: str = "lsq_linear",
-    smoothness: float = SMOOTHNESS,
-    weights: FloatImage | None = None,
-    size_px: int = SIZE_PX,
-    overlap: float = OVERLAP,
-    progress: Callable[[float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
+    settings: SolveSettings = DEFAULT_SETTINGS,
+    context: SolveContext = ALONE,
+    cut: RegionCut = PAPER_CUT,
 ) -> RegionSolution:
-    """Find the projectors' images as the paper does; ``target`` to ``weights`` are those of ``solve_bounded``.
+    """Find the projectors' images as the paper does; parameters as of ``solve_bounded``.
 
-    Parameters
-    ----------
-    solver : one of ``SOLVERS``
-    size_px, overlap : of the regions; the paper's 16 and 25 %
-    progress : called after each region with the share of the work that is done
+    Of ``settings``, the smoothness and the weights count; ``context.progress`` is called after each region with how
+    many are done and the share of the work that is left.
 
     Raises
     ------
@@ -321,21 +337,21 @@ def solve_regions(
     WorkError   "solve-cancelled", "region-unsolved"
     """
     began = time.perf_counter()
-    check_input(SolveInput(transport, target, black, smoothness, weights, None))
-    problem = build_problem(transport, target, black, smoothness, weights)
-    regions = Regions(problem, size_px=size_px, overlap=overlap)
+    check_input(SolveInput(transport, target, black, settings.smoothness, settings.weights, None))
+    problem = build_problem(transport, target, black, settings.smoothness, settings.weights)
+    regions = Regions(problem, size_px=cut.size_px, overlap=cut.overlap)
     x = initial_point(problem)
     x[problem.majoriser == 0] = 0
     settled = np.zeros(x.shape[1], np.bool_)
     phases = [list(regions.of_phase(phase)) for phase in PHASES]
     total, done, unknowns = max(sum(map(len, phases)), 1), 0, 0
     for phase in phases:
-        for solved in _solve_phase(regions, phase, partial(solve_box, solver), x, settled):
+        for solved in _solve_phase(regions, phase, partial(solve_box, cut.solver), x, settled):
             unknowns += solved
             done += 1
-            if progress is not None:
-                progress(done / total)
-            if cancelled is not None and cancelled():
+            if context.progress is not None:
+                context.progress(done, 1 - done / total)
+            if context.cancelled is not None and context.cancelled():
                 raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
     light = transport.forward_planes(x)
     objective = objective_of(problem, x, light)

@@ -8,23 +8,14 @@ of its pixels a step of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Final
-
 import numpy as np
 
-from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.checks import all_finite, check_image
 from controller.core.errors import UsageError
-from controller.optics.solve.bounded.engine import Engine, IterationControl, Processor
-from controller.optics.solve.bounded.equations import Solution, SolveInput
+from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext
+from controller.optics.solve.bounded.equations import DEFAULT_SETTINGS, Solution, SolveInput, SolveSettings
 from controller.optics.transport import LightTransport
-
-TOLERANCE: Final = 3e-5
-"""Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
-calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0004)."""
-MOST_ITERATIONS: Final = 1000
 
 
 def check_target(transport: LightTransport, target: FloatImage) -> None:
@@ -36,37 +27,22 @@ def solve_bounded(
     transport: LightTransport,
     target: FloatImage,
     black: FloatImage,
-    *,
-    smoothness: float = SMOOTHNESS,
-    weights: FloatImage | None = None,
-    start: Sequence[FloatImage] | None = None,
-    tolerance: float = TOLERANCE,
-    most_iterations: int = MOST_ITERATIONS,
-    progress: Callable[[int, float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    engine: Engine | None = None,
+    settings: SolveSettings = DEFAULT_SETTINGS,
+    context: SolveContext = ALONE,
 ) -> Solution:
     """Find the projectors' images that make the camera see ``target``.
 
-    Parameters
-    ----------
-    target, black : (rows, columns, 3) linear camera units; the target is raised to ``black`` where it is darker
-    smoothness : >= 0, relative to the mean of the data's majorising diagonal
-    weights : (rows, columns) >= 0, how much each camera pixel counts; default 1 everywhere
-    start : frames to start from, for example those of a similar target
-    tolerance : stop when the rms scaled projected gradient step falls below it
-    progress : called with (iteration, kkt); ``cancelled`` : asked once an iteration, or once in a few of them
-    engine : what does the sweeps (``solve.engines``); None: the processor
+    ``target``, ``black`` (rows, columns, 3): linear camera units; the target is raised to ``black`` where it is darker
 
     Raises
     ------
     UsageError  "image-wrong-size", "target-not-finite", "solve-arguments"
     WorkError   "solve-cancelled"
     """
-    given = SolveInput(transport, target, black, smoothness, weights, start)
+    given = SolveInput(transport, target, black, settings.smoothness, settings.weights, settings.start)
     check_input(given)
-    control = IterationControl(tolerance, most_iterations, progress, cancelled)
-    return (engine or Processor()).solve(given, control)
+    control = IterationControl(settings.tolerance, settings.most_iterations, context.progress, context.cancelled)
+    return (context.engine or Processor()).solve(given, control)
 
 
 def check_input(given: SolveInput) -> None:
@@ -87,6 +63,3 @@ def check_input(given: SolveInput) -> None:
 
 def _wrong(what: str) -> UsageError:
     return UsageError("solve-arguments", what=f"The solve can't start: {what}.", remedy="Correct it and solve again.")
-
-
-__all__ = ["MOST_ITERATIONS", "SMOOTHNESS", "TOLERANCE", "check_input", "check_target", "solve_bounded"]

@@ -7,7 +7,7 @@ up from photograph to photograph. Arrays in, arrays out (docs/decisions/0012).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,13 +17,12 @@ import numpy as np
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.blur import masked_blur
-from controller.optics.solve.bounded.engine import Engine
-from controller.optics.solve.bounded.equations import appearance_weights
+from controller.optics.solve.appearance import StageLight
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import feasibility, target_radiance
 from controller.optics.solve.result.metrics import colour_difference
-from controller.optics.transport import LightTransport
 
 SCALES_PX: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Standard deviations of the filter's bands; the finest band is what the first leaves."""
@@ -315,28 +314,20 @@ def gain(before: FloatImage, after: FloatImage) -> Gain:
 
 
 def solve_again(
-    transport: LightTransport,
+    light: StageLight,
     target: FloatImage,
     aimed: FloatImage,
-    black: FloatImage,
-    start: Sequence[FloatImage],
+    settings: SolveSettings,
+    context: SolveContext,
     *,
     exposure: float,
-    smoothness: float,
-    drive: DriveLevels | None = None,
-    progress: Callable[[int, float], None] | None = None,
-    engine: Engine | None = None,
 ) -> tuple[FloatImage, ...]:
-    """Frames for ``aimed`` from the present ones, ``start``, in full, with the weights of the appearance ``target``.
+    """Frames for ``aimed`` from the present ones, ``settings.start``, in full, weighted for the appearance ``target``.
 
     Raises as ``solve_bounded``.
     """
-    wanted = target_radiance(target, black, 1.0)
-    possible = feasibility(transport, target, black, drive=drive)
+    wanted = target_radiance(target, light.black, 1.0)
+    possible = feasibility(light.transport, target, light.black, drive=light.drive)
     weights = appearance_weights(wanted, possible.reachable, exposure)
-    radiance = target_radiance(aimed, black, 1.0)
-    solution = solve_bounded(
-        transport, radiance, black, smoothness=smoothness, weights=weights, start=start, progress=progress,
-        engine=engine,
-    )  # fmt: skip
-    return solution.frames
+    radiance = target_radiance(aimed, light.black, 1.0)
+    return solve_bounded(light.transport, radiance, light.black, replace(settings, weights=weights), context).frames

@@ -30,7 +30,7 @@ from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.checks import check_shape, not_finite
 from controller.optics.calibrate.values import Radiometry
-from controller.optics.solve.appearance import Base
+from controller.optics.solve.appearance import Base, StageLight
 from controller.optics.solve.bounded.solver import check_target
 from controller.optics.solve.scaling.kernels import (
     MARGIN,
@@ -196,7 +196,7 @@ def interactive(
     ``check_target`` for ``black``.
     """
     check_target(transport, black)
-    maps = scaling_maps(transport, base, black, radiometries, indirect=indirect)
+    maps = scaling_maps(StageLight(transport, black, indirect), base, radiometries)
     return Interactive(maps, transport.camera_shape)
 
 

@@ -25,7 +25,7 @@ from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Radiometry
 from controller.optics.capture.encoding import checked_response
-from controller.optics.solve.appearance import Base
+from controller.optics.solve.appearance import Base, StageLight
 from controller.optics.solve.scaling.dither import blue_noise
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
@@ -42,23 +42,22 @@ NARROWED: Final = 0.4
 
 
 def scaling_maps(
-    transport: LightTransport,
+    light: StageLight,
     base: Base,
-    black: FloatImage,
     radiometries: Sequence[Radiometry],
     names: Sequence[str] | None = None,
     *,
-    indirect: IndirectLight | None = None,
     largest_px: int = LARGEST_TARGET_PX,
     spread: float = NARROWED,
 ) -> LiveMaps:
-    """The maps of a stage with the black image ``black`` (rows, columns, 3).
+    """The maps of a stage.
 
     One radiometry and one of ``names``, those of the outputs, a projector; targets' sides are at most ``largest_px``;
-    means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6). ``indirect``: light
-    by way of other surfaces, which is left out of what the projectors make, and colours that depend on the paint.
+    means are taken over the part ``spread`` of a pixel's spread, 1 for those of the paper (eq. 6). Light
+    by way of other surfaces is left out of what the projectors make; colours that depend on the paint are corrected.
     Raises UsageError("response-not-rising").
     """
+    transport, black, indirect = light.transport, light.black, light.indirect
     factor = reduction(transport.camera_shape, largest_px)
     lit = base.inverse > 0
     unit = float(np.median(1 / base.inverse[lit])) if lit.any() else 1.0

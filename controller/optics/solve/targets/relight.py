@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
 
 from controller.core import channels
@@ -12,44 +15,51 @@ from controller.optics.solve.targets.patterns import Colour
 from controller.optics.solve.targets.values import Target
 
 
-def gloss(
-    geometry: Geometry,
-    mask: Mask,
-    *,
-    base_colour: Colour = (0.30, 0.12, 0.08),
-    light_direction: tuple[float, float, float] = (-0.5, -0.7, -1.0),
-    shininess: float = 60.0,
-    strength: float = 0.75,
-    ambient: float = 0.3,
-    smoothing_px: float = 1.5,
-) -> Target:
-    """A diffuse body with a highlight: Lambert plus Blinn-Phong (Blinn 1977), clipped to [0, 1].
+@dataclass(frozen=True, slots=True)
+class GlossLook:
+    """Settings of a glossy body; those of stage.toml have the same names.
 
-    Parameters
-    ----------
-    light_direction : from the object towards a distant light, in the camera's frame (x right, y down, z away)
-    shininess : exponent of the highlight; ``strength``: its peak, as a share of white
-    ambient : share of the light that comes from all directions
-    smoothing_px : standard deviation of the smoothing of the normals, which noise would otherwise make glitter
+    ``light_direction``: from the object towards a distant light, in the camera's frame (x right, y down, z away)
+    ``shininess``: exponent of the highlight; ``strength``: its peak, as a share of white
+    ``ambient``: share of the light that comes from all directions
+    ``smoothing_px``: standard deviation of the smoothing of the normals, which noise would otherwise make glitter
+    """
+
+    base_colour: Colour = (0.30, 0.12, 0.08)
+    light_direction: tuple[float, float, float] = (-0.5, -0.7, -1.0)
+    shininess: float = 60.0
+    strength: float = 0.75
+    ambient: float = 0.3
+    smoothing_px: float = 1.5
+
+
+GLOSSY: Final = GlossLook()
+
+
+def gloss(geometry: Geometry, mask: Mask, look: GlossLook = GLOSSY) -> Target:
+    """A diffuse body with a highlight: Lambert plus Blinn-Phong (Blinn 1977), clipped to [0, 1].
 
     Raises UsageError("light-direction-invalid") for a direction of no length.
     """
-    light = np.asarray(light_direction, dtype=np.float64)
+    light = np.asarray(look.light_direction, dtype=np.float64)
     length = float(np.linalg.norm(light))
     if not (np.isfinite(length) and length > 0):
         raise UsageError(
             "light-direction-invalid",
-            what=f"A light can't come from the direction {light_direction}.",
+            what=f"A light can't come from the direction {look.light_direction}.",
             remedy="Give three numbers that are not all 0, e.g. -0.5 -0.7 -1 for a light from above the camera's left.",
         )
-    normals, directions, known = smooth_normals(geometry, mask, smoothing_px)
+    normals, directions, known = smooth_normals(geometry, mask, look.smoothing_px)
     towards_light = (light / length).astype(np.float32)
     half = towards_light - directions
     half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-6)
     lit = np.clip(normals @ towards_light, 0, 1)
-    highlight = np.clip(channels.total(normals * half), 0, 1) ** np.float32(shininess) * (lit > 0)
-    body = np.float32(ambient) + np.float32(1 - ambient) * lit
-    image = body[..., None] * np.asarray(base_colour, dtype=np.float32) + np.float32(strength) * highlight[..., None]
+    highlight = np.clip(channels.total(normals * half), 0, 1) ** np.float32(look.shininess) * (lit > 0)
+    body = np.float32(look.ambient) + np.float32(1 - look.ambient) * lit
+    image = (
+        body[..., None] * np.asarray(look.base_colour, dtype=np.float32)
+        + np.float32(look.strength) * highlight[..., None]
+    )
     return Target(np.where(known[..., None], np.clip(image, 0, 1), 0).astype(np.float32), known)
 
 

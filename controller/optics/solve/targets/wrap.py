@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -101,33 +101,38 @@ def painted(space: ObjectSpace, pattern: Pattern, *, gain: FloatImage | None = N
     return Target(np.clip(image, 0, 1), mask)
 
 
-def wrap_photograph(
-    photo_linear: FloatImage,
-    geometry: Geometry,
-    mask: Mask,
-    *,
-    mapping: Mapping = "cylinder",
-    up: tuple[float, float, float] = UPRIGHT,
-    shading: float = 0.0,
-    ink: float = 0.03,
-    paper: float = 0.9,
-) -> Target:
+@dataclass(frozen=True, slots=True)
+class PrintLook:
+    """Settings of a print on the object; those of stage.toml have the same names.
+
+    ``shading``: 0 flat, as printed on the object; up to 1: darkened where the surface turns away from the camera
+    ``ink``, ``paper``: what the print's black and white reflect, 0 <= ink < paper <= 1. A print of density 1.5 has
+    0.03; no projector makes the black of a screen on a pale object in another projector's stray light
+    """
+
+    mapping: Mapping = "cylinder"
+    up: tuple[float, float, float] = UPRIGHT
+    shading: float = 0.0
+    ink: float = 0.03
+    paper: float = 0.9
+
+
+FLAT_PRINT: Final = PrintLook()
+
+
+def wrap_photograph(photo_linear: FloatImage, geometry: Geometry, mask: Mask, look: PrintLook = FLAT_PRINT) -> Target:
     """A photograph printed and wrapped on the object, large enough to cover its visible part.
 
-    Parameters
-    ----------
-    photo_linear : (rows, columns, 3) float32, linear, in [0, 1]
-    shading : 0 flat, as printed on the object; up to 1: darkened where the surface turns away from the camera
-    ink, paper : what the print's black and white reflect, 0 <= ink < paper <= 1. A print of density 1.5 has 0.03; no
-        projector makes the black of a screen on a pale object in another projector's stray light
+    ``photo_linear`` (rows, columns, 3) float32: linear, in [0, 1]. Raises UsageError("print-range-invalid").
     """
+    ink, paper = look.ink, look.paper
     if not 0 <= ink < paper <= 1:
         raise UsageError(
             "print-range-invalid",
             what=f"A print can't reflect from {ink} to {paper}.",
             remedy="Give 0 <= ink < paper <= 1, for example 0.03 and 0.9.",
         )
-    space = object_space(geometry, mask, mapping=mapping, up=up)
+    space = object_space(geometry, mask, mapping=look.mapping, up=look.up)
     low, high = (np.percentile([space.across_m[space.mask], space.up_m[space.mask]], q, axis=1) for q in (0.5, 99.5))
     height, width = photo_linear.shape[:2]
     metres = float(max((high[0] - low[0]) / width, (high[1] - low[1]) / height, 1e-9))
@@ -145,7 +150,7 @@ def wrap_photograph(
         y = (np.float32(middle[1]) - above) / np.float32(metres) + np.float32((height - 1) / 2)
         return np.float32(ink) + np.float32(paper - ink) * _sampled(photo_linear, x, y)
 
-    return painted(space, pattern, gain=facing(geometry, mask, shading) if shading else None)
+    return painted(space, pattern, gain=facing(geometry, mask, look.shading) if look.shading else None)
 
 
 def facing(geometry: Geometry, mask: Mask, shading: float) -> FloatImage:

@@ -31,39 +31,6 @@ from controller.optics.transport.simd.gaussians import LANES
 Pixels = npt.NDArray[np.int64]
 
 
-def patch_rows(
-    patches: Patches,
-    gain: FloatImage,
-    after: FloatImage,
-    taps: FloatImage,
-    mixing: FloatImage,
-    box: CameraBox,
-    pixels: Pixels,
-    channels: tuple[int, ...],
-) -> sp.csr_matrix[np.float64]:
-    """``LightTransport.submatrix`` of patches; the arrays are those of ``PatchTransport``."""
-    radius = taps.shape[1] // 2
-    wide = box.grown(radius, (int(patches.camera_shape[0]), int(patches.camera_shape[1])))
-    owner = np.searchsorted(patches.start, pixels, side="right") - 1
-    shares = _shares(patches, pixels, wide)
-    by_projector = [np.flatnonzero(owner == n) for n in np.unique(owner)]
-    order = np.argsort(np.concatenate(by_projector), kind="stable")
-    blocks = []
-    for c in channels:
-        parts = []
-        for mine in by_projector:
-            n = int(owner[mine[0]])
-            part = sp.diags_array(gain[n, c][wide.window].ravel().astype(np.float64)) @ shares[:, mine]
-            if radius > 0:
-                factor = after[n, c][box.window].ravel().astype(np.float64)
-                part = sp.diags_array(factor) @ (_blur(taps[c], box, wide) @ part)
-            parts.append(part)
-        whole = sp.hstack(parts, format="csc")[:, order]
-        mixed = [whole @ sp.diags_array(mixing[owner, c, d].astype(np.float64)) for d in channels]
-        blocks.append(sp.hstack(mixed, format="csr"))
-    return sp.csr_matrix(sp.vstack(blocks, format="csr"))
-
-
 def _shares(patches: Patches, pixels: Pixels, box: CameraBox) -> sp.csc_matrix[np.float64]:
     """(camera pixels of the box, projector pixels): the weights of the metapixels, before gain."""
     size = int((patches.rows[pixels].astype(np.int64) * patches.groups[pixels]).sum()) * LANES
@@ -274,7 +241,26 @@ class PatchTransport(LightTransport):
         self, box: CameraBox, pixels: npt.NDArray[np.int64], channels: tuple[int, ...]
     ) -> sp.csr_matrix[np.float64]:
         """A part of T as a sparse matrix, as ``LightTransport.submatrix``."""
-        return patch_rows(self.patches, self.gain, self.after, self.taps, self.mixing, box, pixels, channels)
+        radius = self.taps.shape[1] // 2
+        wide = box.grown(radius, (int(self.patches.camera_shape[0]), int(self.patches.camera_shape[1])))
+        owner = np.searchsorted(self.patches.start, pixels, side="right") - 1
+        shares = _shares(self.patches, pixels, wide)
+        by_projector = [np.flatnonzero(owner == n) for n in np.unique(owner)]
+        order = np.argsort(np.concatenate(by_projector), kind="stable")
+        blocks = []
+        for c in channels:
+            parts = []
+            for mine in by_projector:
+                n = int(owner[mine[0]])
+                part = sp.diags_array(self.gain[n, c][wide.window].ravel().astype(np.float64)) @ shares[:, mine]
+                if radius > 0:
+                    factor = self.after[n, c][box.window].ravel().astype(np.float64)
+                    part = sp.diags_array(factor) @ (_blur(self.taps[c], box, wide) @ part)
+                parts.append(part)
+            whole = sp.hstack(parts, format="csc")[:, order]
+            mixed = [whole @ sp.diags_array(self.mixing[owner, c, d].astype(np.float64)) for d in channels]
+            blocks.append(sp.hstack(mixed, format="csr"))
+        return sp.csr_matrix(sp.vstack(blocks, format="csr"))
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All that the products depend on, by name."""

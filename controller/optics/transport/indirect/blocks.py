@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
+
+
+class BlockGrid(NamedTuple):
+    """The blocks of camera pictures of ``shape`` (rows, columns, ...).
+
+    ``grid``: (rows, columns) of blocks; ``side``: camera pixels along each
+    """
+
+    grid: tuple[int, int]
+    side: int
+    shape: tuple[int, ...]
 
 
 def down(image: FloatImage, grid: tuple[int, int], side: int) -> FloatImage:

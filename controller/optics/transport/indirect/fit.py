@@ -20,7 +20,7 @@ from controller.optics.calibrate.photometry.surface_spread import typical_spread
 from controller.optics.calibrate.photometry.tile_fit import colour_of
 from controller.optics.calibrate.values import Calibration, ProjectorCalibration, Radiometry
 from controller.optics.capture.patterns import plan_patterns
-from controller.optics.transport.indirect.blocks import down, parted, up
+from controller.optics.transport.indirect.blocks import BlockGrid, down, parted, up
 from controller.optics.transport.indirect.form_factors import form_factors
 from controller.optics.transport.indirect.indirect_light import Colours, IndirectLight
 from controller.optics.transport.indirect.stripes import blocks_of, coarse_stripes, stride_of, stripe_parts, thinned
@@ -30,9 +30,9 @@ from controller.optics.transport.indirect.weights import (
     Part,
     Term,
     block_light,
+    corrected_factors,
     falling_colours,
     fit_weights,
-    shaped,
 )
 
 
@@ -189,15 +189,15 @@ def _factors(kinds: Sequence[FloatImage], projectors: Sequence[ProjectorCalibrat
     # Only stripes tell the light of the object from that of table and walls.
     parts: tuple[Part, ...] = ("object", "room") if stripes else ("all",)
     terms = [Term(kind, part) for kind in kinds for part in parts]
-    place = (view.grid, view.side, view.whole.shape)
-    weights = fit_weights(terms, whites, stripes, *place)
+    blocks = BlockGrid(view.grid, view.side, view.whole.shape)
+    weights = fit_weights(terms, whites, stripes, blocks)
     own, room = (
         np.sum([w * t.matrix for w, t in zip(weights, terms, strict=True) if t.part in (part, "all")], axis=0)
         for part in ("object", "room")
     )
     if stripes:
         colours = falling_colours(directs, view.whole, view.lit, view.grid, view.side)
-        own, room = shaped(own, room, (*whites, *stripes), len(whites), *place, colours)
+        own, room = corrected_factors(own, room, (*whites, *stripes), len(whites), blocks, colours)
     return by_all_ways((own, room), view.back((own, room), every))
 
 

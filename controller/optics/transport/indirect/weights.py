@@ -5,12 +5,12 @@
    falls there, in units of the lamp's white. Where surfaces around have other colours, that says how much each of them
    gives (docs/decisions/0015).
 2. The weight of each term (``fit_weights``).
-3. The shape of G, corrected by what the weights leave of whites and stripes (``shaped``). Form factors do not know
-   surfaces that the camera does not see. What a block gets is predicted for every picture of which indirect light was
-   measured; where the measured part differs, the light of some sources counts too little or too much. Of all factors
-   that explain it, those are taken that change least, and alike for neighbouring sources: the mean of a Gaussian
-   process (Rasmussen and Williams 2006, eq. 2.25), block by block. Where the colour of the light that falls is known,
-   it is predicted, too.
+3. The shape of G, corrected by what the weights leave of whites and stripes (``corrected_factors``). Form factors do
+   not know surfaces that the camera does not see. What a block gets is predicted for every picture of which indirect
+   light was measured; where the measured part differs, the light of some sources counts too little or too much. Of all
+   factors that explain it, those are taken that change least, and alike for neighbouring sources: the mean of a
+   Gaussian process (Rasmussen and Williams 2006, eq. 2.25), block by block. Where the colour of the light that
+   falls is known, it is predicted, too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.optics.transport.indirect.blocks import down, down_up, parted
+from controller.optics.transport.indirect.blocks import BlockGrid, down, down_up, parted
 
 BRIGHT: Final = 0.1
 """Of a projector's mean light: where two are brighter, their colours are compared."""
@@ -154,13 +154,12 @@ def block_light(
 
 
 def fit_weights(
-    terms: Sequence[Term], whites: Sequence[BlockLight], stripes: Sequence[BlockLight], grid: tuple[int, int],
-    side: int, shape: tuple[int, ...],
+    terms: Sequence[Term], whites: Sequence[BlockLight], stripes: Sequence[BlockLight], blocks: BlockGrid
 ) -> FloatImage:  # fmt: skip
     """The factor (terms,) >= 0 of each term that tells pictures' indirect light apart best.
 
     What surfaces make of falling light follows from all whites together, so a picture's light is predicted as its part
-    of what falls, times theirs. Least squares by blocks of pictures of ``shape``, relative to the light; the part's
+    of what falls, times theirs. Least squares by ``blocks``, relative to the light; the part's
     denominator is that of the round before. Neighbours in ``terms`` that differ in their part alone are held together.
     """
     from scipy.optimize import nnls
@@ -168,7 +167,7 @@ def fit_weights(
     pictures = (*whites, *stripes)
     total = whites[0].whole
     light = np.sum([one.source("all") for one in whites], axis=0)
-    falling = _falling(terms, pictures, down_up(grid, side, shape))
+    falling = _falling(terms, pictures, down_up(*blocks))
     means = falling[: len(whites)].sum(axis=0).mean(axis=(1, 2))
     alike = np.divide(1, means, out=np.zeros_like(means), where=means > 0)
     falling = falling * alike[None, :, None, None]
@@ -245,27 +244,27 @@ LEAST_VARIANCE: Final = 1e-3
 """Of the largest: what varies less along the grid is left out."""
 
 
-def shaped(
-    own: FloatImage, room: FloatImage, pictures: Sequence[BlockLight], whites: int, grid: tuple[int, int], side: int,
-    shape: tuple[int, ...], colours: FallingColours | None = None,
+def corrected_factors(
+    own: FloatImage, room: FloatImage, pictures: Sequence[BlockLight], whites: int, blocks: BlockGrid,
+    colours: FallingColours | None = None,
 ) -> tuple[FloatImage, FloatImage]:  # fmt: skip
     """``own`` and ``room`` (blocks, blocks), light from the object's and the room's blocks, corrected; none below 0.
 
-    ``pictures``: of which the first are all ``whites``; ``grid``, ``side``: of blocks in camera pictures of ``shape``;
+    ``pictures``: of which the first are all ``whites``; ``blocks``: those of own and room
     ``colours``: of what falls, of all whites together
     """
     lights = np.stack([np.concatenate([one.own, one.room]) for one in pictures])
     every = lights[:whites].sum(axis=0)
     both = np.concatenate([own, room], axis=1)
     falling = np.stack([both @ light for light in (*lights, every)])
-    across = down_up(grid, side, shape)
+    across = down_up(*blocks)
     *seen, whole = (across(np.asarray(one, np.float32)) for one in falling)
     parts, known = (np.stack(images) for images in zip(*(measured_part(one) for one in pictures), strict=True))
     bright = every[: len(own)] + every[len(own) :]
     known = known * ((whole > 0) & (pictures[0].whole > 0) & (bright > FAINTEST * bright.max(initial=0)))
     left = parts - np.divide(seen, whole, out=np.zeros_like(parts), where=known > 0)
     coloured = _Coloured(colours, both, every)
-    smooth = _SmoothFactors(grid)
+    smooth = _SmoothFactors(blocks.grid)
     out = both.copy()
     for block in range(len(both)):
         picture, channel = np.nonzero(known[:, block])

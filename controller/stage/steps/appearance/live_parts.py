@@ -8,6 +8,7 @@ from pathlib import Path
 from controller.bundle.live_maps import LiveMaps
 from controller.bundle.writer import NewLive
 from controller.core.errors import WorkError
+from controller.optics.solve.appearance import StageLight
 from controller.optics.solve.scaling.stage_maps import reduction, scaling_maps
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import has_base
@@ -39,8 +40,10 @@ def live_maps(calibrated: Calibrated, outputs: Mapping[str, str]) -> LiveMaps:
             remedy="Run `velatura appearance` on the stage first.",
         )
     calibration = calibrated.calibration
+    light = StageLight(calibrated.transport, calibration.black, calibrated.indirect)
     return scaling_maps(
-        calibrated.transport, calibrated.base, calibration.black,
-        [part.radiometry for part in calibration.projectors], [outputs[part.name] for part in calibration.projectors],
-        indirect=calibrated.indirect,
-    )  # fmt: skip
+        light,
+        calibrated.base,
+        [part.radiometry for part in calibration.projectors],
+        [outputs[part.name] for part in calibration.projectors],
+    )

@@ -14,6 +14,8 @@ import numpy as np
 from controller.core.arrays import Float64, FloatImage, Mask, summed
 from controller.optics.capture.brackets import merge_brackets
 from controller.optics.capture.profile import load_profile
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, refine_peak_bytes, stage_size
 from controller.optics.solve.result.common_causes import equations
 from controller.optics.solve.result.refinement import (
@@ -190,16 +192,15 @@ class _Round:
         aimed = corrected_target(self.solved.target, seen, self._stage)
         indirect = predicted - black - transport.forward(self._in_order(now.frames))
         frames = solve_again(
-            transport,
+            self.calibrated.light,
             self.solved.target - indirect,
             aimed - indirect,
-            black,
-            self._in_order(now.frames),
+            SolveSettings(self.options.smoothness, start=self._in_order(now.frames)),
+            SolveContext(
+                self.calibrated.engine,
+                progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
+            ),
             exposure=self.solved.exposure,
-            smoothness=self.options.smoothness,
-            drive=self.calibrated.drive,
-            engine=self.calibrated.engine,
-            progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
         expected = self._error(self._predicted(new) + seen.light, seen.known)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,10 +17,16 @@ from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
 from controller.optics.solve.targets.colour import ColourSpace
 from controller.optics.solve.targets.files import check_picture, load_target, read_picture
-from controller.optics.solve.targets.patterns import Colour, checkerboard, replace_pattern
-from controller.optics.solve.targets.relight import gloss, recolour
+from controller.optics.solve.targets.patterns import (
+    CheckerboardLook,
+    Colour,
+    PatternLook,
+    checkerboard,
+    replace_pattern,
+)
+from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
-from controller.optics.solve.targets.wrap import wrap_photograph
+from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.steps.appearance.rendering import blender_request
@@ -86,16 +91,17 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
     return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
 
 
-_MAKERS: Mapping[str, Callable[..., Target]] = {
-    "pattern": replace_pattern,
-    "checkerboard": checkerboard,
-    "gloss": gloss,
-    "photograph": wrap_photograph,
+_MAKERS: Mapping[str, tuple[Callable[..., Target], type[Any]]] = {
+    "pattern": (replace_pattern, PatternLook),
+    "checkerboard": (checkerboard, CheckerboardLook),
+    "gloss": (gloss, GlossLook),
+    "photograph": (wrap_photograph, PrintLook),
 }
+"""What makes the target of a kind, and its settings."""
 
 
 def _options(kind: str) -> dict[str, Any]:
-    """The settings of a kind with their types: the keyword arguments of its maker."""
+    """The settings of a kind with their types: the fields of its look."""
     if kind == "recolour":
         return {"tint": Colour}
     if kind == "blender":
@@ -104,17 +110,14 @@ def _options(kind: str) -> dict[str, Any]:
         return dict(_OF_FILES)
     if kind not in _MAKERS:
         return {}
-    types = get_type_hints(_MAKERS[kind])
-    parameters = inspect.signature(_MAKERS[kind]).parameters.values()
-    names = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
-    options = {_RENAMED.get(name, name): types[name] for name in names}
+    options = {_RENAMED.get(name, name): kind_of for name, kind_of in get_type_hints(_MAKERS[kind][1]).items()}
     return {**options, **_OF_FILES} if kind in NEEDS_FILE else options
 
 
 _OF_FILES: Mapping[str, Any] = {"colour": ColourSpace}
 """Settings on how a picture file is read."""
 _RENAMED: Mapping[str, str] = {"kind": "figure"}
-"""Arguments of makers with another name in stage.toml, where ``kind`` chooses the maker."""
+"""Settings with another name in stage.toml, where ``kind`` chooses the maker."""
 _ARGUMENTS: Mapping[str, str] = {written: name for name, written in _RENAMED.items()}
 
 
@@ -148,9 +151,10 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
     if kind == "photograph":
         assert file is not None
         photograph = np.maximum(read_picture(file, colour)[..., :3], 0)
-        make = partial(wrap_photograph, photograph, **options)
+        make = partial(wrap_photograph, photograph, look=PrintLook(**options))
     else:
-        make = partial(_MAKERS[kind], **options)
+        maker, look = _MAKERS[kind]
+        make = partial(maker, look=look(**options))
     return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make)))
 
 

@@ -15,6 +15,8 @@ from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.capture.patterns import Pattern, PatternKind, plan_patterns
 from controller.optics.solve.appearance import Base, BaseChoice, base_image, solve_base
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
@@ -134,9 +136,8 @@ def solved_base(
     """The base image for these options. Raises as ``solve_bounded``."""
     black = calibrated.calibration.black
     image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
-    return solve_base(
-        calibrated.transport, image, black, smoothness=options.smoothness, progress=progress, engine=calibrated.engine
-    )
+    settings, context = SolveSettings(options.smoothness), SolveContext(calibrated.engine, progress)
+    return solve_base(calibrated.transport, image, black, settings, context)
 
 
 def _watched(context: Context) -> Callable[[int, float], None]:
@@ -155,18 +156,8 @@ Answering = Callable[[AppearanceRequest, SolveOptions, Context], AppearanceResul
 def _answer_here(
     calibrated: Calibrated, request: AppearanceRequest, options: SolveOptions, context: Context
 ) -> AppearanceResult:
-    return solve_appearance(
-        calibrated.transport,
-        calibrated.base,
-        calibrated.calibration.black,
-        request.target(),
-        options,
-        drive=calibrated.drive,
-        indirect=calibrated.indirect,
-        progress=_watched(context),
-        engine=calibrated.engine,
-        folder=calibrated.folder,
-    )
+    solving = SolveContext(calibrated.engine, _watched(context), folder=calibrated.folder)
+    return solve_appearance(calibrated.light, calibrated.base, request.target(), options, solving)
 
 
 def _solve_appearance(

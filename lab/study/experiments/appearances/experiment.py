@@ -13,8 +13,8 @@ import numpy as np
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import VelaturaError
 from controller.optics.solve.appearance import traditional_compensation
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.metrics import TITLES, PixelSet, colour_difference
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import build_transport
@@ -97,10 +97,8 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
     wanted, dimmed = subject.wanted(target), alone.wanted(target)
     black, light = subject.calibration.black, subject.light
     began_s = time.perf_counter()
-    frames = solve_bounded(
-        subject.transport, wanted.direct, black, smoothness=SMOOTHNESS,
-        weights=appearance_weights(wanted.radiance, wanted.mask, wanted.white),
-    ).frames  # fmt: skip
+    settings = SolveSettings(weights=appearance_weights(wanted.radiance, wanted.mask, wanted.white))
+    frames = solve_bounded(subject.transport, wanted.direct, black, settings).frames
     seconds = time.perf_counter() - began_s
     pictures = [
         light.photograph(f"{look.name}-{way}", shown, white=asked.white)

@@ -16,7 +16,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.solve.targets.files import read_picture
 from controller.optics.solve.targets.patterns import replace_pattern
-from controller.optics.solve.targets.relight import gloss, recolour
+from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.values import Target, on_each, through_camera
 from controller.optics.solve.targets.wrap import object_space, painted
 from controller.stage.blender import job
@@ -63,10 +63,8 @@ def _glossy(subject: Subject, _: ProgressCallback) -> Target:
 
 def _lit_anew(subject: Subject, _: ProgressCallback) -> Target:
     """The object's own paint under one lamp at its right."""
-    light = gloss(
-        subject.geometry, subject.mask, base_colour=(1.0, 1.0, 1.0), light_direction=LIGHT_FROM, strength=0.0,
-        ambient=0.15,
-    )  # fmt: skip
+    matt = GlossLook(base_colour=(1.0, 1.0, 1.0), light_direction=LIGHT_FROM, strength=0.0, ambient=0.15)
+    light = gloss(subject.geometry, subject.mask, matt)
     paint = _paint_everywhere(subject)
     return Target(np.asarray(light.image * paint, np.float32), light.mask)
 

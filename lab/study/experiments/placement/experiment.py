@@ -15,7 +15,7 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.values import ProjectorCalibration
 from controller.optics.plan.figures import figures_of
-from controller.optics.plan.search import PlacementPlan, candidates_of, choose_placements
+from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_placements
 from controller.optics.plan.target_object import TargetObject, read_target_object, sampled
 from controller.optics.plan.values import MountingPoint, Placement, PlanGoal, ProjectorModel, Surface
 from controller.stage.report.pictures import crop_around
@@ -72,7 +72,7 @@ def planned(mesh: Path) -> tuple[TargetObject, PlacementPlan, Surface]:
     """The plan for a mesh that stands as the bench puts it up; the same each time."""
     target_object = read_target_object(mesh, height_m=0.30, up="+y", front="+z")
     surface = sampled(target_object, POINTS, CAMERA_M, seed=1)
-    by_model = candidates_of([MODEL] * COUNT, _mounting_points(), surface, target_object, GOAL, CAMERA_M)
+    by_model = candidates_of([MODEL] * COUNT, _mounting_points(), PlanScene(surface, target_object, CAMERA_M), GOAL)
     return target_object, choose_placements(by_model, surface, GOAL), surface
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 import controller
 from controller.optics.solve.appearance import base_image, solve_base
-from controller.optics.solve.bounded.equations import appearance_weights
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.scaling.interactive import interactive
 from controller.optics.solve.targets.files import shipped_photograph
 from controller.optics.solve.targets.values import through_camera
@@ -142,7 +142,7 @@ def _measured(subject: Subject) -> dict[str, Durations]:
     build_transport(calibration)
     found[TRANSPORT] = _fastest(partial(build_transport, calibration), 1)
     even = base_image(calibration, "white")
-    solve_bounded(subject.transport, even, black, smoothness=SMOOTHNESS, most_iterations=2)
+    solve_bounded(subject.transport, even, black, SolveSettings(most_iterations=2))
     subject.advance(0.2, "base image")
     base = solve_base(subject.transport, even, black)
     found[BASE] = _fastest(partial(solve_base, subject.transport, even, black), 1)
@@ -155,7 +155,7 @@ def _measured(subject: Subject) -> dict[str, Durations]:
     found[APPEARANCE] = _fastest(partial(ready.frames, wanted.radiance), REPEATS)
     subject.advance(0.7, "a full solve")
     weights = appearance_weights(wanted.radiance, wanted.mask, wanted.white)
-    full = partial(solve_bounded, subject.transport, wanted.direct, black, weights=weights, smoothness=SMOOTHNESS)
+    full = partial(solve_bounded, subject.transport, wanted.direct, black, SolveSettings(weights=weights))
     found[FULL] = _fastest(full, 1)
     return found
 

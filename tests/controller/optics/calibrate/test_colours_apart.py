@@ -21,6 +21,7 @@ from controller.optics.calibrate.correspondence.phase_shift import FRINGE_PX
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry
 from controller.optics.calibrate.values import Calibration, Correspondence, ProjectorCalibration
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from tests.controller.optics.calibrate.simulator import Scene, Stage, photographed, positions
@@ -119,7 +120,7 @@ def test_frames_show_a_fine_pattern_as_an_aligned_projector_does() -> None:
         part = one.calibration.projectors[0]
         target = part.white * (0.5 + 0.25 * np.cos(2 * np.pi / 6 * positions(ALIGNED)[..., :1])).astype(np.float32)
         target[~one.transport.object_mask] = 0
-        (frame,) = solve_bounded(one.transport, target, np.zeros_like(target), smoothness=0.0).frames
+        (frame,) = solve_bounded(one.transport, target, np.zeros_like(target), SolveSettings(smoothness=0.0)).frames
         off = 0.998 * Stage(scene).light(frame) - target
         inner = one.transport.object_mask & (part.white.min(axis=2) > 0)
         inner[:20], inner[-20:], inner[:, :20], inner[:, -20:] = False, False, False, False

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError, WorkError
-from controller.optics.plan.search import Candidate, Measure, candidates_of, choose_placements, in_the_way
+from controller.optics.plan.search import Candidate, Measure, PlanScene, candidates_of, choose_placements, in_the_way
 from controller.optics.plan.target_object import TargetObject, sampled
 from controller.optics.plan.values import MountingPoint, PlanGoal, ProjectorModel, Surface
 from tests.controller.optics.plan.conftest import EYE
@@ -34,7 +34,7 @@ def surface(target_object: TargetObject) -> Surface:
 def tried(
     target_object: TargetObject, surface: Surface, model: ProjectorModel, goal: PlanGoal, *, count: int
 ) -> list[list[Candidate]]:
-    return candidates_of([model] * count, on_ring(9), surface, target_object, goal, EYE)
+    return candidates_of([model] * count, on_ring(9), PlanScene(surface, target_object, EYE), goal)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -72,16 +72,16 @@ def test_a_place_in_the_audiences_view_is_none(
     target_object: TargetObject, surface: Surface, model: ProjectorModel
 ) -> None:
     points = [MountingPoint("in front", (0.0, 0.0, -1.0)), MountingPoint("beside", (0.9, 0.0, -0.9))]
-    (found,) = candidates_of([model], points, surface, target_object, GOAL, EYE)
+    (found,) = candidates_of([model], points, PlanScene(surface, target_object, EYE), GOAL)
     assert [one.placement.mounting_point.name for one in found] == ["beside"]
     assert in_the_way(np.array([0.0, 0.0, -1.0]), EYE, surface, 0.1)
     with pytest.raises(UsageError) as refused:
-        candidates_of([model], points[:1], surface, target_object, GOAL, EYE)
+        candidates_of([model], points[:1], PlanScene(surface, target_object, EYE), GOAL)
     assert refused.value.code == "plan-no-place"
 
 
 def test_two_can_not_stand_in_one_place(target_object: TargetObject, surface: Surface, model: ProjectorModel) -> None:
-    by_model = candidates_of([model, model], on_ring(9)[:1], surface, target_object, GOAL, EYE)
+    by_model = candidates_of([model, model], on_ring(9)[:1], PlanScene(surface, target_object, EYE), GOAL)
     with pytest.raises(UsageError) as refused:
         choose_placements(by_model, surface, GOAL)
     assert refused.value.code == "plan-too-crowded"
@@ -92,7 +92,7 @@ def test_light_that_is_too_flat_counts_for_nothing(
 ) -> None:
     strict = replace(GOAL, steepest_degrees=30.0)
     (wide,), (narrow,) = (
-        candidates_of([model], on_ring(1), surface, target_object, goal, EYE) for goal in (GOAL, strict)
+        candidates_of([model], on_ring(1), PlanScene(surface, target_object, EYE), goal) for goal in (GOAL, strict)
     )
     assert 0 < narrow[0].useful.sum() < wide[0].useful.sum()
     assert narrow[0].lit.cosine[narrow[0].useful].min() >= np.cos(np.deg2rad(30.0))
@@ -102,5 +102,5 @@ def test_it_stops_on_request(target_object: TargetObject, surface: Surface, mode
     cancel = threading.Event()
     cancel.set()
     with pytest.raises(WorkError) as stopped:
-        candidates_of([model], on_ring(3), surface, target_object, GOAL, EYE, cancel=cancel)
+        candidates_of([model], on_ring(3), PlanScene(surface, target_object, EYE), GOAL, cancel=cancel)
     assert stopped.value.code == "cancelled"

@@ -16,6 +16,7 @@ from controller.optics.solve.appearance import (
     Base,
     BaseKind,
     Mode,
+    StageLight,
     base_image,
     fine_detail,
     high_pass_base,
@@ -82,8 +83,8 @@ def test_a_full_solve_from_the_scaled_base_keeps_what_the_scale_loses(stage: Sta
     y, x = np.mgrid[0:60, 0:80]
     checks = np.repeat((0.3 + 0.5 * ((x // 2 + y // 2) % 2))[..., None], 3, -1).astype(np.float32)
     target = scaled(base, calibration.black, checks)
-    appearance = make_appearance(transport, base, target, calibration.black)
-    quick = make_appearance(transport, base, target, calibration.black, mode="scale")
+    appearance = make_appearance(StageLight(transport, calibration.black), base, target)
+    quick = make_appearance(StageLight(transport, calibration.black), base, target, mode="scale")
     assert (appearance.mode, quick.mode) == ("full", "scale")
     assert appearance.fine_detail > 0.1
     errors = [
@@ -97,7 +98,7 @@ def test_a_smooth_target_is_left_to_the_scale(stage: Stage) -> None:
     calibration = stage()
     transport, base = based(calibration)
     target = scaled(base, calibration.black, smooth_scale(transport.camera_shape))
-    assert make_appearance(transport, base, target, calibration.black).mode == "scale"
+    assert make_appearance(StageLight(transport, calibration.black), base, target).mode == "scale"
 
 
 def test_a_scale_that_clipping_spoils_in_reach_gives_way_to_a_full_solve(stage: Stage) -> None:
@@ -107,7 +108,7 @@ def test_a_scale_that_clipping_spoils_in_reach_gives_way_to_a_full_solve(stage: 
     def made(brightness: float, mode: Mode) -> tuple[Appearance, float]:
         target = scaled(base, calibration.black, brightness * smooth_scale(transport.camera_shape))
         reachable = feasibility(transport, target, calibration.black).reachable
-        found = make_appearance(transport, base, target, calibration.black, mode=mode, reachable=reachable)
+        found = make_appearance(StageLight(transport, calibration.black), base, target, mode=mode, reachable=reachable)
         error = np.abs(transport.forward(found.frames) + calibration.black - target)[reachable]
         return found, float(np.percentile(error, 95))
 
@@ -128,7 +129,7 @@ def test_a_high_pass_base_takes_the_fine_detail_and_leaves_a_smooth_scale(stage:
     before = fine_detail(transport, white, target, calibration.black)
     assert before > 0.1
     assert fine_detail(transport, base, target, calibration.black) < 0.1 * before
-    assert make_appearance(transport, base, target, calibration.black).mode == "scale"
+    assert make_appearance(StageLight(transport, calibration.black), base, target).mode == "scale"
 
 
 def test_a_base_that_is_black_in_places_spoils_nothing_around_them(stage: Stage) -> None:

@@ -13,7 +13,9 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Calibration, SurfaceSpread
-from controller.optics.solve.appearance import base_image, solve_base
+from controller.optics.solve.appearance import StageLight, base_image, solve_base
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import (
     PROGRAM,
     SPARE,
@@ -56,7 +58,9 @@ def _peak_bytes(work: Callable[[], object]) -> int:
 
 def _solved_bytes(calibration: Calibration) -> int:
     def solve() -> None:
-        base = solve_base(build_transport(calibration), base_image(calibration), calibration.black, tolerance=0.1)
+        base = solve_base(
+            build_transport(calibration), base_image(calibration), calibration.black, SolveSettings(tolerance=0.1)
+        )
         assert base.solution.iterations < 10
 
     return _peak_bytes(solve)
@@ -76,18 +80,18 @@ def _indirect(calibration: Calibration, *, has_paint: bool, has_spread: bool) ->
 def _appearance_bytes(calibration: Calibration, know: Callable[[], IndirectLight | None], folder: Path) -> int:
     def solve() -> None:
         transport = build_transport(calibration)
-        base = solve_base(transport, base_image(calibration), calibration.black, tolerance=0.1).in_files(folder)
+        base = solve_base(transport, base_image(calibration), calibration.black, SolveSettings(tolerance=0.1)).in_files(
+            folder
+        )
         indirect = know()
         tracemalloc.reset_peak()
         shape = calibration.black.shape
         solve_appearance(
-            transport,
+            StageLight(transport, calibration.black, None if indirect is None else indirect.in_files(folder)),
             base,
-            calibration.black,
             Target(np.random.default_rng(1).random(shape, np.float32), np.ones(shape[:2], np.bool_)),
             SolveOptions(share=0.9, smoothness=1e-3, mode="full", adapt=1.0),
-            indirect=None if indirect is None else indirect.in_files(folder),
-            folder=folder,
+            context=SolveContext(folder=folder),
         )
 
     return _peak_bytes(solve)

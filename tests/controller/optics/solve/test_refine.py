@@ -12,7 +12,10 @@ import pytest
 from controller.core.arrays import FloatImage, Mask
 from controller.core.blur import masked_blur
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.appearance import StageLight
+from controller.optics.solve.bounded.engine import ALONE
+from controller.optics.solve.bounded.equations import SolveSettings
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.refinement import (
     EDGE_PX,
     LEAST_GAIN,
@@ -104,7 +107,12 @@ class Result:
         assert refusal(photograph, predicted, self.stage, self.mask, trusted) is None
         aimed = corrected_target(self.target, model_error(photograph, predicted, trusted), self.stage)
         new = solve_again(
-            self.transport, self.target, aimed, self.calibration.black, frames, exposure=EXPOSURE, smoothness=SMOOTHNESS
+            StageLight(self.transport, self.calibration.black),
+            self.target,
+            aimed,
+            SolveSettings(start=frames),
+            ALONE,
+            exposure=EXPOSURE,
         )
         expected = photograph.radiance + self.predicted(new) - predicted
         change = gain(self.error(photograph.radiance, trusted), self.error(expected, trusted))

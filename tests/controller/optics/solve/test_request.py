@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.appearance import Base, Mode, base_image, solve_base
+from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.request import SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
@@ -26,7 +27,7 @@ def transport() -> LightTransport:
 
 @pytest.fixture(scope="module")
 def base(transport: LightTransport) -> Base:
-    return solve_base(transport, base_image(STAGE), STAGE.black, smoothness=OPTIONS.smoothness)
+    return solve_base(transport, base_image(STAGE), STAGE.black, SolveSettings(smoothness=OPTIONS.smoothness))
 
 
 def picture(pitch_px: float) -> Target:
@@ -51,13 +52,13 @@ def picture(pitch_px: float) -> Target:
 def test_fine_detail_is_solved_in_full_or_advised_to_be(
     transport: LightTransport, base: Base, pitch_px: float, mode: Mode, made: str, advised: bool
 ) -> None:
-    found = solve_appearance(transport, base, STAGE.black, picture(pitch_px), replace(OPTIONS, mode=mode))
+    found = solve_appearance(StageLight(transport, STAGE.black), base, picture(pitch_px), replace(OPTIONS, mode=mode))
     assert found.figures["mode"] == made
     assert (found.figures["advice"] is not None) is advised
 
 
 def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:
-    found = solve_appearance(transport, base, STAGE.black, picture(40), OPTIONS)
+    found = solve_appearance(StageLight(transport, STAGE.black), base, picture(40), OPTIONS)
     assert not found.reachable[:10].any()
     assert found.reachable[10:].mean() > 0.85
 
@@ -65,8 +66,8 @@ def test_reachable_pixels_are_those_where_the_target_says_something(transport: L
 def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport, base: Base) -> None:
     options = replace(OPTIONS, share=0.6, adapt=1.0)
     asked = picture(60)
-    found = solve_appearance(transport, base, STAGE.black, asked, options)
-    plain = solve_appearance(transport, base, STAGE.black, asked, replace(options, adapt=0.0))
+    found = solve_appearance(StageLight(transport, STAGE.black), base, asked, options)
+    plain = solve_appearance(StageLight(transport, STAGE.black), base, asked, replace(options, adapt=0.0))
     values = {key: value for key, value in found.figures.items() if isinstance(value, float)}
     assert values["reachable_share"] < 0.7 < 0.95 < values["adapted_share"]
     np.testing.assert_allclose(found.asked, plain.target)
@@ -106,7 +107,7 @@ def test_indirect_light_is_left_room_for(transport: LightTransport, base: Base, 
     wave = picture(60)
     errors = {}
     for name, indirect in (("none", None), ("known", known), ("truth", truth)):
-        found = solve_appearance(transport, base, STAGE.black, wave, replace(OPTIONS, mode=mode), indirect=indirect)
+        found = solve_appearance(StageLight(transport, STAGE.black, indirect), base, wave, replace(OPTIONS, mode=mode))
         direct = transport.forward(found.frames)
         seen = STAGE.black + direct + truth.forward(direct)
         there = found.reachable & transport.object_mask
@@ -120,7 +121,7 @@ def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightT
     target.image[40:80, 60:100] = 0.01
     indirect = thrown_back(near=0.3, strength=0.5)
     with_it, without = (
-        solve_appearance(transport, base, STAGE.black, target, OPTIONS, indirect=one) for one in (indirect, None)
+        solve_appearance(StageLight(transport, STAGE.black, one), base, target, OPTIONS) for one in (indirect, None)
     )
     assert without.reachable[45:75, 65:95].mean() > 0.9
     assert with_it.reachable[45:75, 65:95].mean() < 0.1
@@ -131,7 +132,7 @@ def test_the_brightest_target_counts_on_indirect_light(transport: LightTransport
     """With a fifth more light on everything, targets may be about so much brighter."""
     even = thrown_back(near=0.0, strength=0.4)
     with_it, without = (
-        solve_appearance(transport, base, STAGE.black, picture(40), OPTIONS, indirect=one) for one in (even, None)
+        solve_appearance(StageLight(transport, STAGE.black, one), base, picture(40), OPTIONS) for one in (even, None)
     )
     ratio = float(with_it.figures["exposure"] or 0) / float(without.figures["exposure"] or 1)
     assert 1.02 < ratio < 1.4
@@ -141,7 +142,7 @@ def test_the_brightest_target_counts_on_indirect_light(transport: LightTransport
 def test_the_whole_picture_is_told_as_the_target(transport: LightTransport, base: Base, adapt: float) -> None:
     indirect = thrown_back(near=0.5, strength=0.4)
     options = replace(OPTIONS, adapt=adapt, mode="full")
-    found = solve_appearance(transport, base, STAGE.black, picture(40), options, indirect=indirect)
+    found = solve_appearance(StageLight(transport, STAGE.black, indirect), base, picture(40), options)
     direct = transport.forward(found.frames)
     seen = STAGE.black + direct + indirect.forward(direct)
     there = found.reachable & transport.object_mask

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, Metapixels, PhaseMap, ProjectorCalibration, Radiometry
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import build_transport
 from controller.optics.transport.indirect.beside_object import beside_object
@@ -90,7 +91,7 @@ def test_a_solve_lights_the_object_and_leaves_the_room_dark(target: float) -> No
     assert np.abs(transport.forward(solved.frames)[inner] / target - 1).max() < 0.02
 
     def from_start(frames: FloatImage) -> FloatImage:
-        return solve_bounded(transport, wanted, calibration.black, start=[frames]).frames[0]
+        return solve_bounded(transport, wanted, calibration.black, SolveSettings(start=[frames])).frames[0]
 
     assert (from_start(np.ones((*PIXELS, 3), np.float32))[beside] == 0).all()
     lavish = dataclasses.replace(transport, beside=None, lit=calibration.object_mask[None])

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, PhaseMap
 from controller.optics.capture.patterns import plan_patterns
-from controller.optics.transport.indirect.blocks import down_up
+from controller.optics.transport.indirect.blocks import BlockGrid, down_up
 from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.form_factors import form_factors
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.optics.transport.indirect.stripes import blocks_of, coarse_stripes, dark_light, stripe_parts
-from controller.optics.transport.indirect.weights import ALIKE_BLOCKS, PART_NOISE, UNSURE, BlockLight, shaped
+from controller.optics.transport.indirect.weights import ALIKE_BLOCKS, PART_NOISE, UNSURE, BlockLight, corrected_factors
 from tests.controller.optics.solve.conftest import plane_calibration
 
 SHAPE = (22, 27)
@@ -284,7 +284,9 @@ class Shapes:
         return [BlockLight(one, none, self.true @ one, self.whole, full) for one in (*self.whites, *self.stripes)]
 
     def corrected(self) -> FloatImage:
-        return shaped(self.terms, self.room, self.pictures(), 3, self.grid, self.side, self.shape)[0]
+        return corrected_factors(
+            self.terms, self.room, self.pictures(), 3, BlockGrid(self.grid, self.side, self.shape)
+        )[0]
 
 
 def part_of(factors: FloatImage, light: FloatImage, whole: FloatImage) -> FloatImage:
@@ -311,7 +313,9 @@ def test_no_shape_is_changed_that_already_fits() -> None:
     none, full = np.zeros_like(stage.whole), np.ones(len(stage.whole), np.float32)
     whole = across(stage.whole)
     pictures = [BlockLight(one, none, across(stage.true @ one), whole, full) for one in (*stage.whites, *stage.stripes)]
-    found, room = shaped(stage.terms, stage.room, pictures, 3, stage.grid, stage.side, stage.shape)
+    found, room = corrected_factors(
+        stage.terms, stage.room, pictures, 3, BlockGrid(stage.grid, stage.side, stage.shape)
+    )
     np.testing.assert_allclose(found, stage.terms, rtol=1e-4)
     np.testing.assert_array_equal(room, 0)
 

@@ -16,7 +16,7 @@ from distributed import Client, Scheduler
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.optics.solve.appearance import Base, base_image, solve_base
+from controller.optics.solve.appearance import Base, StageLight, base_image, solve_base
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
@@ -51,7 +51,7 @@ def picture(number: int) -> Target:
 
 def here(number: int) -> AppearanceResult:
     transport, base = solved()
-    return solve_appearance(transport, base, CALIBRATION.black, picture(number), OPTIONS)
+    return solve_appearance(StageLight(transport, CALIBRATION.black), base, picture(number), OPTIONS)
 
 
 def assert_same(found: AppearanceResult, expected: AppearanceResult) -> None:

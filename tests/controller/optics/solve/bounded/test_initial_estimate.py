@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
 from controller.optics.solve.bounded.equations import build_problem, initial_point
-from controller.optics.solve.bounded.solver import SMOOTHNESS
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import plane_frames
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.bounded.equations import build_problem
-from controller.optics.solve.bounded.regions import SOLVERS, BoxProblem, Regions, solve_box, solve_regions
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings, build_problem
+from controller.optics.solve.bounded.regions import SOLVERS, BoxProblem, RegionCut, Regions, solve_box, solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.edge_terms import EdgeTerm, with_terms
@@ -99,11 +100,11 @@ def test_one_region_over_a_crop_by_camera_samples_gives_the_global_optimum() -> 
     calibration = crop_calibration(synthetic_calibration("small"), 200, 300, 40)
     transport = build_transport(calibration)
     target = picture(transport)
-    exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=128)
-    best = solve_bounded(transport, target, calibration.black, tolerance=1e-6, most_iterations=6000)
+    exact = solve_regions(transport, target, calibration.black, cut=RegionCut(solver=FAST, size_px=128))
+    best = solve_bounded(transport, target, calibration.black, SolveSettings(tolerance=1e-6, most_iterations=6000))
     assert exact.regions == 1
     assert best.objective == pytest.approx(exact.objective, rel=1e-4)
-    phases = solve_regions(transport, target, calibration.black, solver=FAST)
+    phases = solve_regions(transport, target, calibration.black, cut=RegionCut(solver=FAST))
     assert -1e-4 < phases.objective / exact.objective - 1 < 0.02
 
 
@@ -114,8 +115,12 @@ def test_one_region_over_the_whole_image_gives_the_global_optimum(stage: Stage, 
     target = picture(transport)
     weights = np.random.default_rng(1).uniform(0, 2, transport.camera_shape).astype(np.float32)
     weights[20:24] = 0
-    exact = solve_regions(transport, target, calibration.black, solver=FAST, size_px=100, weights=weights)
-    best = solve_bounded(transport, target, calibration.black, weights=weights, tolerance=1e-6, most_iterations=6000)
+    exact = solve_regions(
+        transport, target, calibration.black, SolveSettings(weights=weights), cut=RegionCut(solver=FAST, size_px=100)
+    )
+    best = solve_bounded(
+        transport, target, calibration.black, SolveSettings(weights=weights, tolerance=1e-6, most_iterations=6000)
+    )
     assert exact.regions == 1
     assert best.objective == pytest.approx(exact.objective, rel=1e-4)
 
@@ -124,8 +129,8 @@ def test_four_phases_come_near_the_global_optimum_and_never_below_it(stage: Stag
     calibration = crop(stage, blurred=True)
     transport = build_transport(calibration)
     target = picture(transport)
-    best = solve_bounded(transport, target, calibration.black, tolerance=1e-6, most_iterations=6000)
-    found = solve_regions(transport, target, calibration.black, solver=FAST)
+    best = solve_bounded(transport, target, calibration.black, SolveSettings(tolerance=1e-6, most_iterations=6000))
+    found = solve_regions(transport, target, calibration.black, cut=RegionCut(solver=FAST))
     assert found.regions == 16
     assert -1e-4 < found.objective / best.objective - 1 < 0.06
     light = transport.forward(best.frames)
@@ -141,7 +146,8 @@ def test_larger_regions_come_nearer(stage: Stage) -> None:
     transport = build_transport(calibration)
     target = picture(transport)
     small, large = (
-        solve_regions(transport, target, calibration.black, solver=FAST, size_px=size).objective for size in (8, 32)
+        solve_regions(transport, target, calibration.black, cut=RegionCut(solver=FAST, size_px=size)).objective
+        for size in (8, 32)
     )
     assert large < small
 
@@ -151,7 +157,7 @@ def test_the_reference_solver_and_the_fast_one_agree(stage: Stage) -> None:
     transport = build_transport(calibration)
     target = picture(transport)
     reference = solve_regions(transport, target, calibration.black)
-    fast = solve_regions(transport, target, calibration.black, solver=FAST)
+    fast = solve_regions(transport, target, calibration.black, cut=RegionCut(solver=FAST))
     assert (fast.regions, fast.unknowns) == (reference.regions, reference.unknowns)
     assert fast.objective == pytest.approx(reference.objective, rel=3e-4)
 
@@ -177,7 +183,8 @@ def test_osqp_agrees_where_it_is_installed(stage: Stage) -> None:
     transport = build_transport(calibration)
     target = picture(transport)
     splitting, exact = (
-        solve_regions(transport, target, calibration.black, solver=name).objective for name in ("osqp", FAST)
+        solve_regions(transport, target, calibration.black, cut=RegionCut(solver=name)).objective
+        for name in ("osqp", FAST)
     )
     assert splitting == pytest.approx(exact, rel=2e-3)
 
@@ -204,7 +211,7 @@ def test_a_dead_projector_stays_dark_and_an_object_in_the_middle_is_enough(stage
     mask[20:30, 22:50] = True
     calibration = dataclasses.replace(calibration, projectors=(dead, calibration.projectors[1]), object_mask=mask)
     transport = build_transport(calibration)
-    found = solve_regions(transport, picture(transport), calibration.black, solver=FAST)
+    found = solve_regions(transport, picture(transport), calibration.black, cut=RegionCut(solver=FAST))
     assert 0 < found.regions < 16
     assert not found.frames[0].any()
     assert found.frames[1].any()
@@ -216,15 +223,19 @@ def test_wrong_use_is_told_and_a_stop_takes_hold(stage: Stage) -> None:
     target = picture(transport)
     for arguments in ({"overlap": 1.0}, {"overlap": -0.1}, {"size_px": 0}):
         with pytest.raises(UsageError) as refused:
-            solve_regions(transport, target, calibration.black, **arguments)
+            solve_regions(transport, target, calibration.black, cut=RegionCut(**arguments))
         assert refused.value.code == "solve-arguments"
     with pytest.raises(UsageError) as refused:
-        solve_regions(transport, target, calibration.black, solver="guess")
+        solve_regions(transport, target, calibration.black, cut=RegionCut(solver="guess"))
     assert refused.value.code == "solver-unknown"
-    seen: list[float] = []
+    seen: list[int] = []
     with pytest.raises(WorkError) as stopped:
         solve_regions(
-            transport, target, calibration.black, solver=FAST, progress=seen.append, cancelled=lambda: len(seen) == 2
+            transport,
+            target,
+            calibration.black,
+            context=SolveContext(progress=lambda done, left: seen.append(done), cancelled=lambda: len(seen) == 2),
+            cut=RegionCut(solver=FAST),
         )
     assert stopped.value.code == "solve-cancelled"
     assert len(seen) == 2

@@ -13,16 +13,19 @@ import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration, Metapixels
+from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import (
     EDGE_WEIGHT_STEPS,
     Solution,
+    SolveSettings,
     build_problem,
     smoothness_term,
     squared_edge_weights,
 )
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import frame_planes, image_planes, plane_frames
 from tests.controller.optics.solve.bounded.smoothness_reference import smoothness_weights
@@ -100,10 +103,7 @@ def test_the_objective_agrees_with_an_exact_solver(stage: Stage, seed: int, smoo
         transport,
         target,
         calibration.black,
-        smoothness=smoothness,
-        weights=weights,
-        tolerance=1e-7,
-        most_iterations=5000,
+        SolveSettings(smoothness=smoothness, weights=weights, tolerance=1e-7, most_iterations=5000),
     )
     T, magnitude = dense(transport), dense(transport, absolute=True)
     counted = transport.object_mask.astype(np.float64) * (1.0 if weights is None else weights)
@@ -176,7 +176,7 @@ def test_one_camera_pixel_and_one_projector_pixel(stage: Stage) -> None:
     calibration = dataclasses.replace(calibration, projectors=(projector,), black=np.zeros((1, 1, 3), np.float32))
     transport = build_transport(calibration)
     frame = np.array([[[0.2, 0.5, 0.8]]], np.float32)
-    solution = solve_bounded(transport, transport.forward([frame]), calibration.black, tolerance=1e-6)
+    solution = solve_bounded(transport, transport.forward([frame]), calibration.black, SolveSettings(tolerance=1e-6))
     np.testing.assert_allclose(solution.frames[0], frame, atol=1e-3)
 
 
@@ -200,7 +200,10 @@ def test_weights_that_are_negative_are_refused(stage: Stage) -> None:
     transport = build_transport(calibration)
     with pytest.raises(UsageError) as refused:
         solve_bounded(
-            transport, calibration.black, calibration.black, weights=np.full(transport.camera_shape, -1, np.float32)
+            transport,
+            calibration.black,
+            calibration.black,
+            SolveSettings(weights=np.full(transport.camera_shape, -1, np.float32)),
         )
     assert refused.value.code == "solve-arguments"
 
@@ -210,7 +213,7 @@ def test_a_warm_start_needs_fewer_iterations_for_the_same_answer(stage: Stage) -
     transport = build_transport(calibration)
     target = random_target(transport, 4)
     cold = solve_bounded(transport, target, calibration.black)
-    warm = solve_bounded(transport, target * 1.01, calibration.black, start=cold.frames)
+    warm = solve_bounded(transport, target * 1.01, calibration.black, SolveSettings(start=cold.frames))
     again = solve_bounded(transport, target * 1.01, calibration.black)
     assert warm.iterations < again.iterations
     assert warm.objective == pytest.approx(again.objective, rel=1e-3)
@@ -230,8 +233,9 @@ def test_a_solve_reports_progress_and_stops_when_asked(stage: Stage) -> None:
             transport,
             random_target(transport, 5),
             calibration.black,
-            progress=lambda iteration, kkt: seen.append(iteration),
-            cancelled=lambda: len(seen) >= 3,
+            context=SolveContext(
+                progress=lambda iteration, kkt: seen.append(iteration), cancelled=lambda: len(seen) >= 3
+            ),
         )
     assert stopped.value.code == "solve-cancelled"
     assert seen == [1, 2, 3]
@@ -241,7 +245,9 @@ def test_more_smoothness_makes_smoother_frames(stage: Stage) -> None:
     calibration = stage()
     transport = build_transport(calibration)
     target = random_target(transport, 6)
-    rough, smooth = (solve_bounded(transport, target, calibration.black, smoothness=s).frames[0] for s in (1e-4, 0.3))
+    rough, smooth = (
+        solve_bounded(transport, target, calibration.black, SolveSettings(smoothness=s)).frames[0] for s in (1e-4, 0.3)
+    )
     assert np.abs(np.diff(smooth, axis=1)).mean() < 0.7 * np.abs(np.diff(rough, axis=1)).mean()
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import Float64, FloatImage
 from controller.optics.calibrate.values import Calibration, PhaseMap
-from controller.optics.solve.bounded.equations import Problem, build_problem
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.equations import Problem, SolveSettings, build_problem
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import CameraBox
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
@@ -97,5 +98,5 @@ def check(calibration: Calibration) -> None:
     transport = build_transport(calibration)
     target = unreachable_in_parts(transport, calibration.black)
     best = exact(build_problem(transport, target, calibration.black, SMOOTHNESS, None))
-    found = solve_bounded(transport, target, calibration.black, tolerance=1e-6, most_iterations=4000)
+    found = solve_bounded(transport, target, calibration.black, SolveSettings(tolerance=1e-6, most_iterations=4000))
     assert found.objective == pytest.approx(best, rel=1e-4)

@@ -14,6 +14,7 @@ from scipy.optimize import LinearConstraint, minimize
 from controller.core.arrays import Float64, FloatImage
 from controller.optics.calibrate.values import Calibration, Radiometry
 from controller.optics.solve.appearance import base_image, scale_frames, solve_base
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.gradient import within_segment
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.drive_levels import DriveLevels
@@ -65,9 +66,9 @@ def orange(calibration: Calibration) -> FloatImage:
 def test_frames_are_such_as_the_projector_can_show(stage: Stage, segment: float) -> None:
     calibration = with_segment(stage(), segment)
     transport = build_transport(calibration)
-    solved = solve_bounded(transport, orange(calibration), calibration.black, tolerance=1e-4)
+    solved = solve_bounded(transport, orange(calibration), calibration.black, SolveSettings(tolerance=1e-4))
     assert solved.converged
-    base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-3)
+    base = solve_base(transport, base_image(calibration, "white"), calibration.black, SolveSettings(tolerance=1e-3))
     scaled = scale_frames(transport, base, orange(calibration), calibration.black)
     for frames in (solved.frames, scaled):
         for frame, part in zip(frames, calibration.projectors, strict=True):
@@ -84,7 +85,7 @@ def test_a_solve_knows_that_saturated_colours_are_darker(stage: Stage) -> None:
     target = orange(calibration)
 
     def missed(which: LightTransport) -> float:
-        frames = solve_bounded(which, target, calibration.black, smoothness=0.0, tolerance=1e-4).frames
+        frames = solve_bounded(which, target, calibration.black, SolveSettings(smoothness=0.0, tolerance=1e-4)).frames
         shown = [
             np.asarray(part.radiometry.emitted(np.clip(part.radiometry.channels(frame), 0, 1)), np.float32)
             for frame, part in zip(frames, calibration.projectors, strict=True)

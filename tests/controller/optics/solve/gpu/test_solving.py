@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import base_image, scale_frames, solve_base
-from controller.optics.solve.bounded.equations import build_problem
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.equations import SolveSettings, build_problem
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.gpu.device import Device
 from controller.optics.solve.gpu.engine import GpuEngine
 from controller.optics.transport import LightTransport, build_transport
@@ -44,7 +46,13 @@ def test_the_objective_is_the_least_on_a_folded_object(engine: GpuEngine) -> Non
     transport = build_transport(calibration)
     target = unreachable_in_parts(transport, calibration.black)
     best = exact(build_problem(transport, target, calibration.black, SMOOTHNESS, None))
-    found = solve_bounded(transport, target, calibration.black, tolerance=1e-5, most_iterations=2000, engine=engine)
+    found = solve_bounded(
+        transport,
+        target,
+        calibration.black,
+        SolveSettings(tolerance=1e-5, most_iterations=2000),
+        SolveContext(engine=engine),
+    )
     assert found.objective == pytest.approx(best, rel=1e-4)
 
 
@@ -59,7 +67,13 @@ def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, ed
     target = transport.reach() * rng.uniform(0, 1.2, black.shape).astype(np.float32)
     weights = rng.uniform(0.1, 3, transport.camera_shape).astype(np.float32)
     there, here = (
-        solve_bounded(transport, target, black, weights=weights, tolerance=1e-5, most_iterations=100, engine=which)
+        solve_bounded(
+            transport,
+            target,
+            black,
+            SolveSettings(weights=weights, tolerance=1e-5, most_iterations=100),
+            SolveContext(engine=which),
+        )
         for which in (engine, None)
     )
     assert there.objective == pytest.approx(here.objective, rel=1e-4)
@@ -77,7 +91,9 @@ def test_a_solve_starts_where_the_processor_s_does(device: Device, seed: int, mo
     black = np.full((*transport.camera_shape, 3), 0.001, np.float32)
     target = black + transport.reach() * rng.uniform(0, 1.6, 3).astype(np.float32)
     there, here = (
-        solve_bounded(transport, target, black, tolerance=0, most_iterations=0, engine=which)
+        solve_bounded(
+            transport, target, black, SolveSettings(tolerance=0, most_iterations=0), SolveContext(engine=which)
+        )
         for which in (GpuEngine(device, _only_memory), None)
     )
     np.testing.assert_allclose(frame_planes(there.frames), frame_planes(here.frames), atol=2e-3)
@@ -90,12 +106,16 @@ def test_each_solve_has_its_own_black_weights_start_and_smoothness(engine: GpuEn
     rng = np.random.default_rng(4)
     shape = transport.camera_shape
     asked = [
-        {
-            "black": np.full((*shape, 3), black, np.float32),
-            "weights": rng.uniform(0.2, 2, shape).astype(np.float32) if weighted else None,
-            "start": [np.full((*size, 3), 0.2, np.float32) for size in transport.sizes] if started else None,
-            "smoothness": smoothness,
-        }
+        (
+            np.full((*shape, 3), black, np.float32),
+            SolveSettings(
+                smoothness,
+                rng.uniform(0.2, 2, shape).astype(np.float32) if weighted else None,
+                [np.full((*size, 3), 0.2, np.float32) for size in transport.sizes] if started else None,
+                tolerance=0,
+                most_iterations=6,
+            ),
+        )
         for black, weighted, started, smoothness in (
             (0.0, False, False, 1e-3),
             (0.02, True, False, 1e-2),
@@ -105,10 +125,9 @@ def test_each_solve_has_its_own_black_weights_start_and_smoothness(engine: GpuEn
         )
     ]
     target = transport.reach() * np.float32(0.7)
-    for one in asked:
+    for dark, settings in asked:
         there, here = (
-            solve_bounded(transport, target, tolerance=0, most_iterations=6, engine=which, **one)  # type: ignore[arg-type]
-            for which in (engine, None)
+            solve_bounded(transport, target, dark, settings, SolveContext(which)) for which in (engine, None)
         )
         assert there.objective == pytest.approx(here.objective, rel=1e-4)
         np.testing.assert_allclose(frame_planes(there.frames), frame_planes(here.frames), atol=2e-3)
@@ -122,7 +141,9 @@ def test_pixels_beside_the_object_stay_dark(engine: GpuEngine) -> None:
     black = np.zeros((*transport.camera_shape, 3), np.float32)
     target = 0.6 * transport.reach()
     there, here = (
-        solve_bounded(transport, target, black, tolerance=0, most_iterations=8, engine=which)
+        solve_bounded(
+            transport, target, black, SolveSettings(tolerance=0, most_iterations=8), SolveContext(engine=which)
+        )
         for which in (engine, None)
     )
     assert (frame_planes(there.frames)[:, beside] == 0).all()
@@ -137,7 +158,13 @@ def test_sweeps_are_those_of_the_processor(
     calibration, transport = stage
     target = unreachable_in_parts(transport, calibration.black)
     there, here = (
-        solve_bounded(transport, target, calibration.black, tolerance=0, most_iterations=sweeps, engine=which)
+        solve_bounded(
+            transport,
+            target,
+            calibration.black,
+            SolveSettings(tolerance=0, most_iterations=sweeps),
+            SolveContext(engine=which),
+        )
         for which in (engine, None)
     )
     assert there.iterations == here.iterations == sweeps
@@ -155,9 +182,15 @@ def test_a_solve_ends_in_the_sweep_that_meets_the_tolerance(
     """Although several are submitted at once: those after it change nothing."""
     calibration, transport = stage
     image = base_image(calibration)
-    found = solve_bounded(transport, image, calibration.black, tolerance=1e-4, engine=engine)
+    found = solve_bounded(
+        transport, image, calibration.black, SolveSettings(tolerance=1e-4), SolveContext(engine=engine)
+    )
     same = solve_bounded(
-        transport, image, calibration.black, tolerance=0, most_iterations=found.iterations, engine=engine
+        transport,
+        image,
+        calibration.black,
+        SolveSettings(tolerance=0, most_iterations=found.iterations),
+        SolveContext(engine=engine),
     )
     assert found.converged
     assert found.kkt == same.kkt <= 1e-4
@@ -167,8 +200,10 @@ def test_a_solve_ends_in_the_sweep_that_meets_the_tolerance(
 def test_a_warm_start_is_used(engine: GpuEngine, stage: tuple[Calibration, LightTransport]) -> None:
     calibration, transport = stage
     image = base_image(calibration)
-    cold = solve_bounded(transport, image, calibration.black, engine=engine)
-    warm = solve_bounded(transport, image, calibration.black, start=cold.frames, engine=engine)
+    cold = solve_bounded(transport, image, calibration.black, context=SolveContext(engine=engine))
+    warm = solve_bounded(
+        transport, image, calibration.black, SolveSettings(start=cold.frames), SolveContext(engine=engine)
+    )
     assert warm.iterations < cold.iterations / 2
 
 
@@ -177,11 +212,9 @@ def test_progress_is_told_and_a_stop_request_obeyed(
 ) -> None:
     calibration, transport = stage
     seen: list[int] = []
+    context = SolveContext(engine, lambda iteration, kkt: seen.append(iteration), lambda: len(seen) >= 3)
     with pytest.raises(WorkError) as stopped:
-        solve_bounded(
-            transport, base_image(calibration), calibration.black, tolerance=0,
-            progress=lambda iteration, kkt: seen.append(iteration), cancelled=lambda: len(seen) >= 3, engine=engine,
-        )  # fmt: skip
+        solve_bounded(transport, base_image(calibration), calibration.black, SolveSettings(tolerance=0), context)
     assert stopped.value.code == "solve-cancelled"
     assert len(seen) == 3
     assert seen == sorted(set(seen))
@@ -192,7 +225,7 @@ def test_base_times_scale_is_that_of_the_processor(engine: GpuEngine, segment: f
     transport = any_windows(8, mosaic=True, segment=segment)
     rng = np.random.default_rng(8)
     black = np.full((*transport.camera_shape, 3), 0.001, np.float32)
-    base = solve_base(transport, 0.4 * transport.reach() + black, black, tolerance=1e-3)
+    base = solve_base(transport, 0.4 * transport.reach() + black, black, SolveSettings(tolerance=1e-3))
     for _ in range(2):
         target = black + transport.reach() * rng.uniform(0, 0.9, black.shape).astype(np.float32)
         there, here = (scale_frames(transport, base, target, black, engine=which) for which in (engine, None))
@@ -206,7 +239,9 @@ def test_a_second_base_and_a_second_stage_take_the_place_of_the_first(engine: Gp
         transport = any_windows(seed, mosaic=True)
         black = np.zeros((*transport.camera_shape, 3), np.float32)
         for level in (0.3, 0.5):
-            base = solve_base(transport, level * transport.reach(), black, tolerance=1e-2, engine=engine)
+            base = solve_base(
+                transport, level * transport.reach(), black, SolveSettings(tolerance=1e-2), SolveContext(engine=engine)
+            )
             target = 0.3 * transport.reach()
             there, here = (scale_frames(transport, base, target, black, engine=which) for which in (engine, None))
             np.testing.assert_allclose(frame_planes(there), frame_planes(here), atol=1e-5)
@@ -224,10 +259,9 @@ def solved(stage: tuple[Calibration, LightTransport], engine: GpuEngine | None, 
         transport,
         target,
         calibration.black,
-        tolerance=0,
-        most_iterations=30,
-        engine=engine,
-        **more,  # type: ignore[arg-type]
+        SolveSettings(tolerance=0, most_iterations=30),
+        SolveContext(engine=engine),
+        **more,
     ).frames
 
 

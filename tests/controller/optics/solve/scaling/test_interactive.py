@@ -13,6 +13,7 @@ from controller.bundle.live_maps import compensate
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import Base, base_image, scale_frames, solve_base
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.scaling.dither import to_light
 from controller.optics.solve.scaling.interactive import Interactive, interactive
 from controller.optics.transport import LightTransport, build_transport
@@ -23,7 +24,7 @@ Image = npt.NDArray[np.float32]
 
 def prepared(calibration: Calibration) -> tuple[LightTransport, Base, Interactive]:
     transport = build_transport(calibration)
-    base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-4)
+    base = solve_base(transport, base_image(calibration, "white"), calibration.black, SolveSettings(tolerance=1e-4))
     made = interactive(transport, base, calibration.black, [p.radiometry for p in calibration.projectors])
     return transport, base, made
 

@@ -12,7 +12,8 @@ from controller.bundle.live_maps import LiveMaps, compensate, compensate_light, 
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.appearance import Base, BaseKind, base_image, scale_frames, solve_base
+from controller.optics.solve.appearance import Base, BaseKind, StageLight, base_image, scale_frames, solve_base
+from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.scaling.dither import to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import NARROWED, footprints, reduced, reduction, scaling_maps
@@ -27,7 +28,7 @@ Stage = tuple[Calibration, LightTransport, Base]
 def solved(kind: BaseKind) -> Stage:
     calibration = synthetic_calibration(projector=(52, 70), camera=(130, 194))
     transport = build_transport(calibration)
-    base = solve_base(transport, base_image(calibration, kind), calibration.black, tolerance=1e-2)
+    base = solve_base(transport, base_image(calibration, kind), calibration.black, SolveSettings(tolerance=1e-2))
     return calibration, transport, base
 
 
@@ -39,7 +40,9 @@ def stage() -> Stage:
 def maps_of(stage: Stage, largest_px: int = 2048, spread: float = NARROWED) -> LiveMaps:
     calibration, transport, base = stage
     radiometries = [part.radiometry for part in calibration.projectors]
-    return scaling_maps(transport, base, calibration.black, radiometries, largest_px=largest_px, spread=spread)
+    return scaling_maps(
+        StageLight(transport, calibration.black), base, radiometries, largest_px=largest_px, spread=spread
+    )
 
 
 def seen(stage: Stage, frames: Sequence[ByteImage]) -> FloatImage:
@@ -180,7 +183,9 @@ def test_the_processor_leaves_room_for_other_light_as_the_reference_does(
     stage = solved("white")
     calibration, transport, base = stage
     radiometries = [part.radiometry for part in calibration.projectors]
-    maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=light(stage), largest_px=largest_px)
+    maps = scaling_maps(
+        StageLight(transport, calibration.black, light(stage)), base, radiometries, largest_px=largest_px
+    )
     target, brightness = wanted(stage, largest_px)
     scaler = Interactive(maps)
     frames = scaler.blank()
@@ -201,7 +206,7 @@ def shown(stage: Stage, indirect: IndirectLight, target: ByteImage, brightness: 
     radiometries = [part.radiometry for part in calibration.projectors]
     found = []
     for known in (indirect, None):
-        maps = scaling_maps(transport, base, calibration.black, radiometries, indirect=known)
+        maps = scaling_maps(StageLight(transport, calibration.black, known), base, radiometries)
         direct = seen(stage, compensate(maps, target, brightness))
         found.append(direct + indirect.forward(direct) + calibration.black)
     return found[0], found[1]
@@ -245,7 +250,7 @@ def segmented(stage: Stage, share: float) -> Stage:
     )
     calibration = dataclasses.replace(calibration, projectors=projectors)
     transport = build_transport(calibration)
-    base = solve_base(transport, base_image(calibration, "white"), calibration.black, tolerance=1e-2)
+    base = solve_base(transport, base_image(calibration, "white"), calibration.black, SolveSettings(tolerance=1e-2))
     return calibration, transport, base
 
 

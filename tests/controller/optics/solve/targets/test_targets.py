@@ -20,10 +20,10 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.files import load_target, shipped_photograph
-from controller.optics.solve.targets.patterns import checkerboard, replace_pattern
-from controller.optics.solve.targets.relight import gloss, recolour
+from controller.optics.solve.targets.patterns import CheckerboardLook, PatternLook, checkerboard, replace_pattern
+from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.values import Target, in_box, linear_to_srgb, srgb_to_linear, through_camera
-from controller.optics.solve.targets.wrap import object_space, wrap_photograph
+from controller.optics.solve.targets.wrap import PrintLook, object_space, wrap_photograph
 
 ROWS, COLUMNS, FOCAL = 160, 240, 400.0
 Array = npt.NDArray[np.float64]
@@ -65,7 +65,9 @@ def test_the_highlight_of_a_sphere_lies_where_the_normal_halves_light_and_view()
     geometry, mask = quadric(0.12, upright=False)
     light = np.array([-0.4, -0.5, -1.0]) / np.linalg.norm([-0.4, -0.5, -1.0])
     target = gloss(
-        geometry, mask, light_direction=(-0.4, -0.5, -1.0), base_colour=(0.1, 0.1, 0.1), shininess=200, smoothing_px=0
+        geometry,
+        mask,
+        GlossLook(light_direction=(-0.4, -0.5, -1.0), base_colour=(0.1, 0.1, 0.1), shininess=200, smoothing_px=0),
     )
     brightest = np.unravel_index(int(np.argmax(target.image[..., 0])), mask.shape)
     point = geometry.points_m[brightest].astype(np.float64)
@@ -73,13 +75,13 @@ def test_the_highlight_of_a_sphere_lies_where_the_normal_halves_light_and_view()
     expected = np.array([0, 0, 1]) + 0.12 * half / np.linalg.norm(half)
     px = expected[:2] / expected[2] * FOCAL + [119.5, 79.5]
     assert np.hypot(*(px - [brightest[1], brightest[0]])) < 1.0
-    dark = gloss(geometry, mask, light_direction=(0, 0, 1), base_colour=(0.5, 0.2, 0.1), ambient=0.4)
+    dark = gloss(geometry, mask, GlossLook(light_direction=(0, 0, 1), base_colour=(0.5, 0.2, 0.1), ambient=0.4))
     np.testing.assert_allclose(dark.image[80, 120], [0.2, 0.08, 0.04], rtol=1e-5)
 
 
 def test_a_checkerboards_squares_have_their_size_on_the_cylinder() -> None:
     geometry, mask = quadric(0.15, upright=True)
-    target = checkerboard(geometry, mask, square_m=0.02)
+    target = checkerboard(geometry, mask, CheckerboardLook(square_m=0.02))
     row = 90
     columns = edges(np.where(mask[row], target.image[row, :, 0], np.nan)[30:-30]) + 30
     x = np.interp(columns, np.arange(COLUMNS), geometry.points_m[row, :, 0].astype(np.float64))
@@ -111,7 +113,7 @@ def test_a_photograph_on_a_wall_is_the_photograph() -> None:
     geometry, mask = wall()
     rng = np.random.default_rng(1)
     photo = cv2.GaussianBlur(rng.random((ROWS, COLUMNS, 3)).astype(np.float32), (0, 0), 3).astype(np.float32)
-    target = wrap_photograph(photo, geometry, mask, ink=0, paper=1)
+    target = wrap_photograph(photo, geometry, mask, PrintLook(ink=0, paper=1))
     # 99 % of the wall's extent take the whole photograph, so it is 1 % smaller than pixel for pixel
     inner = (slice(40, -40), slice(60, -60))
     assert np.abs(target.image[inner] - photo[inner]).mean() < 0.02
@@ -123,17 +125,17 @@ def test_fine_detail_is_averaged_and_does_not_alias() -> None:
     geometry, mask = wall()
     photo = np.zeros((2400, 3600, 3), dtype=np.float32)
     photo[::2, 1::2] = photo[1::2, ::2] = 1.0
-    target = wrap_photograph(photo, geometry, mask, ink=0, paper=1)
+    target = wrap_photograph(photo, geometry, mask, PrintLook(ink=0, paper=1))
     np.testing.assert_allclose(target.image[20:-20, 20:-20], 0.5, atol=0.05)
-    checks = checkerboard(geometry, mask, square_m=0.01, colours=((1, 1, 1), (0, 0, 0)))
+    checks = checkerboard(geometry, mask, CheckerboardLook(square_m=0.01, colours=((1, 1, 1), (0, 0, 0))))
     assert checks.image.mean() == pytest.approx(0.5, abs=0.02)
 
 
 def test_shading_darkens_what_turns_away_and_only_that() -> None:
     geometry, mask = quadric(0.15, upright=True)
     white = np.ones((50, 50, 3), dtype=np.float32)
-    flat = wrap_photograph(white, geometry, mask, paper=1)
-    shaded = wrap_photograph(white, geometry, mask, paper=1, shading=0.5)
+    flat = wrap_photograph(white, geometry, mask, PrintLook(paper=1))
+    shaded = wrap_photograph(white, geometry, mask, PrintLook(paper=1, shading=0.5))
     assert np.all(flat.image[mask] == pytest.approx(1.0, abs=1e-5))
     assert shaded.image[80, 120, 0] == pytest.approx(1.0, abs=1e-3)
     assert 0.5 <= shaded.image[80][mask[80]].min() < 0.65
@@ -145,14 +147,12 @@ def test_a_pattern_covers_the_share_asked_for(kind: str) -> None:
     target = replace_pattern(
         geometry,
         mask,
-        kind="dots" if kind == "dots" else "stripes",
-        period_m=0.05,
-        fill=0.25,
-        body=(1, 1, 1),
-        ink=(0, 0, 0),
+        PatternLook(
+            kind="dots" if kind == "dots" else "stripes", period_m=0.05, fill=0.25, body=(1, 1, 1), ink=(0, 0, 0)
+        ),
     )
     assert 1 - target.image.mean() == pytest.approx(0.25, abs=0.02)
-    plain = replace_pattern(geometry, mask, kind="plain", body=(0.6, 0.5, 0.4))
+    plain = replace_pattern(geometry, mask, PatternLook(kind="plain", body=(0.6, 0.5, 0.4)))
     np.testing.assert_allclose(plain.image[80, 120], [0.6, 0.5, 0.4], rtol=1e-5)
 
 
@@ -162,7 +162,7 @@ def test_every_target_is_finite_in_range_and_black_off_the_object() -> None:
     holed[70:75, 100:105] = np.nan
     geometry = Geometry(geometry.camera, (), holed, geometry.normals, 0.1, True)
     made = [
-        wrap_photograph(shipped_photograph(), geometry, mask, shading=0.3),
+        wrap_photograph(shipped_photograph(), geometry, mask, PrintLook(shading=0.3)),
         replace_pattern(geometry, mask),
         checkerboard(geometry, mask),
         gloss(geometry, mask),
@@ -190,12 +190,12 @@ def test_an_object_without_known_positions_is_refused() -> None:
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan")])
 def test_impossible_pattern_sizes_are_refused(size: float) -> None:
     with pytest.raises(UsageError) as refused:
-        checkerboard(*wall(), square_m=size)
+        checkerboard(*wall(), look=CheckerboardLook(square_m=size))
     assert refused.value.code == "pattern-period-invalid"
     with pytest.raises(UsageError):
-        replace_pattern(*wall(), fill=0.9)
+        replace_pattern(*wall(), look=PatternLook(fill=0.9))
     with pytest.raises(UsageError):
-        gloss(*wall(), light_direction=(0, 0, 0))
+        gloss(*wall(), look=GlossLook(light_direction=(0, 0, 0)))
 
 
 @settings(max_examples=30, deadline=None)
@@ -311,11 +311,11 @@ def test_a_print_reflects_from_its_ink_to_its_paper() -> None:
     geometry, mask = wall()
     photo = np.zeros((20, 30, 3), dtype=np.float32)
     photo[:, 15:] = 1
-    printed = wrap_photograph(photo, geometry, mask, ink=0.04, paper=0.85).image[mask]
+    printed = wrap_photograph(photo, geometry, mask, PrintLook(ink=0.04, paper=0.85)).image[mask]
     assert printed.min() == pytest.approx(0.04, abs=1e-4)
     assert printed.max() == pytest.approx(0.85, abs=1e-4)
     with pytest.raises(UsageError) as refused:
-        wrap_photograph(photo, geometry, mask, ink=0.9, paper=0.2)
+        wrap_photograph(photo, geometry, mask, PrintLook(ink=0.9, paper=0.2))
     assert refused.value.code == "print-range-invalid"
 
 

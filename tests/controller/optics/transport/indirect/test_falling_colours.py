@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.arrays import Float64, FloatImage
+from controller.optics.transport.indirect.blocks import BlockGrid
 from controller.optics.transport.indirect.weights import (
     BlockLight,
     FallingColours,
+    corrected_factors,
     falling_colours,
     lamp_colours,
-    shaped,
 )
 
 GRID, SIDE = (5, 8), 6
@@ -130,8 +131,8 @@ def test_sources_that_count_too_little_are_found_by_their_colour() -> None:
         falling = factors * made.every.sum(axis=1)
         return np.asarray((falling[:, orange].sum(axis=1) / falling.sum(axis=1))[above])
 
-    without, _ = shaped(wrong.astype(np.float32), room, [white], 1, GRID, SIDE, SHAPE)
-    found, _ = shaped(wrong.astype(np.float32), room, [white], 1, GRID, SIDE, SHAPE, made.found())
+    without, _ = corrected_factors(wrong.astype(np.float32), room, [white], 1, BlockGrid(GRID, SIDE, SHAPE))
+    found, _ = corrected_factors(wrong.astype(np.float32), room, [white], 1, BlockGrid(GRID, SIDE, SHAPE), made.found())
     off = [float(np.abs(share(one) - share(made.factors)).mean()) for one in (without, found)]
     assert off[1] < 0.5 * off[0]
 

@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.capture.raw import develop
-from controller.optics.solve.bounded.solver import SMOOTHNESS, solve_bounded
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.metrics import compare
 from controller.optics.transport import build_transport
 from controller.run.journal import Journal
