@@ -25,7 +25,7 @@ from controller.kiosk.decide.clock import synchronised
 from controller.kiosk.supervisors.player_supervisor import Process, launched
 from controller.play.control.launch import PlayerSettings
 from controller.stage.rig.lamp_ledger import SystemClock
-from controller.stage.sessions.recording import open_context
+from controller.stage.sessions.run import open_context
 from hal.deadline import Deadline
 from hal.player import PlayerClient
 from hal.registry import Drivers, OpenContext

@@ -15,7 +15,7 @@ def read_target(file: Path) -> None:
 
 def read_live(source: Path) -> None:
     """Open a stream of targets, as ``velatura live`` does, and take its first picture."""
-    from controller.stage.live.sources import FolderSource, open_source
+    from controller.stage.live import FolderSource, open_source
 
     opened = open_source(source, loop=False, rate_hz=25.0)
     if isinstance(opened, FolderSource):

@@ -37,8 +37,7 @@ from tests.real_kernel.usb_ip import Cable
 from tests.real_kernel.uvc_camera import BLACK, FULL, HEIGHT, INTERVAL_S, WIDTH, UvcCamera
 
 if TYPE_CHECKING:
-    from controller.stage.live.sources import LivePicture
-    from controller.stage.live.streams import StreamSource
+    from controller.stage.live import LivePicture, StreamSource
 
 CONTEXT = OpenContext(Path())
 OUT = Path("/tmp/out")
@@ -311,7 +310,7 @@ def is_even(colour: tuple[int, int, int], picture: Any) -> bool:
 
 def live(path: Path) -> StreamSource:
     """The device as a live target, with its first picture."""
-    from controller.stage.live.readers import open_stream
+    from controller.stage.live import open_stream
 
     source = open_stream(str(path), silent_s=20.0, retry_s=0.2)
     source.wait_for_picture(PATIENCE_S)

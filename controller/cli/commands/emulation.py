@@ -95,7 +95,7 @@ def record(
     out: Annotated[Path | None, typer.Option(help="The tape (default: a new file in STAGE/tapes).")] = None,
 ) -> int:
     """Record all device traffic of a command on a tape. It has no passwords; `velatura emulate --tape` replays it."""
-    from controller.stage.sessions.recording import VARIABLE, new_tape
+    from controller.stage.sessions.run import VARIABLE, new_tape
 
     if not (stage / "stage.toml").is_file():
         raise UsageError(

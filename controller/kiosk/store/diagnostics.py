@@ -18,7 +18,7 @@ from controller.stage.artefacts.grade import FIGURES
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import json_path
 from controller.stage.artefacts.published import BUNDLE_FIGURES
-from controller.stage.sessions.recording import tapes
+from controller.stage.sessions.run import tapes
 from hal.runtime.caches import kept
 
 LARGEST_TAPE: Final = 64 << 20

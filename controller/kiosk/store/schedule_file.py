@@ -18,7 +18,7 @@ from controller.core.storage import write_atomically
 from controller.kiosk.decide.days import expanded
 from controller.kiosk.decide.hours import check_overlaps, check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.stage.sessions.time_zone import PANELS_FILE
+from controller.stage.sessions.check import PANELS_FILE
 
 FILE: Final = PANELS_FILE
 _HEADING: Final = "# Opening hours, written by the panel. This file replaces [schedule] in stage.toml.\n\n"

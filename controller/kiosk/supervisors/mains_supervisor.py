@@ -14,7 +14,7 @@ from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervi
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Lock
 from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit
+from controller.stage.rig.power import Circuit
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device

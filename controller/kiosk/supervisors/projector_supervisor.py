@@ -12,8 +12,7 @@ from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorVi
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.reopening import pause_s
 from controller.optics.capture.acquire import DISK_CODES
-from controller.stage.rig.lamp_faults import fatal_faults, faulty
-from controller.stage.rig.lamp_guard import LampGuard
+from controller.stage.rig.lamp_guard import LampGuard, fatal_faults, faulty
 from controller.stage.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused

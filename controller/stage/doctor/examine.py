@@ -1,31 +1,183 @@
-"""Search every bus, test the stage's own devices, and compare."""
+"""Searches every bus, tests the stage's own devices, and compares. No lamp, relay or camera is operated."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import socket
+import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from controller.config.loader import FILE
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
 from controller.optics.solve.engines import graphics_sentence
 from controller.run.progress import Reporter
-from controller.stage.doctor.search_address import PJLINK, search_address
-from controller.stage.doctor.trying import Trying, devices_of
-from controller.stage.doctor.values import Examination
+from controller.stage.doctor.values import Examination, Tried
 from controller.stage.doctor.writing import write
+from controller.stage.rig.lamp_guard import fatal_faults, faulty
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.run import LOCK
+from controller.stage.sessions.run import LOCK, open_context
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.finding import Finder, Found, Known, SearchScope, load_finders, search_bus
+from hal.interfaces import ButtonPanel, Camera, Douser, LightSensor, PowerSwitch, Projector, WatchedProjector
 from hal.notices import Notice
-from hal.registry import Drivers, load_drivers
+from hal.registry import Driver, Drivers, load_drivers, open_device
+from hal.values import Power
+
+OPEN_S = 15.0
+
+
+_DOUSER: Final = {True: "closed", False: "open", None: "not moved yet"}
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A device of the stage: its name for people, and how to open it."""
+
+    name: str
+    kind: str
+    driver: Driver
+    settings: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Its name in stage.toml, or "" for a kind of which a stage has at most one."""
+        return self.name if self.kind in ("projector", "power_switch") else ""
+
+    @property
+    def place(self) -> str:
+        """Its address in its table."""
+        return str(self.settings.get("port") or self.settings.get("address") or self.settings.get("serial") or "")
+
+
+def devices_of(checked: Checked) -> Iterator[Device]:
+    """Relays first, because a projector without mains does not answer. The display is not tested: it is our own."""
+    tables = checked.stage.tables
+    for relays, (driver, settings) in zip(tables.relays, checked.relays, strict=True):
+        yield Device(relays.name, "power_switch", driver, settings)
+    for projector, (driver, settings) in zip(tables.projectors, checked.projectors, strict=True):
+        yield Device(projector.name, "projector", driver, settings)
+    for projector, douser in zip(tables.projectors, checked.dousers, strict=True):
+        if douser is not None:
+            yield Device(f"{projector.name} (douser)", "douser", *douser)
+    yield Device("camera", "camera", *checked.camera)
+    if checked.light_sensor is not None:
+        yield Device("light sensor", "light_sensor", *checked.light_sensor)
+    if checked.key_panel is not None:
+        yield Device("key panel", "button_panel", *checked.key_panel)
+
+
+class Trying:
+    """Tests one device after the other, and remembers which relays are open."""
+
+    def __init__(self, checked: Checked, deadline: Deadline) -> None:
+        self._checked = checked
+        self._deadline = deadline
+        self._dark: dict[str, str] = {}
+
+    def each(self, failed: Mapping[str, Notice]) -> Iterator[tuple[Tried, Notice | None]]:
+        """Test every device, except those whose address has ``failed`` already."""
+        for device in devices_of(self._checked):
+            problem = failed.get(device.place)
+            answer = None
+            if problem is None:
+                try:
+                    answer = self._asked(device)
+                except DeviceError as error:
+                    problem = Notice.of(error)
+            if problem is not None and device.name in self._dark:
+                problem = Notice.warning(
+                    "mains-off",
+                    f"Projector {device.name} does not answer, and its mains relay {self._dark[device.name]} is open.",
+                    "A run closes it automatically. To test it now, switch the relay on by hand (usbrelay).",
+                )
+            yield Tried(device.name, device.kind, answer), problem and replace(problem, about=device.name)
+
+    def _asked(self, device: Device) -> str:
+        context = open_context(self._checked.stage.folder)
+        until = self._deadline.within(OPEN_S)
+        opened = open_device(device.driver, device.settings, context, until, name=device.title)
+        with contextlib.closing(opened):
+            identity = opened.identity(deadline=self._deadline.within(OPEN_S))
+            says = f"{identity.maker} {identity.model}" + (f", number {identity.serial}" if identity.serial else "")
+            return f"{says}: {self._state(device, opened)}"
+
+    def _state(self, device: Device, opened: object) -> str:
+        until = self._deadline.within(OPEN_S)
+        match device.kind:
+            case "projector":
+                return self._projector(device.name, cast("Projector", opened))
+            case "power_switch":
+                return self._relays(device.name, cast("PowerSwitch", opened))
+            case "douser":
+                return _DOUSER[cast("Douser", opened).closed(deadline=until)]
+            case "light_sensor":
+                return f"{cast('LightSensor', opened).illuminance_lux(deadline=until):.2f} lux"
+            case "button_panel":
+                return f"{cast('ButtonPanel', opened).capabilities.keys} keys"
+        can = cast("Camera", opened).capabilities
+        formats = [word for word, has in (("RAW", can.raw), ("JPEG", can.jpeg)) if has]
+        return f"{' and '.join(formats) or 'no format'}, {len(can.exposures_s)} exposure times"
+
+    def _projector(self, name: str, projector: Projector) -> str:
+        can = projector.capabilities
+        status = projector.status(deadline=self._deadline.within(max(OPEN_S, can.answer_s)))
+        if status.power is Power.FAULT or fatal_faults(status):
+            raise faulty(name, status)
+        hours = "" if status.lamp_hours is None else f", {status.lamp_hours} lamp hours"
+        warned = f", {', '.join(status.faults)}" if status.faults else ""
+        by_hand = "" if can.power else ", must be switched by hand"
+        notices = projector.notices() if isinstance(projector, WatchedProjector) else []
+        return " ".join([f"{status.power.value}{hours}{warned}{by_hand}", *(f"({notice.what})" for notice in notices)])
+
+    def _relays(self, name: str, board: PowerSwitch) -> str:
+        until = self._deadline.within(OPEN_S)
+        closed = [board.state(channel, deadline=until) for channel in range(1, board.channels(deadline=until) + 1)]
+        for table in self._checked.stage.tables.relays:
+            for mains in table.mains if table.name == name else ():
+                if mains.channel <= len(closed) and not closed[mains.channel - 1]:
+                    self._dark.update(dict.fromkeys(mains.feeds, f"{name} {mains.channel}"))
+        return ", ".join(f"relay {n} {'closed' if shut else 'open'}" for n, shut in enumerate(closed, 1))
+
+
+ALL: Final = "all"
+EVERYWHERE: Final = "255.255.255.255"
+PJLINK: Final = 4352
+_SIOCGIFBRDADDR: Final = 0x8919
+_LONGEST: Final = 15
+
+
+def search_address(interface: str) -> str:
+    """The broadcast address of ``interface``, or of all for "all". Raises UsageError("interface-unknown")."""
+    if interface == ALL:
+        return EVERYWHERE
+    names = sorted(name for _, name in socket.if_nameindex())
+    if interface in names and len(interface) <= _LONGEST:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+            try:
+                reply = fcntl.ioctl(any_socket, _SIOCGIFBRDADDR, struct.pack("256s", interface.encode()))
+            except OSError:
+                reply = b""
+        if reply and reply[20:24] != bytes(4):
+            return socket.inet_ntoa(reply[20:24])
+        raise UsageError(
+            "interface-unknown",
+            what=f"The network interface {interface} has no broadcast address.",
+            remedy="Connect it, or name another one.",
+        )
+    raise UsageError(
+        "interface-unknown",
+        what=f"There is no network interface {interface!r}.",
+        remedy=f"Use one of {', '.join(names)}, or {ALL}.",
+    )
+
 
 LONGEST_S: Final = 300.0
 

@@ -1,13 +1,20 @@
-"""The object as a mesh, in the formats of programs for 3D pictures."""
+"""The object as a mesh, in the formats of programs for 3D pictures: glTF, PLY, Blender, USD."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
 
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import View, scene_script, write_glb, write_ply
+from controller.optics.calibrate.values import Pinhole
+from controller.optics.solve.targets.values import srgb_to_linear
 from controller.stage.exchange.content import Content
-from controller.stage.exchange.usd import pose_matrix
 
 MESH, SCRIPT = "object.glb", "scene.py"
 
@@ -49,3 +56,112 @@ def write_blender_folder(content: Content, folder: Path) -> dict[str, int]:
 
 def _figures(content: Content) -> dict[str, int]:
     return {"vertices": len(content.mesh.vertices_m), "triangles": len(content.mesh.triangles)}
+
+
+FLIP: Final = np.diag([1.0, -1.0, -1.0])
+"""From our frame (y down, z forward) to that of USD and glTF (y up, cameras look along -z), and back."""
+APERTURE_MM: Final = 36.0
+"""Only the ratio of focal length and aperture counts."""
+
+
+def pose_matrix(own: Pinhole) -> npt.NDArray[np.float64]:
+    """(4, 4): from the frame of a USD or glTF camera to the world, for columns."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = FLIP @ own.rotation.T @ FLIP
+    matrix[:3, 3] = FLIP @ (-own.rotation.T @ own.translation_m)
+    return matrix
+
+
+def write_usd(content: Content, path: Path) -> dict[str, int]:
+    """Write a mesh with normals, texture coordinates and colours, and one Camera for each view; metres, y up.
+
+    A Camera of USD has no lens distortion: ``velatura:distortion`` holds k1 and k2, and a rendering has to be bent.
+
+    Raises WorkError("no-space", "cannot-write").
+    """
+    mesh = content.mesh
+    parts = [_HEAD, *_mesh(content)]
+    for n, (name, own) in enumerate(content.views):
+        parts += _camera("Camera" if n == 0 else f"Projector_{n}", name, own)
+    write_atomically(path, ("\n".join([*parts, "}"]) + "\n").encode())
+    return {"vertices": len(mesh.vertices_m), "triangles": len(mesh.triangles)}
+
+
+_HEAD: Final = """#usda 1.0
+(
+    defaultPrim = "Stage"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "Stage" (
+    kind = "component"
+)
+{"""
+
+
+def _mesh(content: Content) -> list[str]:
+    mesh = content.mesh
+    flip = np.diag(FLIP).astype(np.float32)
+    vertices = mesh.vertices_m * flip
+    width, height = content.geometry.camera.size_px
+    across = (mesh.camera_px.astype(np.float64) + 0.5) / (width, height)
+    extent = np.stack([vertices.min(axis=0), vertices.max(axis=0)]) if len(vertices) else np.zeros((2, 3))
+    lines = [
+        '    def Mesh "Object"',
+        "    {",
+        "        bool doubleSided = 1",
+        f"        float3[] extent = {_tuples(extent)}",
+        f"        int[] faceVertexCounts = [{', '.join(['3'] * len(mesh.triangles))}]",
+        f"        int[] faceVertexIndices = [{', '.join(map(str, mesh.triangles.ravel().tolist()))}]",
+        f"        normal3f[] normals = {_tuples(mesh.normals * flip)} (",
+        '            interpolation = "vertex"',
+        "        )",
+        f"        point3f[] points = {_tuples(vertices)}",
+        f"        texCoord2f[] primvars:st = {_tuples(np.stack([across[:, 0], 1 - across[:, 1]], axis=1))} (",
+        '            interpolation = "vertex"',
+        "        )",
+    ]
+    if content.colours is not None:
+        lines += [
+            f"        color3f[] primvars:displayColor = {_tuples(srgb_to_linear(content.colours))} (",
+            '            interpolation = "vertex"',
+            "        )",
+        ]
+    return [*lines, '        uniform token subdivisionScheme = "none"', "    }"]
+
+
+def _camera(prim: str, name: str, own: Pinhole) -> list[str]:
+    """The focal length, and the picture's window on the plane at that distance, shifted by the principal point."""
+    width, height = own.size_px
+    focal_x, focal_y = float(own.matrix[0, 0]), float(own.matrix[1, 1])
+    focal = APERTURE_MM * focal_x / width
+    shift_x = focal * (width / 2 - 0.5 - float(own.matrix[0, 2])) / focal_x
+    shift_y = focal * (float(own.matrix[1, 2]) + 0.5 - height / 2) / focal_y
+    rows = ", ".join(_tuple(row) for row in pose_matrix(own).T.tolist())
+    return [
+        "",
+        f'    def Camera "{prim}"',
+        "    {",
+        "        float2 clippingRange = (0.01, 100)",
+        f"        float focalLength = {focal:.9g}",
+        f"        float horizontalAperture = {APERTURE_MM:.9g}",
+        f"        float horizontalApertureOffset = {shift_x:.9g}",
+        '        token projection = "perspective"',
+        f"        float verticalAperture = {focal * height / focal_y:.9g}",
+        f"        float verticalApertureOffset = {shift_y:.9g}",
+        f"        custom double2 velatura:distortion = {_tuple(own.distortion[:2].tolist())}",
+        f"        custom string velatura:name = {json.dumps(name, ensure_ascii=False)}",
+        f"        custom int2 velatura:size = ({width}, {height})",
+        f"        matrix4d xformOp:transform = ( {rows} )",
+        '        uniform token[] xformOpOrder = ["xformOp:transform"]',
+        "    }",
+    ]
+
+
+def _tuples(values: npt.NDArray[Any]) -> str:
+    return "[" + ", ".join("(" + ", ".join(f"{one:.9g}" for one in row) + ")" for row in values.tolist()) + "]"
+
+
+def _tuple(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{one:.17g}" for one in values) + ")"

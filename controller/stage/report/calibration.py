@@ -37,8 +37,7 @@ from controller.stage.artefacts.grade import (
 from controller.stage.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.stage.report import plots
-from controller.stage.report.causes import causes_gallery
-from controller.stage.report.light import light_gallery, whites
+from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.stage.report.pictures import Crop, crop_around, fitted, to_screen
 from controller.stage.report.words import When, moment, spent

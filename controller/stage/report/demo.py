@@ -23,8 +23,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.stage.artefacts.published import BundleFigures, has_photograph, read_photograph_of, read_playback
 from controller.stage.artefacts.solved import Solved, is_solved, read_base_figures, read_solved
-from controller.stage.report.causes import causes_gallery
-from controller.stage.report.light import light_gallery, whites
+from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.one_projector import OneProjector, as_figures, as_rows, one_projector
 from controller.stage.report.one_projector import goals as one_projector_goals
 from controller.stage.report.page import Goal, Page, PictureRow, ReportPicture, judged_rows, refined_row, write_report

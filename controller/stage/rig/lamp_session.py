@@ -12,8 +12,7 @@ from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId
-from controller.stage.rig.mains_relays import open_circuits
-from controller.stage.rig.power import BY_HAND_S, light, power_down, steady
+from controller.stage.rig.power import BY_HAND_S, light, open_circuits, power_down, steady
 from controller.stage.rig.rig import Rig
 from hal.errors import DeviceError
 from hal.notices import Level

@@ -12,9 +12,8 @@ from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.optics.capture.acquire import Acquirer
 from controller.stage.rig.ambient_light import AmbientLightLimit
-from controller.stage.rig.lamp_faults import START_AGAIN, faulty
-from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit
+from controller.stage.rig.lamp_guard import START_AGAIN, LampGuard, faulty
+from controller.stage.rig.power import Circuit
 from hal.deadline import Deadline
 from hal.errors import DeviceRefused
 from hal.interfaces import BundleDisplay, Camera, Display

@@ -37,14 +37,13 @@ from controller.stage.sessions.session import StageSession
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.cluster_solve import answering_on
 from controller.stage.steps.appearance.publishing import publish_step
-from controller.stage.steps.appearance.rendering import scene_request
-from controller.stage.steps.appearance.requests import requests_of
+from controller.stage.steps.appearance.requests import requests_of, scene_request
 from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.stage.steps.calibrate.dots import dot_steps
 from controller.stage.steps.calibrate.full import calibration_steps
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
 from controller.stage.steps.calibrate.grade import verify_step
-from controller.stage.steps.capture.device_checks import device_checks
+from controller.stage.steps.capture.camera import device_checks
 from controller.stage.steps.modes import DotOptions, dot_options
 from hal.deadline import in_seconds
 from hal.notices import Level

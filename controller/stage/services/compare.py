@@ -20,9 +20,8 @@ from controller.stage.report.comparison import picture_steps, write_comparison_r
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import finished_calibrations, stage_trust
-from controller.stage.sessions.check import Checked, check_stage
+from controller.stage.sessions.check import Checked, check_stage, time_zone
 from controller.stage.sessions.session import StageSession
-from controller.stage.sessions.time_zone import time_zone
 from controller.stage.steps.appearance.compare import compare_steps
 from hal.notices import Level
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,27 +17,33 @@ from controller.bundle.install import CURRENT, current
 from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
 from controller.core.arrays import FloatImage
-from controller.core.errors import BundleError
+from controller.core.errors import BundleError, UsageError
 from controller.core.storage import runtime_folder
 from controller.optics.solve.reach.feasibility import exposure
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.play.frames import FrameFile, FrameSet, OutputSize
-from controller.play.live_stream import TARGET
+from controller.play.live_stream import SILENT_S, TARGET, LiveFile
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.live.readers import open_stream
-from controller.stage.live.sources import LiveSource, open_source
-from controller.stage.live.streams import StreamSource, is_stream, without_password
+from controller.stage.live import (
+    LivePicture,
+    LiveSource,
+    StreamSource,
+    is_stream,
+    open_source,
+    open_stream,
+    without_password,
+)
 from controller.stage.rig.rig import Rig
-from controller.stage.services.live_frame_file import FileSource, holds_frames
 from controller.stage.sessions.calibrations import stage_trust, usable_calibration
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.session import StageSession
 from controller.stage.steps.appearance.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
 from controller.stage.steps.appearance.live_parts import live_maps, target_px
+from hal.codecs.player import MAGIC
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.notices import Level
@@ -294,3 +301,50 @@ def feed(
 
 def _target_writer(file: FrameFile) -> Callable[[Frames], object]:
     return lambda frames: file.write(FrameSet(tuple(frames)))
+
+
+def holds_frames(path: Path) -> bool:
+    """Whether ``path`` is a frame file."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+class FileSource:
+    """The newest picture that another process wrote there; see ``controller.stage.live.LiveSource``."""
+
+    def __init__(self, path: Path, size: OutputSize) -> None:
+        """Raises UsageError("live-file-unfit"), naming both sizes."""
+        self._path, self._file = path, LiveFile(path, [size])
+        self._set = FrameSet.black([size])
+        self._number = 0
+        self._heard_s = time.monotonic()
+        self._told_gone = False
+
+    def next(self, at_s: float) -> LivePicture | None:
+        """See ``LiveSource``. Raises UsageError("live-source-gone") once when the writer ended; it may come back."""
+        if self._file.newest(self._set) is not None:
+            self._heard_s, self._told_gone = time.monotonic(), False
+            self._number += 1
+            return LivePicture(self._set.pixels[0], self._number - 1, 0)
+        if time.monotonic() - self._heard_s > SILENT_S:
+            self._heard_s = time.monotonic()
+            self._file = self._file.reopened() or self._file
+            if not self._file.has_writer() and not self._told_gone:
+                self._told_gone = True
+                raise UsageError(
+                    "live-source-gone",
+                    what=f"The source of {self._path} has ended. The last picture stays.",
+                    remedy="Restart the source; playback resumes.",
+                )
+        return None
+
+    @property
+    def ended(self) -> bool:
+        """False: a writer may come back at any time."""
+        return False
+
+    def close(self) -> None:
+        """Release the mapping."""
+        self._file.close()

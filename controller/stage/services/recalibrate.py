@@ -30,8 +30,7 @@ from controller.stage.steps.calibrate.dots import dot_steps
 from controller.stage.steps.calibrate.drift import drift_steps
 from controller.stage.steps.calibrate.full import calibration_steps
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
-from controller.stage.steps.calibrate.quick import quick_steps
-from controller.stage.steps.calibrate.single_projector import one_projector_steps
+from controller.stage.steps.calibrate.quick import one_projector_steps, quick_steps
 from controller.stage.steps.modes import MODES, CalibrationMode, DotOptions
 from hal.notices import Level
 

@@ -10,8 +10,7 @@ from controller.stage.artefacts.comparison import COMPARE
 from controller.stage.artefacts.names import REPORT_FIGURES, run_kind
 from controller.stage.report.calibration import StageDescription, graded_runs, write_calibration_report
 from controller.stage.sessions.calibrations import worst_grade
-from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.time_zone import time_zone
+from controller.stage.sessions.check import Checked, check_stage, time_zone
 
 
 def report_of(where: Path, out: Path | None) -> Mapping[str, str]:

@@ -1,16 +1,20 @@
-"""Checks every key of stage.toml, including the drivers' keys, before a device is opened."""
+"""Checks every key of stage.toml, including the drivers' keys, before a device is opened; and the stage's time zone."""
 
 from __future__ import annotations
 
+import tomllib
+import zoneinfo
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import tzinfo
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from controller.config import Stage, check_driver_settings, load_stage
 from controller.config.models import CameraTable, OpenConfigTable
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
+from controller.core.files import read_text
 from hal.errors import DeviceError, DriverFault, PluginError
 from hal.registry import Driver, Drivers, OpenContext, check_device, load_drivers
 
@@ -130,3 +134,23 @@ def mistake_in(table: OpenConfigTable, settings: Mapping[str, Any], error: Devic
     named = (key for key, value in settings.items() if f"'{key}'" in error.what or f"'{value}'" in error.what)
     line = place.line(next(named, None))
     return UsageError(error.code, what=f"{place.file}, line {line}: {error.what}", remedy=error.remedy)
+
+
+PANELS_FILE: Final = "schedule.toml"
+"""Written by the panel; it replaces the table [schedule] of stage.toml."""
+
+
+def time_zone(checked: Checked) -> tzinfo | None:
+    """None, for the computer's own, on a stage that has no opening hours and names no zone, or one that is unknown."""
+    table = checked.stage.tables.schedule
+    named = table.time_zone if table.hours or table.time_zone != "UTC" else ""
+    file = checked.stage.folder / PANELS_FILE
+    if file.exists():
+        try:
+            named = str(tomllib.loads(read_text(file)).get("time_zone", named))
+        except (UsageError, ValueError, OSError):
+            return None
+    try:
+        return zoneinfo.ZoneInfo(named) if named else None
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
+        return None

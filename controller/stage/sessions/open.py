@@ -17,14 +17,13 @@ from controller.core import kiosk_places
 from controller.optics.capture.acquire import Acquirer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
 from controller.stage.rig.ambient_light import AmbientLightLimit
-from controller.stage.rig.doused import DousedProjector
+from controller.stage.rig.douser import ProjectorWithDouser
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile
-from controller.stage.rig.mains_relays import Circuit, close_circuits
+from controller.stage.rig.power import Circuit, close_circuits
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.sessions.check import Checked, mistake_in
-from controller.stage.sessions.recording import open_context
-from controller.stage.sessions.run import used_runtime_folder
+from controller.stage.sessions.run import open_context, used_runtime_folder
 from hal import registry
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, PluginError
@@ -94,7 +93,7 @@ def open_projector(checked: Checked, number: int, context: OpenContext, deadline
     def open_douser(until: Deadline) -> Douser:
         return cast("Douser", open_device(place, its_driver, its_settings, context, until))
 
-    return DousedProjector(table.name, projector, open_douser)
+    return ProjectorWithDouser(table.name, projector, open_douser)
 
 
 def mains_circuits(

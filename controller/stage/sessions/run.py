@@ -1,21 +1,27 @@
-"""Shared by every run on a stage: the stage's lock, the run's folder, marker steps."""
+"""Shared by every run on a stage: the stage's lock, the run's folder, marker steps, and the tape if one is recorded."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import os
 import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from controller.core import kiosk_places
+from controller.core.errors import WorkError
 from controller.core.storage import exclusive, runtime_folder, runtime_path
 from controller.play.control.launch import LOG_NAME
 from controller.run.journal import Journal
 from controller.run.runner import Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
+from hal.registry import OpenContext
 from hal.runtime.caches import in_use
+from hal.tape import Tape
 
 LONGEST_RUN_S = 12 * 3600.0
 LOCK = "run/lock"
@@ -74,3 +80,47 @@ def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
             break
     stamp = time.strftime("%Y%m%d-%H%M%S")
     return runs / f"{stamp}-{name}"
+
+
+VARIABLE: Final = "VELATURA_TAPE"
+"""Environment variable with the file of the tape."""
+FOLDER: Final = "tapes"
+
+
+def open_context(stage: Path, *, runtime: Path | None = None) -> OpenContext:
+    """What drivers get to open the devices of ``stage``. Raises WorkError("tape-not-made")."""
+    return OpenContext(stage=stage, runtime=runtime, tape=_tape())
+
+
+def new_tape(stage: Path, name: str) -> Path:
+    """A file for a new tape of ``stage``; its folder is made. Raises WorkError("tape-not-made")."""
+    try:
+        (stage / FOLDER).mkdir(exist_ok=True)
+    except OSError as error:
+        raise _not_made(stage / FOLDER, error) from error
+    return stage / FOLDER / f"{name}.tape"
+
+
+def tapes(stage: Path) -> list[Path]:
+    """The tapes of ``stage``, oldest first."""
+    return sorted((stage / FOLDER).glob("*.tape"), key=lambda path: path.stat().st_mtime)
+
+
+@functools.cache
+def _tape() -> Tape | None:
+    # Taken out of the environment: a process that this one starts must not write into the same file.
+    path = os.environ.pop(VARIABLE, "")
+    if not path:
+        return None
+    try:
+        return Tape(Path(path))
+    except OSError as error:
+        raise _not_made(Path(path), error) from error
+
+
+def _not_made(path: Path, error: OSError) -> WorkError:
+    return WorkError(
+        "tape-not-made",
+        what=f"The tape {path} can't be written: {error.strerror}.",
+        remedy="Give another file with --out, or check the permissions of its folder.",
+    )

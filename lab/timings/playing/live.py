@@ -31,7 +31,7 @@ from controller.optics.solve.targets.values import linear_to_srgb
 from controller.optics.transport import LightTransport, build_transport
 from controller.play.control.launch import PlayerSettings, start_player
 from controller.play.frames import FrameFile, FrameSet, OutputSize
-from controller.stage.live.sources import LivePicture, LiveSource, VideoSource
+from controller.stage.live import LivePicture, LiveSource, VideoSource
 from controller.stage.steps.appearance.live import FrameMaker, run_live
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
@@ -225,7 +225,7 @@ class _Pictures:
         self._number = -1
 
     def next(self, at_s: float) -> LivePicture | None:
-        """See ``controller.stage.live.sources.LiveSource``."""
+        """See ``controller.stage.live.LiveSource``."""
         self._number += 1
         return LivePicture(self._targets[self._number % DIFFERENT], self._number, 0)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import WorkError
-from controller.stage.sessions import recording
+from controller.stage.sessions import run as recording
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.tape import read_tape
@@ -24,7 +24,7 @@ from plugins.projectors.pjlink import open_pjlink_projector
 OPENS = """
 import sys
 from pathlib import Path
-from controller.stage.sessions.recording import open_context
+from controller.stage.sessions.run import open_context
 from hal.deadline import in_seconds
 from plugins.projectors.pjlink import open_pjlink_projector
 driver = open_pjlink_projector({"address": sys.argv[1]}, open_context(Path()), in_seconds(20))

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sacn import DataPacket, sACNreceiver
 
-from controller.stage.rig.doused import DousedProjector
+from controller.stage.rig.douser import ProjectorWithDouser
 from hal.conformance import DouserConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError
@@ -246,7 +246,7 @@ class TestBeforeAProjector:
         pair = open_serial()
         lamp = pair.emulator.lamp
         with node_of(truth(), lamps={"left": lamp}) as (node, told):
-            made = DousedProjector("left", pair.driver, lambda deadline: douser_at(node.address))
+            made = ProjectorWithDouser("left", pair.driver, lambda deadline: douser_at(node.address))
             yield made, lamp, told
             made.close()
 
@@ -281,7 +281,7 @@ def test_a_douser_that_fails_strikes_no_lamp_and_keeps_none_lit(open_serial: Any
     pair = open_serial()
     lamp = pair.emulator.lamp
     with kept_port() as port:
-        projector = DousedProjector("left", pair.driver, lambda deadline: douser_at(f"127.0.0.1:{port}"))
+        projector = ProjectorWithDouser("left", pair.driver, lambda deadline: douser_at(f"127.0.0.1:{port}"))
         with pytest.raises(DeviceGone):
             projector.switch_on(deadline=in_seconds(SOON))
         assert lamp.strikes == 0
@@ -301,7 +301,7 @@ def test_a_driver_that_does_not_open_strikes_no_lamp(open_serial: Any) -> None:
     def refused(deadline: object) -> Douser:
         raise DeviceRefused("made-up", what="It is locked.", remedy="Unlock it.")
 
-    projector = DousedProjector("left", pair.driver, refused)
+    projector = ProjectorWithDouser("left", pair.driver, refused)
     assert projector.status(deadline=in_seconds(SOON)).power is Power.OFF
     assert projector.notices() == [Notice.warning("made-up", "The douser of projector left fails: It is locked.")]
     with pytest.raises(DeviceRefused, match="locked"):

@@ -17,7 +17,7 @@ from pymodbus.datastore import ModbusDeviceContext, ModbusSequentialDataBlock, M
 from pymodbus.server import ModbusTcpServer
 
 from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit, close_circuits, open_circuits
+from controller.stage.rig.power import Circuit, close_circuits, open_circuits
 from hal.conformance import PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout

@@ -11,8 +11,7 @@ import pytest
 import serial
 
 from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit, close_circuits, open_circuits
-from controller.stage.rig.power import light, power_down
+from controller.stage.rig.power import Circuit, close_circuits, light, open_circuits, power_down
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.registry import OpenContext

@@ -1,17 +1,41 @@
-"""Solves a run's appearances on other machines; each is still its own step."""
+"""Solves a run's appearances on other machines; each is still its own step. A worker gets the stage once."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from controller.optics.solve.request import AppearanceResult, SolveOptions
+from controller.optics.solve.targets.values import Target
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.cluster.appearances import SpreadAppearances
-from controller.stage.cluster.connect import Cluster, connected
-from controller.stage.cluster.tasks import StageData
+from controller.stage.cluster import Cluster, StageData, Task, connected, make_there
 from controller.stage.steps.appearance.solving import Answering, AppearanceRequest
+
+
+class SpreadAppearances:
+    """Starts appearances elsewhere, and gives their results by name."""
+
+    def __init__(self, cluster: Cluster, stage: StageData) -> None:
+        key = f"velatura-stage-{stage.digest()}"
+        self._key, self._cluster = key, cluster
+        self._stage = cluster.share(key, stage)
+        self._begun: dict[str, Task[AppearanceResult]] = {}
+
+    def begin(self, name: str, asked: Target, options: SolveOptions) -> None:
+        """Start an appearance, unless it was started already."""
+        if name not in self._begun:
+            self._begun[name] = self._cluster.submit(make_there, self._stage, self._key, asked, options)
+
+    def answer(self, name: str, check: Callable[[], None]) -> AppearanceResult:
+        """The result of a started one; errors as ``solve.request.solve_appearance`` and ``Task.result``."""
+        return self._begun.pop(name).result(check)
+
+    def cancel(self) -> None:
+        """Cancel all that were started and not fetched."""
+        for task in self._begun.values():
+            task.cancel()
+        self._begun.clear()
 
 
 class ClusterSolve:

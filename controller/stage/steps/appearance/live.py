@@ -14,7 +14,7 @@ import numpy as np
 from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.optics.solve.scaling.interactive import Interactive
-from controller.stage.live.sources import LivePicture, LiveSource, fitted
+from controller.stage.live import LivePicture, LiveSource, fitted
 
 IDLE_S: Final = 0.002
 REPORT_EVERY_S: Final = 1.0

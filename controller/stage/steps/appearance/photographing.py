@@ -1,16 +1,28 @@
-"""Steps with the installed appearances: photograph each of them, and swap them at the display's rate."""
+"""Steps with the installed appearances: photograph each of them, and swap them at the display's rate.
+
+Two exposure times, a long and a short one, are chosen for the results, and give one picture.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
+from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.core import channels
+from controller.core.arrays import Float64, FloatImage
 from controller.optics.capture.brackets import merge_brackets
-from controller.optics.capture.profile import load_profile
+from controller.optics.capture.demosaic import SensorLevels
+from controller.optics.capture.linearity import RawExposure, exposure_ratio
+from controller.optics.capture.profile import CameraProfile, load_profile
+from controller.optics.capture.raw import is_jpeg, read_mosaic
+from controller.optics.solve.result.refinement import FLOOR
 from controller.run.runner import Context, Step
 from controller.run.step_id import ShotId, StepId
 from controller.stage.artefacts.kinds import StepKind
@@ -19,9 +31,129 @@ from controller.stage.artefacts.published import write_photograph, write_playbac
 from controller.stage.artefacts.solved import read_solved
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
-from controller.stage.steps.appearance.exposure_times import speeds, timed
+from controller.stage.steps.capture.exposure import bracket
 from controller.stage.steps.capture.photographs import photograph_series, take_photograph
 from hal.deadline import Deadline
+
+WANTED: Final = (0.7, 5.0)
+"""Exposures of an appearance's photograph, relative to the one at which its target's white reaches full scale."""
+BRIGHTEST_PERCENTILE: Final = 99.9
+CLIPPED: Final = 0.9
+"""Of full scale: what is expected to be brighter may clip."""
+DARKEST: Final = 1e-6
+"""Full scales per second: what has less light gets the longest exposure."""
+LEAST_CERTAINTY: Final = 1e-30
+SAMPLES: Final = 20_000
+LONG: Final = 2.2, 9.0
+"""In the same unit: a known exposure is taken for the longer photograph. With less, white's half is missing in it, and
+with more hardly anything is well exposed in both."""
+
+
+def speeds(
+    white: float,
+    available_s: Sequence[float],
+    longest_s: float,
+    profile: CameraProfile | None,
+    *,
+    light: FloatImage | None = None,
+    shorter: int = 1,
+) -> list[float]:
+    """Exposures for what has ``white`` in full scales per second, rising: those ``WANTED``, the longer one known.
+
+    With ``light``, about what is shown, the longer one is that with which all of them together have least noise: as
+    short as the first where all of the light is about as bright.
+
+    Parameters
+    ----------
+    profile : of the camera; without corrections in it, its exposures are what it says
+    light : (pixels, 3) in full scales per second
+    shorter : so many photographs have the first exposure
+    """
+    found = bracket(1 / white, WANTED, available_s, longest_s)
+    known = _known(white, available_s, longest_s, profile)
+    if light is not None and len(light):
+        longer = [value for value in available_s if found[0] <= value <= min(LONG[1] / white, longest_s)]
+        noise = _Noise(light, found[0], shorter, white, profile)
+        return [found[0], min(known or longer or found[:1], key=noise.with_longer)]
+    if not known or len(found) < 2:
+        return found
+    return [found[0], min(known, key=lambda value: abs(math.log(value * white / WANTED[1])))]
+
+
+def brightest(light: FloatImage) -> float:
+    """What a photograph of ``light`` (pixels, 3) must not clip, in full scales per second, above 0."""
+    return max(float(np.percentile(channels.largest(light), BRIGHTEST_PERCENTILE)), DARKEST)
+
+
+class _Noise:
+    """The noise of ``light`` in ``shorter`` photographs of ``short_s`` and a longer one, of light and white."""
+
+    def __init__(
+        self, light: FloatImage, short_s: float, shorter: int, white: float, profile: CameraProfile | None
+    ) -> None:
+        self._light = np.maximum(light[:: max(1, len(light) // SAMPLES)].astype(np.float64), 0)
+        self._noise = (profile or CameraProfile()).noise
+        self._counted_over = self._light + FLOOR * white
+        self._short = shorter * self._certainty(short_s)
+
+    def _certainty(self, exposure_s: float) -> Float64:
+        noise = self._noise.per_second(exposure_s)
+        measured = exposure_s * self._light < CLIPPED
+        return np.asarray(np.where(measured, 1 / (noise.shot * self._light + noise.read**2), 0))
+
+    def with_longer(self, exposure_s: float) -> float:
+        certainty = np.maximum(self._short + self._certainty(exposure_s), LEAST_CERTAINTY)
+        return float(np.mean(1 / (np.sqrt(certainty) * self._counted_over)))
+
+
+def _known(white: float, available_s: Sequence[float], longest_s: float, profile: CameraProfile | None) -> list[float]:
+    """Exposures whose true times a camera's corrections have, and that suit the longer photograph."""
+    if profile is None or not len(profile.exposures):
+        return []
+    low, high = (factor / white for factor in LONG)
+    return [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
+
+
+def timed(taken: Sequence[Taken]) -> list[Taken]:
+    """Photographs of one picture with their true exposures: those that are not known, by those that are.
+
+    ``taken`` have the exposures of their ``profile`` where it knows them. Where no two overlap, nothing is changed.
+    """
+    profile = taken[0].profile if taken else None
+    if profile is None or not len(profile.exposures) or is_jpeg(taken[0].path):
+        return list(taken)
+    true = {float(value) for value in profile.exposures[:, 1]}
+    known = [one for one in taken if _listed(one.exposure_s, true)]
+    if not known or len(known) == len(taken):
+        return list(taken)
+    sure = max(known, key=lambda one: one.exposure_s)
+    times: dict[float, list[float]] = {}
+    for one in taken:
+        if not _listed(one.exposure_s, true):
+            times.setdefault(one.exposure_s, []).append(_measured_s(one, sure, profile))
+    return [replace(one, exposure_s=fmean(times[one.exposure_s])) if one.exposure_s in times else one for one in taken]
+
+
+def _measured_s(one: Taken, sure: Taken, profile: CameraProfile) -> float:
+    """Its exposure in seconds as the light says, compared with ``sure``."""
+    (shorter, levels), (longer, _) = (
+        _exposed(each, profile) for each in sorted((one, sure), key=lambda each: each.exposure_s)
+    )
+    ratio = exposure_ratio(shorter, longer, levels)
+    return sure.exposure_s / ratio if one.exposure_s < sure.exposure_s else sure.exposure_s * ratio
+
+
+def _exposed(one: Taken, profile: CameraProfile) -> tuple[RawExposure, SensorLevels]:
+    raw = read_mosaic(one.path, profile=profile)
+    return RawExposure(raw.samples, one.exposure_s), raw.levels
+
+
+def _listed(value: float, known: set[float]) -> bool:
+    return any(math.isclose(value, one, rel_tol=1e-6) for one in known)
+
+
+__all__ = ["brightest", "speeds", "timed"]
+
 
 PLAYED = "played"
 """The kind of the photographs of appearances."""

@@ -1,4 +1,4 @@
-"""The step from solved frames to a signed, installed bundle."""
+"""The step from solved frames to a signed, installed bundle, with a small picture of each appearance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
+import cv2
+import numpy as np
+
+from controller.bundle.describe import png
 from controller.bundle.format import Index, PlaylistEntry
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
@@ -16,14 +21,17 @@ from controller.bundle.signing import ANY_SIGNER, Trust, load_signing_key, unsig
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config import load_stage
 from controller.config.loader import FILE
+from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import BundleError
 from controller.core.storage import sha256_of
+from controller.optics.solve.targets.values import linear_to_srgb
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.published import BUNDLE, BundleFigures
+from controller.stage.artefacts.projectors import Light
+from controller.stage.artefacts.published import BUNDLE, BundleFigures, read_thumbnail, write_thumbnail
 from controller.stage.artefacts.solved import is_solved, read_solved
 from hal.notices import Level
 
@@ -201,7 +209,6 @@ def publish_solved(
 def _appearances(
     calibrated: Calibrated, outputs: Outputs, names: Sequence[str], check: Callable[[], None]
 ) -> Iterator[NewAppearance]:
-    from controller.stage.steps.appearance.thumbnails import Thumbnails
 
     thumbnails = Thumbnails(calibrated)
     for name in names:
@@ -224,3 +231,49 @@ def created_unix_s(run: Path) -> int:
         return max(0, int(time.mktime(time.strptime(run.name[:15], "%Y%m%d-%H%M%S"))))
     except (ValueError, OverflowError):
         return 0
+
+
+LONGEST_PX: Final = 160
+_XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+"""IEC 61966-2-1, linear part."""
+
+
+class Thumbnails:
+    """Makes the thumbnails of a run's appearances, and keeps them in the run's folder until they are solved again.
+
+    The first thumbnail that is not stored yet needs the light transport of ``calibrated``, whose run it is.
+    """
+
+    def __init__(self, calibrated: Calibrated) -> None:
+        self._calibrated = calibrated
+        self._folder, self._projectors = calibrated.folder, calibrated.projectors
+
+    def of(self, name: str) -> bytes | None:
+        """The PNG file of a solved appearance of the run; None if its calibration is not in the run."""
+        if (kept := read_thumbnail(self._folder, name)) is not None:
+            return kept
+        if not all(Light.path(self._folder, projector).exists() for projector in self._projectors):
+            return None
+        data = self._made(name)
+        write_thumbnail(self._folder, name, data)
+        return data
+
+    def _made(self, name: str) -> bytes:
+        calibration = self._calibrated.calibration
+        solved = read_solved(self._folder, name, self._projectors)
+        seen = self._calibrated.predicted_light([solved.linear[projector] for projector in self._projectors])
+        return png(thumbnail(seen + calibration.black, calibration.camera_to_xyz, white=solved.exposure))
+
+
+def thumbnail(picture: FloatImage, camera_to_xyz: Float64, *, white: float) -> ByteImage:
+    """A linear camera picture (rows, columns, 3) as sRGB of at most ``LONGEST_PX`` per side.
+
+    ``white``: the camera value for the screen's white; ``camera_to_xyz`` (3, 3): equal values are D65 grey.
+    """
+    rows, columns = picture.shape[:2]
+    part = min(1.0, LONGEST_PX / max(rows, columns))
+    size = max(1, round(columns * part)), max(1, round(rows * part))
+    small = np.asarray(cv2.resize(np.nan_to_num(picture), size, interpolation=cv2.INTER_AREA), np.float32)
+    matrix = _XYZ_TO_SRGB @ camera_to_xyz
+    matrix = (matrix / matrix.sum(axis=1, keepdims=True)).astype(np.float32)
+    return np.asarray(np.rint(255 * linear_to_srgb(small @ matrix.T / np.float32(white))), np.uint8)

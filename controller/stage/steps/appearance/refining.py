@@ -1,10 +1,10 @@
-"""The steps that photograph solved frames, correct them by the photograph, and keep the better ones."""
+"""The steps that photograph solved frames, correct them, keep the better ones, and say what limits the result."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from controller.optics.capture.profile import load_profile
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, refine_peak_bytes, stage_size
-from controller.optics.solve.result.common_causes import equations
+from controller.optics.solve.result.common_causes import Cause, CommonCauses, common_causes, equations
 from controller.optics.solve.result.refinement import (
     ModelError,
     PhotographedError,
@@ -38,12 +38,10 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import IndirectFigures
-from controller.stage.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_refined
+from controller.stage.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_causes, write_refined
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
-from controller.stage.steps.appearance.causes import causes_step
-from controller.stage.steps.appearance.exposure_times import brightest, speeds
-from controller.stage.steps.appearance.photographing import take_bracket
+from controller.stage.steps.appearance.photographing import brightest, speeds, take_bracket
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.capture.photographs import frames_digest
 from hal.notices import Level
@@ -294,3 +292,80 @@ def sentence(name: str, figures: Mapping[str, Any]) -> str:
 
 
 __all__ = ["RefineOptions", "refine_steps", "sentence"]
+
+
+def causes_step(calibrated: Calibrated, names: Sequence[str], photographs: int, *, after: Sequence[StepId]) -> Step:
+    """After the refining of these appearances, by at most so many photographs each."""
+    return Step(
+        StepId(StepKind.CAUSES),
+        partial(_look, calibrated, tuple(names), photographs),
+        after=tuple(after),
+        title="Looking for common causes of the errors",
+        weight=0.1,
+    )
+
+
+def _look(calibrated: Calibrated, names: Sequence[str], photographs: int, context: Context) -> Sequence[Path]:
+    left = [Refining.read(context.folder, name, photographs, calibrated.projectors).equations for name in names]
+    found = [one for one in left if one is not None]
+    causes = common_causes(found, len(calibrated.projectors)) if len(found) > 1 else CommonCauses((), 0.0)
+    lines = sentences(causes, calibrated.projectors)
+    for text in lines:
+        context.reporter.say(text, Level.WARNING)
+    rows = [
+        {**asdict(cause), "projector": None if cause.projector is None else calibrated.projectors[cause.projector]}
+        for cause in causes.causes
+    ]
+    return [write_causes(context.folder, {"share": causes.share, "causes": rows, "sentences": lines})]
+
+
+def sentences(found: CommonCauses, projectors: Sequence[str]) -> list[str]:
+    """For people: each cause with how to correct the calibration; nothing where there is none."""
+    if not found.causes:
+        return []
+    lines = [f"The appearances have {100 * found.share:.0f} % of their error (squared) in common."]
+    for n, name in enumerate(projectors):
+        of = [cause for cause in found.causes if cause.projector == n]
+        colours = [cause for cause in of if cause.kind == "brightness"]
+        if colours:
+            lines.append(
+                f"Projector {name} is not as bright as calibrated: {_by_colour(colours)}. `velatura calibrate STAGE "
+                "--quick` measures it again."
+            )
+        lines += [
+            f"The response of projector {name} has changed (exponents {100 * cause.amount:+.0f} %). See whether its "
+            f"picture mode was changed, or run `velatura calibrate STAGE --projector {name}`."
+            for cause in of
+            if cause.kind == "response"
+        ]
+    return lines + _of_all(found.causes)
+
+
+def _of_all(causes: Sequence[Cause]) -> list[str]:
+    lines = []
+    for cause in causes:
+        if cause.kind == "indirect":
+            more = (
+                "comes back from the object and the room" if cause.amount > 0 else "no longer comes back from the room"
+            )
+            lines.append(
+                f"{100 * abs(cause.amount):.0f} % of the projectors' light {more}. Cover pale surfaces; photographs of "
+                "the results correct the rest."
+            )
+        elif cause.kind == "focus":
+            sharper = "less sharp" if cause.amount > 0 else "sharper"
+            lines.append(
+                f"The pictures are {sharper} than when they were calibrated. Check the focus of projectors and camera, "
+                "then run `velatura calibrate STAGE`."
+            )
+    ambient = [cause for cause in causes if cause.kind == "ambient"]
+    if ambient:
+        lines.append(
+            f"The light in the room has changed, in parts of the projectors' light: {_by_colour(ambient)}. Make the "
+            "room as dark as it was, or run `velatura calibrate STAGE`."
+        )
+    return lines
+
+
+def _by_colour(causes: Sequence[Cause]) -> str:
+    return ", ".join(f"{cause.colour} {100 * cause.amount:+.1f} %" for cause in causes)

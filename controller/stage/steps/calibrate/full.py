@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, astuple
 from pathlib import Path
+from typing import Final
 
+import cv2
 import numpy as np
 
+from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, TroubleCode
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.colour_alignment import (
@@ -23,8 +26,13 @@ from controller.optics.calibrate.geometry.lenses import bent
 from controller.optics.calibrate.geometry.self_calibration import reconstruct
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels
+from controller.optics.calibrate.photometry.glare import spread_by_lens
+from controller.optics.calibrate.photometry.projector_glare import DarkPart, lens_veils, projector_glare
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry, white_segment
+from controller.optics.calibrate.values import Geometry
+from controller.optics.capture.pattern_frames import frame
 from controller.optics.capture.raw import CAMERA_BLUR_PX
+from controller.optics.transport.indirect.stripes import stride_of, stripe_parts, thinned
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
@@ -36,7 +44,6 @@ from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels, w
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.calibrate.indirect import indirect_step
-from controller.stage.steps.calibrate.projector_glare import lens_troubles
 from controller.stage.steps.capture.camera import camera_step
 from controller.stage.steps.capture.patterns import capture_steps, code_step, light_step
 from controller.stage.steps.troubles import tell, tell_all
@@ -199,3 +206,42 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
             troubles.append(Notice.warning(TroubleCode.LENS_DISTORTION, text, about=name))
     said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
     return [*write_geometry(context.folder, names, found), said]
+
+
+COARSE_BITS: Final = 4
+"""Of each axis of the code; finer stripes leave few places dark."""
+
+
+def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry: Geometry) -> list[Notice]:
+    """A trouble for each projector that has a veil; none where the code was shown in colours, or not at all."""
+    stride = stride_of(geometry.points_m.shape)
+    lights = [Light.read(context.folder, projector.name) for projector in projectors]
+    whites = [thinned(light.white, stride) for light in lights]
+    depth_m = np.ascontiguousarray(geometry.points_m[::stride, ::stride, 2])
+    found = []
+    for n, projector in enumerate(projectors):
+        parts = list(_dark_parts(context, projector, thinned(lights[n].black, stride), stride))
+        glare = projector_glare(whites, n, parts, depth_m)
+        if (said := lens_veils(projector.name, glare.sure)) is not None:
+            found.append(Notice.warning(TroubleCode.PROJECTOR_GLARE, said, about=projector.name))
+    return found
+
+
+def _dark_parts(context: Context, projector: RigProjector, black: FloatImage, stride: int) -> Iterator[DarkPart]:
+    known = Pixels.read(context.folder, projector.name).phase_map
+    plan = PlanUsed.read(context.folder, projector.name).plan(projector.size_px)
+    stripes = [pattern for axis in (0, 1) for pattern in plan.gray(axis)[:COARSE_BITS]]
+    if known is None or not stripes:
+        return
+    captures = Developed(read_captures(context.folder, projector.name), {})
+    position_px = thinned(known.projector_px, stride)
+    at = np.nan_to_num(position_px, nan=-1e4)
+    for pattern in stripes:
+        dark = stripe_parts(pattern, plan.size_px, position_px)[1]
+        spread = spread_by_lens(np.asarray(frame(pattern, plan.size_px), np.float32))
+        veil = cv2.remap(spread, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        light = thinned(captures[pattern.name], stride) - black
+        yield DarkPart(light, dark, np.asarray(veil, np.float32))
+
+
+__all__ = ["lens_troubles"]

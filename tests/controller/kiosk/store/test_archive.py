@@ -17,7 +17,7 @@ from controller.kiosk.serving import serving
 from controller.kiosk.store import archive
 from controller.kiosk.store.archive import FOLDER
 from controller.kiosk.store.diagnostics import LARGEST_TAPE, diagnostics
-from controller.stage.sessions.recording import new_tape
+from controller.stage.sessions.run import new_tape
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
 OLD, NEW = "20260501-100000-calibrate", "20260601-100000-calibrate"

@@ -14,7 +14,7 @@ from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit
+from controller.stage.rig.power import Circuit
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Device

@@ -21,10 +21,9 @@ from controller.optics.solve.request import AppearanceResult, SolveOptions, solv
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import frame_planes
-from controller.stage.cluster import connect
-from controller.stage.cluster.appearances import SpreadAppearances
-from controller.stage.cluster.connect import Cluster, connected
-from controller.stage.cluster.tasks import Outcome, StageData
+from controller.stage import cluster as cluster_module
+from controller.stage.cluster import Cluster, Outcome, StageData, connected
+from controller.stage.steps.appearance.cluster_solve import SpreadAppearances
 from lab.timings.tools.synthetic import synthetic_calibration
 from tests.controller.stage.cluster.machines import Machines, machines
 
@@ -170,14 +169,14 @@ def _keys(dask_scheduler: Scheduler) -> list[str]:
 
 
 def test_a_scheduler_without_workers_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connect, "WORKERS_S", 0.3)
+    monkeypatch.setattr(cluster_module, "WORKERS_S", 0.3)
     with machines(tmp_path, 0) as made, pytest.raises(WorkError) as refused, connected(made.address):
         pass
     assert refused.value.code == "no-workers"
 
 
 def test_workers_with_other_code_are_refused(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connect, "code_digest", _another)
+    monkeypatch.setattr(cluster_module, "code_digest", _another)
     with pytest.raises(UsageError) as refused:
         cluster.check_code()
     assert refused.value.code == "workers-differ"

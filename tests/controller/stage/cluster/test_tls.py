@@ -11,8 +11,7 @@ import distributed  # noqa: F401  (its defaults are read when it is imported, an
 import pytest
 
 from controller.core.errors import WorkError
-from controller.stage.cluster.connect import connected
-from controller.stage.cluster.tasks import Outcome
+from controller.stage.cluster import Outcome, connected
 from tests.controller.stage.cluster.machines import machines
 
 OPENSSL = shutil.which("openssl")

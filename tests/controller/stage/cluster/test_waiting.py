@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from controller.stage.cluster.connect import Cluster
+from controller.stage.cluster import Cluster
 
 
 class Scheduler:

@@ -11,7 +11,7 @@ import pytest
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
-from controller.stage.live.sources import FolderSource, VideoSource, open_source
+from controller.stage.live import FolderSource, VideoSource, open_source
 
 
 def grey(value: int) -> ByteImage:

@@ -19,9 +19,7 @@ import pytest
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
-from controller.stage.live.readers import open_stream
-from controller.stage.live.sources import LivePicture
-from controller.stage.live.streams import Lost, StreamSource, is_stream, without_password
+from controller.stage.live import LivePicture, Lost, StreamSource, is_stream, open_stream, without_password
 from controller.stage.steps.appearance.live import TargetMaker, run_live
 from tests.ports import kept_port
 from tests.waiting import eventually, wait_for

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.stage.artefacts.grade import PICTURE, in_rows, parts_of
-from controller.stage.report.causes import causes_gallery
+from controller.stage.report.galleries import causes_gallery
 
 
 @given(count=st.integers(1, 9), rows=st.integers(1, 5), columns=st.integers(1, 5))

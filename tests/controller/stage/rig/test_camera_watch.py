@@ -11,7 +11,7 @@ import pytest
 from controller.run.journal import Journal
 from controller.run.progress import Progress
 from controller.run.runner import Context
-from controller.stage.rig.camera_watch import EVERY_S, CameraWatch
+from controller.stage.steps.capture.photographs import EVERY_S, CameraWatch
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceTimeout
 from hal.notices import Level, Notice

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from controller.stage.rig.lamp_guard import LampGuard
-from controller.stage.rig.mains_relays import Circuit, close_circuits, open_circuits
-from controller.stage.rig.power import power_down
+from controller.stage.rig.power import Circuit, close_circuits, open_circuits, power_down
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.values import DeviceIdentity

@@ -15,7 +15,7 @@ from controller.bundle.live_maps import compensate
 from controller.optics.capture.acquire import Acquirer
 from controller.play.control.launch import PlayerSettings, start_player
 from controller.run.runner import Context
-from controller.stage.live.sources import LivePicture
+from controller.stage.live import LivePicture
 from controller.stage.rig.rig import Rig
 from controller.stage.services.live import Ready, live_mode
 from hal.deadline import in_seconds

@@ -100,7 +100,7 @@ def test_mains_are_on_while_the_run_works_and_cut_after_the_lamps(tmp_path: Path
 
 
 def test_a_lamp_that_does_not_go_out_keeps_its_mains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("controller.stage.rig.mains_relays.MARGIN_S", 0.2)
+    monkeypatch.setattr("controller.stage.rig.power.MARGIN_S", 0.2)
     hall = Hall(tmp_path, RELAYS)
     hall.stuck.add("A")
     with pytest.raises(DeviceError) as caught:

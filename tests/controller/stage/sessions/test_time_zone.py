@@ -10,8 +10,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from controller.stage.report.words import moment
-from controller.stage.sessions.check import check_stage
-from controller.stage.sessions.time_zone import time_zone
+from controller.stage.sessions.check import check_stage, time_zone
 from tests.controller.kiosk.vase import TEXT, vase
 
 RUN = "20260105-233000-calibrate"

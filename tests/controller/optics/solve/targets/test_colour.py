@@ -20,7 +20,7 @@ from controller.core.errors import UsageError
 from controller.optics.solve.targets.colour import SPACES, ColourSpace, Unsuitable, read_profile, with_profile
 from controller.optics.solve.targets.files import load_target, read_picture
 from controller.optics.solve.targets.values import linear_to_srgb
-from controller.stage.live.sources import FolderSource
+from controller.stage.live import FolderSource
 from tests.controller.optics.solve.targets import icc_files
 
 SIZE = (24, 16)

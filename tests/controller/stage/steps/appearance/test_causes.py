@@ -15,7 +15,7 @@ from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import Refining
-from controller.stage.steps.appearance.causes import causes_step, sentences
+from controller.stage.steps.appearance.refining import causes_step, sentences
 from hal.deadline import in_seconds
 from hal.notices import Level
 

@@ -8,7 +8,7 @@ import pytest
 from controller.core.arrays import FloatImage
 from controller.optics.capture.profile import CameraNoise, CameraProfile
 from controller.stage.artefacts.photographs import Taken
-from controller.stage.steps.appearance.exposure_times import brightest, speeds, timed
+from controller.stage.steps.appearance.photographing import brightest, speeds, timed
 from tests.controller.optics.capture.test_raw import BLACK, WHITE, write_dng
 
 AVAILABLE_S = [round(2.0 ** (number / 3), 4) for number in range(-30, 10)]

@@ -12,7 +12,7 @@ from controller.core.errors import UsageError
 from controller.optics.solve.appearance import base_image, solve_base
 from controller.optics.solve.scaling.interactive import interactive
 from controller.optics.transport import build_transport
-from controller.stage.live.sources import LivePicture
+from controller.stage.live import LivePicture
 from controller.stage.steps.appearance import live
 from controller.stage.steps.appearance.live import FrameMaker, Frames, LiveFigures, TargetMaker, run_live
 from lab.timings.tools.synthetic import synthetic_calibration

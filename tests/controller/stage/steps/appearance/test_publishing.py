@@ -19,13 +19,14 @@ from controller.run.progress import Reporter, Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.solved import Solved
 from controller.stage.steps.appearance.publishing import (
+    LONGEST_PX,
     created_unix_s,
     hints_ms,
     kept_names,
     publish_solved,
     publish_step,
+    thumbnail,
 )
-from controller.stage.steps.appearance.thumbnails import LONGEST_PX, thumbnail
 from hal.deadline import in_seconds
 from hal.notices import Level
 

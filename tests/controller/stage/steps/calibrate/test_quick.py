@@ -20,8 +20,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.drift import write_drift
 from controller.stage.artefacts.kinds import white_of
-from controller.stage.steps.calibrate import single_projector
-from controller.stage.steps.calibrate.quick import Reuse, chosen, reuse_of
+from controller.stage.steps.calibrate.quick import Reuse, chosen, reuse_for_one, reuse_of
 from hal.deadline import in_seconds
 from tests.controller.stage.artefacts.names import projectors
 
@@ -183,6 +182,6 @@ def test_exactly_the_projectors_that_moved_are_repeated_whatever_they_are_called
 def test_one_projector_is_recalibrated_and_no_other(names: list[str], data: st.DataObject) -> None:
     one = data.draw(st.sampled_from(names))
     for name in names:
-        ways = {kind: single_projector.reuse_of(StepId(kind, name), one) for kind in (*KINDS, "radiometry")}
+        ways = {kind: reuse_for_one(StepId(kind, name), one) for kind in (*KINDS, "radiometry")}
         kept = {**dict.fromkeys(KINDS, Reuse.KEEP), "radiometry": Reuse.CORRECT}
         assert ways == (dict.fromkeys(ways, Reuse.RUN) if name == one else kept)

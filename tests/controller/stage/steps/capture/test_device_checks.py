@@ -17,7 +17,7 @@ from controller.optics.capture.raw import read_photograph, read_samples
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
-from controller.stage.steps.capture.device_checks import device_checks
+from controller.stage.steps.capture.camera import device_checks
 from hal.deadline import Deadline, in_seconds
 from hal.notices import Level
 from hal.values import CapturedFile, FileKind

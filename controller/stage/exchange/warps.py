@@ -1,5 +1,7 @@
-"""MPCDI 2.0: warps and poses of projectors for media servers, in the profiles 2d, 3d and sl (shader lamps).
+"""Warps as pictures for other programs: ST maps, and MPCDI 2.0 for media servers.
 
+The red and green of an ST map (OpenEXR) say where in another picture each pixel's colour comes from. MPCDI has warps
+and poses of projectors in the profiles 2d, 3d and sl (shader lamps).
 Sources: VESA's MPCDI standard as its public reference library and Christie's notes explain it. A file is a ZIP archive
 with mpcdi.xml and, for each projector, maps of its size: PFM with floats, rows from the bottom to the top, and PNG.
 """
@@ -21,13 +23,60 @@ import numpy as np
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.values import Pinhole
+from controller.optics.capture.linear_files import exr_bytes
 from controller.stage.artefacts.names import safe_name
 from controller.stage.exchange.content import Content
+
+_MAPS_README: Final = """ST maps of a Velatura stage. All are OpenEXR files with 32-bit floats.
+
+PROJECTOR-from-camera.exr  has the projector's size and says where in the camera's picture each projector pixel lies:
+                           it warps a picture as seen from the camera into the projector's own.
+camera-from-PROJECTOR.exr  has the camera's size and says where in the projector's picture each camera pixel looks.
+
+R is s, 0 at the left border of the picture and 1 at its right border. G is t, 0 at the lower border and 1 at the upper
+border. A is 1 where the place is known and 0 elsewhere; B is 0.
+
+A warp moves a picture of one projector to its place. It knows nothing of how bright and in which colour the projector
+lights the object, nor of the other projectors whose light falls on the same place. Pictures for superimposed
+projectors come from `velatura appearance`, and can't be had by these maps alone.
+"""
+
+
+def write_maps(content: Content, folder: Path) -> dict[str, int]:
+    """Write two maps for each projector, and README.txt; a map of measured places only where the run has them.
+
+    Raises WorkError("no-space", "cannot-write").
+    """
+    size = content.geometry.camera.size_px
+    written = 0
+    for n, (name, metapixels) in enumerate(zip(content.names, content.metapixels(), strict=True)):
+        plain = safe_name(name)
+        known = metapixels.valid & np.isfinite(metapixels.centre_px).all(axis=2)
+        places = np.where(known[..., None], metapixels.centre_px, np.float32(np.nan))
+        write_atomically(folder / f"{plain}-from-camera.exr", st_map(places, size))
+        written += 1
+        seen = content.seen_px[n]
+        if seen is not None:
+            write_atomically(folder / f"camera-from-{plain}.exr", st_map(seen, content.geometry.projectors[n].size_px))
+            written += 1
+    write_atomically(folder / "README.txt", _MAPS_README.encode())
+    return {"maps": written}
+
+
+def st_map(places_px: FloatImage, size_px: tuple[int, int]) -> bytes:
+    """An EXR file of (rows, columns, 2) places x, y in a picture of ``size_px`` (width, height); NaN: unknown."""
+    known = np.isfinite(places_px).all(axis=2)
+    s = (places_px[..., 0] + np.float32(0.5)) / np.float32(size_px[0])
+    t = 1 - (places_px[..., 1] + np.float32(0.5)) / np.float32(size_px[1])
+    red, green = np.where(known, s, np.float32(0)), np.where(known, t, np.float32(0))
+    return exr_bytes({"R": red, "G": green, "B": np.zeros_like(red), "A": np.asarray(known, np.float32)})
+
 
 DATE: Final = "1980-01-01 00:00:00"
 """The earliest that a ZIP archive can name: the same calibration gives the same bytes."""
 BUFFER: Final = "stage"
-README: Final = """MPCDI 2.0 files of a Velatura stage. Each has one region for each projector, named as on the stage.
+_MPCDI_README: Final = """\
+MPCDI 2.0 files of a Velatura stage. Each has one region for each projector, named as on the stage.
 
 stage-2d.mpcdi  profile 2d: for each projector pixel the place in the camera's picture, 0 to 1 from the left and from
                 the top. The picture to be shown is one as seen from the camera.
@@ -82,7 +131,7 @@ def write_mpcdi(content: Content, folder: Path) -> dict[str, int]:
     ]
     for profile, regions in (("2d", flat), ("3d", seen), ("sl", lamps)):
         write_atomically(folder / f"stage-{profile}.mpcdi", _archive(profile, regions, camera.size_px))
-    write_atomically(folder / "README.txt", README.encode())
+    write_atomically(folder / "README.txt", _MPCDI_README.encode())
     return {"files": 3, "regions": len(flat)}
 
 

@@ -18,7 +18,7 @@ MOVE_S: Final = 25.0
 """Longest that one movement may take."""
 
 
-class DousedProjector:
+class ProjectorWithDouser:
     """``hal.interfaces.WatchedProjector`` and ``AdjustedProjector``; its shutter is the douser.
 
     The douser follows every status and every switch. When it fails, the lamp can still be read and switched off: the

@@ -1,1 +1,0 @@
-"""Solves on many machines with Dask distributed (docs/how-to/cluster.md). Entry: `connect`, `appearances`."""
