@@ -33,7 +33,7 @@ def words() -> Catalog:
         found.add(message, None, [(file, 0)], context=context)
     for operation in OPERATIONS:
         if operation.name in LEADS_TO:
-            for sentence in (operation.said, operation.asks):
+            for sentence in (operation.done, operation.asks):
                 if sentence:
                     found.add(sentence, None, [("operations", 0)])
     for name, _, _ in error_causes.WORDS.values():

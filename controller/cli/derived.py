@@ -22,14 +22,13 @@ from controller.cli.groups import (
 )
 from controller.core.errors import UsageError
 from controller.core.text import printable
-from controller.kiosk.operations.fields import Field
+from controller.kiosk.operations.fields import Field, Sent
 from controller.kiosk.operations.operation import Answer, Effect, Operation
 from controller.kiosk.operations.table import OPERATIONS
 
 if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
-_TYPES: Final[Mapping[str, Any]] = {"integer": int, "number": float, "boolean": bool, "file": Path, "target": Path}
 _COMPLETE: Final = {"appearance": appearance_names, "projector": projector_names, "": None}
 NoWait = Annotated[bool, typer.Option("--no-wait", help="Do not wait for the end of the job.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask. Scripts are never asked.")]
@@ -40,7 +39,7 @@ def commands(group: str, operations: Sequence[Operation] = OPERATIONS) -> dict[s
     words = (
         (operation, operation.words.rpartition(" "))
         for operation in operations
-        if not operation.within and operation.holder != "targets"
+        if not operation.names.part_of and operation.holder != "targets"
     )
     return {name: command(operation, name) for operation, (first, _, name) in words if first == group}
 
@@ -58,7 +57,8 @@ def command(operation: Operation, name: str) -> Callable[..., None]:
         console.show_result(*_shown(operation, call(stage, operation.socket_name, **arguments), arguments))
 
     parameters = [typed_parameter("stage", StageFolder)]
-    parameters += [typed_parameter(field.name, *_typed(field)) for field in operation.fields if not field.secret]
+    open_fields = [field for field in operation.fields if not field.command_line.secret]
+    parameters += [typed_parameter(field.name, *_typed(field)) for field in open_fields]
     if operation.effect is Effect.WORKS:
         parameters.append(typed_parameter("no_wait", NoWait, False))
     if operation.asks:
@@ -88,26 +88,28 @@ def job(stage: Path, op: str, arguments: Mapping[str, Any]) -> None:
 def _typed(field: Field) -> tuple[Any, ...]:
     """The annotation that typer reads, and the default of an optional value."""
     about = ("" if field.choices else field.about[:1].upper()) + field.about[0 if field.choices else 1 :] + "."
-    if field.flag is not None:
-        return Annotated[bool, typer.Option(field.flag.option, help=field.flag.about)], False
-    kind = Literal[tuple(field.choices)] if field.choices else _TYPES.get(field.kind, str)
-    complete = _COMPLETE[field.names]
-    if field.kind == "target":
+    asked = field.command_line
+    if asked.flag is not None:
+        return Annotated[bool, typer.Option(asked.flag.option, help=asked.flag.about)], False
+    kind: Any = Literal[field.choices] if field.choices else field.kind
+    complete = _COMPLETE[asked.completes]
+    if field.sent is Sent.TARGET:
         about = "The object's requested look, seen from the camera (PNG)."
-    if field.argument or (field.required and not field.usual):
-        made = typer.Argument(help=about, autocompletion=complete, metavar=field.metavar or None)
+    if asked.argument or (field.required and not asked.default):
+        made = typer.Argument(help=about, autocompletion=complete, metavar=asked.metavar or None)
         return (Annotated[kind, made],) if field.required else (Annotated[kind | None, made], None)
     option = typer.Option(help=about, autocompletion=complete)
-    return (Annotated[kind, option], field.usual) if field.usual else (Annotated[kind | None, option], None)
+    return (Annotated[kind, option], asked.default) if asked.default else (Annotated[kind | None, option], None)
 
 
 def _value(field: Field, typed: Any) -> Any:
     """As the socket takes it."""
-    if field.secret:
+    asked = field.command_line
+    if asked.secret:
         return _secret(field)
-    if field.flag is not None:
-        return field.flag.value if typed else field.flag.otherwise
-    if field.kind == "target" and not typed.is_file():
+    if asked.flag is not None:
+        return asked.flag.value if typed else asked.flag.otherwise
+    if field.sent is Sent.TARGET and not typed.is_file():
         raise UsageError("target-missing", what=f"The file {typed} does not exist.", remedy="Give a PNG file.")
     return str(typed.absolute()) if isinstance(typed, Path) else typed
 
@@ -120,7 +122,7 @@ def _secret(field: Field) -> str:
 
 def _help(operation: Operation) -> str:
     sentences = [f"{operation.about}.", *([operation.more] if operation.more else [])]
-    if any(field.secret for field in operation.fields):
+    if any(field.command_line.secret for field in operation.fields):
         sentences.append("You are asked for the password; a script gives it on standard input.")
     if operation.effect is Effect.WORKS:
         sentences.append("The command waits until it is done.")
@@ -143,7 +145,9 @@ def _shown(operation: Operation, answer: Any, arguments: Mapping[str, Any]) -> S
     if operation.effect is Effect.WORKS:
         return done, "Started. `velatura kiosk status` shows the progress."
     if operation.answer is Answer.NOTHING:
-        undone = any(field.flag and arguments[field.name] == field.flag.value for field in operation.fields)
+        undone = any(
+            (flag := field.command_line.flag) and arguments[field.name] == flag.value for field in operation.fields
+        )
         return done, "Done." if undone else printable(operation.sentence(dict(arguments)))
     if operation.answer in (Answer.FILE, Answer.PICTURE, Answer.PAGE):
         return {"file": answer}, f"Written: {answer}"

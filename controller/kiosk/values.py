@@ -8,13 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from controller.kiosk.state import EventLevel, Grade
 
 RecalibrationKind = Literal["full", "quick"]
 Fit = Literal["fit", "fill", "crop", "wrap"]
 Unsubscribe = Callable[[], None]
+Picture = Annotated[Path | None, Field(exclude=True)]
+"""A file of this machine, which the HTTP API leaves out: it has an address for each picture."""
+Pictures = Annotated[dict[str, Path], Field(exclude=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +43,7 @@ class Appearance:
     made_unix_s: float
     delta_e: float | None = None
     playing: bool = False
-    preview: Path | None = None
+    preview: Picture = None
     outputs: tuple[str, ...] = ()
     source: str = ""
 
@@ -56,7 +61,7 @@ class Reach:
     too_bright: float
     too_dark: float
     too_colourful: float
-    pictures: dict[str, Path] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=dict)
     coarse: int = 1
     computes: bool = False
 
@@ -76,7 +81,7 @@ class Computed:
     in_reach_share: float
     seconds: float
     device: str
-    pictures: dict[str, Path] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +92,7 @@ class Scene:
 
     name: str
     shipped: bool
-    preview: Path | None = None
+    preview: Picture = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +129,7 @@ class Comparison:
 
     name: str
     history: tuple[Achieved, ...]
-    pictures: dict[str, Path] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +204,7 @@ class Aiming:
     hints: tuple[str, ...] = ()
     source: str = ""
     measured_unix_s: float = 0.0
-    picture: Path | None = None
+    picture: Picture = None
     outlined: bool = False
     clipped: float | None = None
     histogram: tuple[float, ...] = ()
@@ -234,5 +239,5 @@ class Results:
 
     run: str
     grade: Grade | None
-    pictures: dict[str, Path] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=dict)
     figures: tuple[tuple[str, str], ...] = ()

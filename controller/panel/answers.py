@@ -6,20 +6,19 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 from urllib.parse import quote
 
+from pydantic import TypeAdapter
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.kiosk.operations.fields import Field, parse
-from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
+from controller.kiosk.operations.fields import Sent, Values, parse
+from controller.kiosk.operations.operation import Answer, Effect, Operation
 from controller.panel.context import Panel
-from hal.driver_calls import field_types
 from hal.errors import DeviceError
 
 FAILURES: Final = (VelaturaError, DeviceError)
@@ -55,14 +54,14 @@ async def run(panel: Panel, operation: Operation, values: Values, who: str) -> A
 
     The event log has ``who`` asked for it, unless it only looks.
     """
-    targets = [field.name for field in operation.fields if field.kind == "target"]
+    targets = [field.name for field in operation.fields if field.sent is Sent.TARGET]
 
     def do() -> Any:
         if operation.effect is not Effect.LOOKS:
             # Before, because some of them end the log's service.
             panel.kiosk.record("done-by", operation.done_by(who, values))
         files = {name: panel.targets.path(values[name]) for name in targets}
-        return operation.of(panel.holders[operation.holder], values | files)
+        return operation.function(panel.holders[operation.holder], **values | files)
 
     return await panel.in_thread(do)
 
@@ -75,7 +74,7 @@ def response(operation: Operation, answer: Any, values: Values) -> Response:
     if kind is Answer.TEXT:
         return JSONResponse({"text": answer})
     if kind is Answer.VALUE:
-        return JSONResponse(plain(answer))
+        return JSONResponse(plain(operation, answer))
     if kind is Answer.JPEG:
         if answer is None:
             raise UsageError(
@@ -98,25 +97,15 @@ def _picture(path: Path | None) -> Response:
     return FileResponse(path, media_type=types[path.suffix])
 
 
-def plain(value: Any) -> Any:
-    """Values as JSON, without paths, which mean nothing outside this machine."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {name: plain(getattr(value, name)) for name in sent_fields(type(value))}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, dict):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    return value
+def plain(operation: Operation, answer: Any) -> Any:
+    """An answer as JSON, without files of this machine."""
+    return adapter(operation).dump_python(answer, mode="json", warnings=False)
 
 
 @cache
-def sent_fields(kind: type) -> dict[str, Any]:
-    """The type of each field of a dataclass, by name, without those that have paths."""
-    return {name: hint for name, hint in field_types(kind).items() if not _has_paths(hint)}
-
-
-def _has_paths(hint: Any) -> bool:
-    return hint is Path or any(_has_paths(inner) for inner in get_args(hint))
+def adapter(operation: Operation) -> TypeAdapter[Any]:
+    """What describes and serialises an operation's answers."""
+    return TypeAdapter(operation.returns)
 
 
 def scalar_values(operation: Operation, request: Request) -> Values:
@@ -176,8 +165,3 @@ def temporary(folder: Path) -> Path:
     handle, name = tempfile.mkstemp(dir=folder, prefix="incoming-")
     os.close(handle)
     return Path(name)
-
-
-def fields_from_path(operation: Operation) -> tuple[Field, ...]:
-    """All fields except an upload; a form sends the fields of the path in its body."""
-    return tuple(field for field in operation.fields if field.kind != "file")

@@ -9,22 +9,25 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_1_0_0
 from prometheus_client.registry import Collector
+from pydantic import TypeAdapter
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from controller.kiosk.building.rates import Rate, Rates
-from controller.kiosk.operations.fields import object_schema
+from controller.kiosk.operations.fields import PlainSchema, object_schema
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
 from controller.panel import answers
-from controller.panel.answer_schemas import BYTES, Schemas
 from controller.panel.auth.identity import Endpoint, Entry, Visitor
 from controller.panel.context import Panel
 from controller.run.state_machine import State
 
 PREFIX: Final = "/api/v1"
+REFERENCE: Final = "#/components/schemas/{model}"
 _ERROR: Final = {"$ref": "#/components/responses/Error"}
+BYTES: Final[dict[str, Any]] = {"type": "string", "format": "binary"}
+"""A picture or a file. OpenAPI 3.1 needs no schema for it, but generators of clients do."""
 
 
 def entries(panel: Panel) -> list[Entry]:
@@ -85,9 +88,10 @@ def _document(operations: Sequence[Operation]) -> Endpoint:
 def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
     """The OpenAPI 3.1 document, made from the same table as the routes."""
     paths: dict[str, dict[str, Any]] = {}
-    schemas = Schemas()
+    answered, objects = answer_schemas(operations)
     for operation in operations:
-        paths.setdefault(operation.path, {})[operation.method.lower()] = _described(operation, schemas.of(operation))
+        described = _described(operation, answered[operation.name], objects)
+        paths.setdefault(operation.path, {})[operation.method.lower()] = described
     return {
         "openapi": "3.1.0",
         "info": {
@@ -99,7 +103,7 @@ def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
         "security": [{"token": []}],
         "paths": paths,
         "components": {
-            "schemas": {name: schemas.components[name] for name in sorted(schemas.components)},
+            "schemas": {name: objects[name] for name in sorted(objects)},
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
             "responses": {
                 "Error": {
@@ -115,7 +119,51 @@ def document(operations: Sequence[Operation] = OPERATIONS) -> dict[str, Any]:
     }
 
 
-def _described(operation: Operation, answer: dict[str, Any]) -> dict[str, Any]:
+class _AnswerSchema(PlainSchema):
+    """All fields of an answer are always there. A later version may add others."""
+
+    def field_is_required(self, field: Any, total: bool) -> bool:
+        return True
+
+    def tuple_schema(self, schema: Any) -> Any:
+        # A pair of texts: a schema with a place of its own for each is understood by few generators.
+        described = super().tuple_schema(schema)
+        if "prefixItems" in described:
+            described["items"] = described.pop("prefixItems")[0]
+        return described
+
+
+def answer_schemas(operations: Sequence[Operation]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The JSON Schema of each operation's answer, by its name, and those of the objects in them, by theirs."""
+    text = {"type": "string"}
+    objects: dict[str, Any] = {
+        "Done": _object({"done": {"type": "boolean"}}) | {"description": "It was done."},
+        "Refusal": _object(dict.fromkeys(("code", "what", "remedy"), text))
+        | {"description": "What happened, and what to do; the code is stable."},
+        "Text": _object({"text": text}) | {"description": "A text; it may be empty."},
+    }
+    values = [operation for operation in operations if operation.answer is Answer.VALUE]
+    described, definitions = TypeAdapter.json_schemas(
+        [(operation.name, "serialization", answers.adapter(operation)) for operation in values],
+        schema_generator=_AnswerSchema, ref_template=REFERENCE,
+    )  # fmt: skip
+    for name, schema in definitions["$defs"].items():
+        objects[name] = schema | {"description": schema.get("description", "").replace("``", "")}
+    general = {Answer.NOTHING: "Done", Answer.TEXT: "Text"}
+    answered: dict[str, Any] = {
+        operation.name: {"$ref": REFERENCE.format(model=general[operation.answer])}
+        if operation.answer in general else BYTES
+        for operation in operations
+    }  # fmt: skip
+    return answered | {str(name): schema for (name, _), schema in described.items()}, objects
+
+
+def _object(properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": properties, "required": list(properties)}
+
+
+def _described(operation: Operation, answer: dict[str, Any], objects: dict[str, Any]) -> dict[str, Any]:
+    """An operation in the document; the objects in its body are added to ``objects``."""
     content: dict[str, Any] = {operation.answer.media: {"schema": answer}}
     if operation.answer is Answer.PICTURE:
         content["image/jpeg"] = {"schema": BYTES}
@@ -133,14 +181,16 @@ def _described(operation: Operation, answer: dict[str, Any]) -> dict[str, Any]:
     scalars = [(field, where) for field, where in placed if where != "body"]
     if scalars:
         described["parameters"] = [
-            {"name": f.name, "in": where, "required": f.required or where == "path", "schema": f.schema()}
+            {"name": f.name, "in": where, "required": f.required or where == "path", "schema": f.schema}
             for f, where in scalars
         ]
     body = [field for field, where in placed if where == "body"]
     if operation.upload is not None:
         described["requestBody"] = {"required": True, "content": {"application/octet-stream": {"schema": BYTES}}}
     elif body:
-        described["requestBody"] = {"required": True, "content": {"application/json": {"schema": object_schema(body)}}}
+        schema = object_schema(body)
+        objects |= schema.pop("$defs", {})
+        described["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
     return described
 
 

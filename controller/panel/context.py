@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import anyio
 
 from controller.kiosk.interface import Kiosk
-from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.operations.accounts import Accounts as AccountsInUse
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts
@@ -77,8 +77,8 @@ class Panel:
 
     @property
     def holders(self) -> dict[str, Any]:
-        """The holders of the operations."""
-        accounts = AccountActions(lambda: self.accounts, self.sessions.end_all, self.costly)
+        """What operations work on, by the name of their first parameter."""
+        accounts = AccountsInUse(lambda: self.accounts, self.sessions.end_all, self.costly)
         return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets}
 
     async def in_thread(self, question: Callable[[], T]) -> T:

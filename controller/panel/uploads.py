@@ -14,7 +14,7 @@ from pathlib import Path
 
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.kiosk.operations.table import TARGET_KEY
+from controller.kiosk.operations.fields import TARGET_KEY
 from controller.kiosk.store import targets
 from controller.kiosk.values import Fit
 from controller.panel import decoder

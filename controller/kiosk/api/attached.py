@@ -14,7 +14,7 @@ from controller.kiosk.api import finding
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.api.snapshot import Snapshots
 from controller.kiosk.interface import EventLevel, EventRow, KioskState, Unsubscribe
-from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.operations.accounts import Accounts as AccountsInUse
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.kiosk.service import Service
 from controller.kiosk.store.accounts import Accounts, stage_accounts
@@ -87,7 +87,7 @@ class AttachedKiosk(FolderKiosk):
 
     def holders(self) -> dict[str, Any]:
         """The holders of the socket's operations."""
-        return {"kiosk": self, "accounts": AccountActions(self.held_accounts, self._end_sessions)}
+        return {"kiosk": self, "accounts": AccountsInUse(self.held_accounts, self._end_sessions)}
 
     def _end_sessions(self, name: str) -> None:
         # Looked up late, because a panel may be attached after the socket.

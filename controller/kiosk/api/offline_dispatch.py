@@ -17,7 +17,7 @@ from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.decide.days import expanded
 from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.kiosk.operations.accounts import AccountActions
+from controller.kiosk.operations.accounts import Accounts
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.store.bundle_store import BundleStore
@@ -40,11 +40,11 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
         raise UsageError("not-serving", what="No kiosk runs on this stage.", remedy=remedy)
     values = local_values(operation, arguments)
     if operation.effect is Effect.LOOKS:
-        return plain(operation.of(_holder(operation, folder), values))
+        return plain(operation.function(_holder(operation, folder), **values))
     # A starting kiosk reads these files before it answers, and would miss a change.
     with stage_lock(folder):
         _record(folder, operation.done_by(f"User {user_name(os.getuid())}, while no kiosk ran", values))
-        return plain(operation.of(_holder(operation, folder), values))
+        return plain(operation.function(_holder(operation, folder), **values))
 
 
 def _record(folder: Path, text: str) -> None:
@@ -59,7 +59,7 @@ def _holder(operation: Operation, folder: Path) -> object:
     from controller.kiosk.store.accounts import stage_accounts
 
     accounts = stage_accounts(folder)
-    return AccountActions(lambda: accounts, lambda name: None)
+    return Accounts(lambda: accounts)
 
 
 def status_of(stage: Path) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def named(fields: Sequence[Value], arguments: Sequence[Any]) -> dict[str, Any] |
     for at, argument in enumerate(left):
         if at >= len(fields):
             values[f"argument {at + 1}"] = argument
-        elif fields[at].kind == "boolean" and argument in (0, 1):
+        elif fields[at].kind is bool and argument in (0, 1):
             values[fields[at].name] = bool(argument)
         else:
             values[fields[at].name] = argument

@@ -10,8 +10,8 @@ from typing import Any
 from controller.core.errors import UsageError
 from controller.kiosk.building.rates import Rate, Rates
 from controller.kiosk.interface import Kiosk, KioskState
-from controller.kiosk.operations.fields import Field, parse
-from controller.kiosk.operations.operation import Operation, Values
+from controller.kiosk.operations.fields import Field, Values, parse
+from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
 
@@ -85,7 +85,7 @@ class Verbs:
         self._rates.take(source)
         named = f"{self._who} ({source})" if source else self._who
         self._kiosk.record("done-by", operation.done_by(named, values))
-        operation.of(self._kiosk, values)
+        operation.function(self._kiosk, **values)
 
     def subscribe(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Call ``callback`` (quick, from any thread) after every change of the state; returns what ends that."""

@@ -1,26 +1,38 @@
-"""Accounts and tokens as operations; ``AccountActions`` implements them."""
+"""Accounts and tokens as operations."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from controller.kiosk.operations.fields import Field
-from controller.kiosk.operations.operation import Answer, Effect, Operation
+from pydantic import Field
+
+from controller.kiosk.operations.fields import TEXT, CommandLine
+from controller.kiosk.operations.operation import Effect, Names, operation
 from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
 
 if TYPE_CHECKING:
-    from controller.kiosk.store.accounts import Accounts
+    from controller.kiosk.store.accounts import Accounts as StoredAccounts
 
-_NAME: Final = Field(
-    "name", "1 to 32 lower-case letters, digits, dots, dashes, underscores; the first is a letter",
-    pattern=ACCOUNT_NAME, longest=32,
-)  # fmt: skip
-_ROLE: Final = Field("role", "viewer, operator or technician", choices=("viewer", "operator", "technician"),
-                     usual="viewer")  # fmt: skip
-_PASSWORD: Final = Field("password", "10 characters or more", longest=LONGEST_PASSWORD, secret=True)
+AccountName = Annotated[str, Field(pattern=ACCOUNT_NAME, max_length=32, description=(
+    "1 to 32 lower-case letters, digits, dots, dashes, underscores; the first is a letter")), TEXT]  # fmt: skip
+RoleName = Annotated[Literal["viewer", "operator", "technician"], Field(description="viewer, operator or technician"),
+                     CommandLine(default="viewer")]  # fmt: skip
+Password = Annotated[str, Field(max_length=LONGEST_PASSWORD, description="10 characters or more"), TEXT,
+                     CommandLine(secret=True)]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Accounts:
+    """What the operations on accounts need. ``open`` gives the accounts, and opens them at the first use;
+    ``end_sessions`` ends the sessions of an account; ``hashing`` limits how many passwords are hashed at once.
+    """
+
+    open: Callable[[], StoredAccounts]
+    end_sessions: Callable[[str], object] = lambda name: None
+    hashing: contextlib.AbstractContextManager[Any] = field(default_factory=contextlib.nullcontext)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,69 +60,65 @@ class NewToken:
     token: str
 
 
-class AccountActions:
-    """The operations on accounts and tokens. ``held`` opens the accounts at the first use; ``ended`` ends the sessions
-    of an account; ``costly`` limits how many passwords are hashed at the same time.
-    """
-
-    def __init__(
-        self, held: Callable[[], Accounts], ended: Callable[[str], object],
-        costly: contextlib.AbstractContextManager[Any] | None = None,
-    ) -> None:  # fmt: skip
-        self._held, self._ended = held, ended
-        self._costly = costly or contextlib.nullcontext()
-
-    def accounts(self) -> Sequence[AccountRow]:
-        return [AccountRow(row.name, row.role.name.lower(), row.one_time) for row in self._held().all()]
-
-    def tokens(self) -> Sequence[TokenRow]:
-        return [TokenRow(row.name, row.role.name.lower(), row.made_unix_s) for row in self._held().tokens()]
-
-    def add_account(self, name: str, role: str, password: str) -> None:
-        with self._costly:
-            self._held().add(name, Role.named(role), password)
-
-    def set_role(self, name: str, role: str) -> None:
-        self._held().set_role(name, Role.named(role))
-        self._ended(name)
-
-    def set_password(self, name: str, password: str) -> None:
-        with self._costly:
-            self._held().set_password(name, password)
-        self._ended(name)
-
-    def remove_account(self, name: str) -> None:
-        self._held().remove(name)
-        self._ended(name)
-
-    def add_token(self, name: str, role: str) -> NewToken:
-        return NewToken(self._held().add_token(name, Role.named(role)))
-
-    def remove_token(self, name: str) -> None:
-        self._held().remove_token(name)
+@operation("GET /accounts", Role.TECHNICIAN, Effect.LOOKS, names=Names(part_of="kiosk account list"), offline=True)
+def accounts(accounts: Accounts) -> Sequence[AccountRow]:
+    """List the accounts."""
+    return [AccountRow(row.name, row.role.name.lower(), row.one_time) for row in accounts.open().all()]
 
 
-def _declared(name: str, about: str, effect: Effect, **more: Any) -> Operation:
-    return Operation(name, about, Role.TECHNICIAN, effect, holder="accounts", offline=True, **more)
+@operation("GET /tokens", Role.TECHNICIAN, Effect.LOOKS, names=Names(part_of="kiosk account list"), offline=True)
+def tokens(accounts: Accounts) -> Sequence[TokenRow]:
+    """List the API tokens, without their secrets."""
+    return [TokenRow(row.name, row.role.name.lower(), row.made_unix_s) for row in accounts.open().tokens()]
 
 
-ACCOUNT_OPERATIONS: Final = (
-    _declared("accounts", "List the accounts", Effect.LOOKS, within="kiosk account list"),
-    _declared("tokens", "List the API tokens, without their secrets", Effect.LOOKS, within="kiosk account list"),
-    _declared("add-account", "Add an account", Effect.CHANGES, fields=(_NAME, _ROLE, _PASSWORD),
-              answer=Answer.NOTHING, http=("POST", "/accounts"), command="account add", said="{name} may log in."),
-    _declared("set-role", "Change an account's role, and end its sessions", Effect.CHANGES, fields=(_NAME, _ROLE),
-              answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/role"), command="account role",
-              said="{name} has the role {role} now."),
-    _declared("set-password", "Set a new password for an account, and end its sessions", Effect.CHANGES,
-              fields=(_NAME, _PASSWORD), answer=Answer.NOTHING, http=("PUT", "/accounts/{name}/password"),
-              command="account password", said="The new password is in use."),
-    _declared("remove-account", "Remove an account, and end its sessions", Effect.CHANGES, fields=(_NAME,),
-              answer=Answer.NOTHING, http=("DELETE", "/accounts/{name}"), command="account remove",
-              said="{name} is removed.", asks="Remove the account {name}?"),
-    _declared("add-token", "Add an API token; it is shown only once", Effect.CHANGES, fields=(_NAME, _ROLE),
-              http=("POST", "/tokens"), command="account add-token"),
-    _declared("remove-token", "Remove an API token", Effect.CHANGES, fields=(_NAME,), answer=Answer.NOTHING,
-              http=("DELETE", "/tokens/{name}"), command="account remove-token", said="The token {name} is removed.",
-              asks="Remove the token {name}? Its programs are refused."),
+@operation("POST /accounts", Role.TECHNICIAN, Effect.CHANGES, done="{name} may log in.",
+           names=Names(command="account add"), offline=True)  # fmt: skip
+def add_account(accounts: Accounts, name: AccountName, role: RoleName, password: Password) -> None:
+    """Add an account."""
+    with accounts.hashing:
+        accounts.open().add(name, Role.named(role), password)
+
+
+@operation("PUT /accounts/{name}/role", Role.TECHNICIAN, Effect.CHANGES, done="{name} has the role {role} now.",
+           names=Names(command="account role"), offline=True)  # fmt: skip
+def set_role(accounts: Accounts, name: AccountName, role: RoleName) -> None:
+    """Change an account's role, and end its sessions."""
+    accounts.open().set_role(name, Role.named(role))
+    accounts.end_sessions(name)
+
+
+@operation("PUT /accounts/{name}/password", Role.TECHNICIAN, Effect.CHANGES, done="The new password is in use.",
+           names=Names(command="account password"), offline=True)  # fmt: skip
+def set_password(accounts: Accounts, name: AccountName, password: Password) -> None:
+    """Set a new password for an account, and end its sessions."""
+    with accounts.hashing:
+        accounts.open().set_password(name, password)
+    accounts.end_sessions(name)
+
+
+@operation("DELETE /accounts/{name}", Role.TECHNICIAN, Effect.CHANGES, done="{name} is removed.",
+           asks="Remove the account {name}?", names=Names(command="account remove"), offline=True)  # fmt: skip
+def remove_account(accounts: Accounts, name: AccountName) -> None:
+    """Remove an account, and end its sessions."""
+    accounts.open().remove(name)
+    accounts.end_sessions(name)
+
+
+@operation("POST /tokens", Role.TECHNICIAN, Effect.CHANGES, names=Names(command="account add-token"), offline=True)
+def add_token(accounts: Accounts, name: AccountName, role: RoleName) -> NewToken:
+    """Add an API token; it is shown only once."""
+    return NewToken(accounts.open().add_token(name, Role.named(role)))
+
+
+@operation("DELETE /tokens/{name}", Role.TECHNICIAN, Effect.CHANGES, done="The token {name} is removed.",
+           asks="Remove the token {name}? Its programs are refused.", names=Names(command="account remove-token"),
+           offline=True)  # fmt: skip
+def remove_token(accounts: Accounts, name: AccountName) -> None:
+    """Remove an API token."""
+    accounts.open().remove_token(name)
+
+
+ACCOUNT_OPERATIONS = (
+    accounts, tokens, add_account, set_role, set_password, remove_account, add_token, remove_token
 )  # fmt: skip

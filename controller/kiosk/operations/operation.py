@@ -1,19 +1,20 @@
-"""The declaration of an operation: all that HTTP, socket, command line and MQTT need to offer it."""
+"""An operation: a function on the kiosk, and what HTTP, socket, command line and building control need to offer it."""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cached_property
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Final, Literal, get_type_hints
 
-from controller.kiosk.operations.fields import Field
+from controller.kiosk.operations.fields import Field, Sent, Values
 from controller.kiosk.roles import Role
 
-Values = dict[str, Any]
-"""Checked values by the names of the fields."""
 Where = Literal["body", "path", "query"]
-Holder = Literal["kiosk", "accounts", "targets"]
 
 
 class Effect(enum.Enum):
@@ -46,78 +47,118 @@ class Answer(enum.Enum):
         return Answer.VALUE.value if self in (Answer.TEXT, Answer.NOTHING) else self.value
 
 
-def values_as_they_are(values: Values) -> Mapping[str, Any]:
-    return values
-
-
-def whole_answer(answer: Any, values: Values) -> Any:
-    return answer
+Picture = Annotated[Path | None, Answer.PICTURE]
+Jpeg = Annotated[bytes | None, Answer.JPEG]
+Page = Annotated[Path, Answer.PAGE]
+Download = Annotated[Path, Answer.FILE]
 
 
 @dataclass(frozen=True, slots=True)
-class Operation:
-    """One operation. It needs only this declaration and a method of its holder.
-
-    ``holder``: the object with the method: the kiosk, its accounts, or the panel's uploaded targets (HTTP only);
-    ``call``: the method's name; ``take`` makes its arguments from the values, ``part`` selects from its result;
-    ``gives``: the type of what ``part`` returns, where the method returns another.
-    ``offline``: ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``http``: method and path below
-    /api/v1; ``at_socket``, ``command``, ``verb``: its name at the socket, on the command line and for building control.
-    All names default to ``name``; the command follows "kiosk". ``within``: the command that includes it, or does more.
-    ``said``: the sentence shown when it is done, with the values as format fields; ``more``: what the help says after
-    ``about``;
-    ``asks``: the question that a person has to answer with yes before, with the values as format fields
+class Names:
+    """The names of an operation, where they differ from its function's: ``name``, and at the ``socket``, as a
+    ``command`` after "kiosk", and as a ``verb`` of building control. ``part_of``: the command that includes it.
     """
 
-    name: str
-    about: str
+    name: str = ""
+    socket: str = ""
+    command: str = ""
+    part_of: str = ""
+    verb: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """One operation; ``operation`` makes it of a function.
+
+    The function's first parameter is what it works on (``holder``): ``kiosk``, ``accounts``, or ``targets``, the
+    panel's uploads (HTTP only). The others are the fields of a request. What it returns says the kind of answer, and
+    its docstring what it does. ``http``: method and path below /api/v1, such as "POST /play". ``offline``:
+    ``api.folder.FolderKiosk`` has it, for use without a running kiosk. ``done``: the sentence that is shown when it is
+    done, and ``asks``: the question that a person has to answer with yes before; both with the values as format fields.
+    """
+
+    function: Callable[..., Any]
+    http: str
     role: Role
     effect: Effect
-    fields: tuple[Field, ...] = ()
-    answer: Answer = Answer.VALUE
-    holder: Holder = "kiosk"
-    call: str = ""
-    take: Callable[[Values], Mapping[str, Any]] = values_as_they_are
-    part: Callable[[Any, Values], Any] = whole_answer
-    gives: Any = None
-    offline: bool = False
-    http: tuple[str, str] = ("", "")
-    at_socket: str = ""
-    command: str = ""
-    within: str = ""
-    verb: str = ""
-    said: str = "Done."
-    more: str = ""
-    asks: str = ""
+    done: str
+    asks: str
+    names: Names
+    offline: bool
+
+    @property
+    def name(self) -> str:
+        return self.names.name or self.function.__name__.replace("_", "-")
+
+    @cached_property
+    def _sentences(self) -> tuple[str, str]:
+        about, _, more = " ".join((self.function.__doc__ or "").split()).partition(". ")
+        return about.removesuffix("."), more
+
+    @property
+    def about(self) -> str:
+        """The first sentence of its description, without a full stop."""
+        return self._sentences[0]
+
+    @property
+    def more(self) -> str:
+        """The rest of its description, which the help adds."""
+        return self._sentences[1]
+
+    @cached_property
+    def _hints(self) -> dict[str, Any]:
+        return get_type_hints(self.function, include_extras=True)
+
+    @cached_property
+    def holder(self) -> str:
+        return next(iter(inspect.signature(self.function).parameters))
+
+    @cached_property
+    def fields(self) -> tuple[Field, ...]:
+        _, *parameters = inspect.signature(self.function).parameters.values()
+        return tuple(
+            Field(one.name, _without_none(self._hints[one.name]), one.default is inspect.Parameter.empty)
+            for one in parameters
+        )
+
+    @property
+    def returns(self) -> Any:
+        """The type of its result."""
+        return self._hints["return"]
+
+    @property
+    def answer(self) -> Answer:
+        plain = {NoneType: Answer.NOTHING, str: Answer.TEXT}
+        notes = getattr(self.returns, "__metadata__", ())
+        return next((note for note in notes if isinstance(note, Answer)), plain.get(self.returns, Answer.VALUE))
 
     @property
     def method(self) -> str:
-        """By default GET if it changes nothing."""
-        return self.http[0] or ("GET" if self.effect is Effect.LOOKS else "POST")
+        return self.http.partition(" ")[0]
 
     @property
     def path(self) -> str:
-        return self.http[1] or f"/{self.name}"
+        return self.http.partition(" ")[2]
 
     @property
     def socket_name(self) -> str:
-        return self.at_socket or self.name
+        return self.names.socket or self.name
 
     @property
     def words(self) -> str:
-        """The command after ``velatura``: a verb of ``velatura kiosk``, if it is not ``within`` another."""
-        return self.within or f"kiosk {self.command or self.name}"
+        """The command after ``velatura``: a verb of ``velatura kiosk``, if it is not part of another."""
+        return self.names.part_of or f"kiosk {self.names.command or self.name}"
 
     @property
     def building_verb(self) -> str:
         """Its name for building control, which may only change what the stage shows; else empty."""
         allowed = self.effect is Effect.SHOWS and self.role <= Role.OPERATOR and self.holder == "kiosk"
-        return (self.verb or self.name) if allowed else ""
+        return (self.names.verb or self.name) if allowed else ""
 
-    @property
+    @cached_property
     def upload(self) -> Field | None:
         """The field that is the whole body of the request."""
-        return next((field for field in self.fields if field.kind == "file"), None)
+        return next((field for field in self.fields if field.sent is Sent.FILE), None)
 
     @property
     def changes(self) -> bool:
@@ -128,24 +169,41 @@ class Operation:
         """The place of the field in a request."""
         if f"{{{field.name}}}" in self.path:
             return "path"
-        if self.upload is not None and field.kind != "file":
+        if self.upload is not None and field is not self.upload:
             return "query"
         return "body" if self.changes else "query"
-
-    def of(self, holder: Any, values: Values) -> Any:
-        """Call the holder's method. Raises what it raises."""
-        method = getattr(holder, self.call or self.name.replace("-", "_"))
-        return self.part(method(**self.take(values)), values)
 
     def question(self, values: Values) -> str:
         """``asks``, with the values in it; empty if it does not ask."""
         return self.asks.format_map(values)
+
+    def sentence(self, values: Values) -> str:
+        """``done``, with the values in it."""
+        return self.done.format_map(values)
 
     def done_by(self, who: str, values: Values) -> str:
         """A line for the event log; it has names, and no other values."""
         named = ", ".join(str(values[key]) for key in ("name", "projector", "role", "kind") if values.get(key))
         return f"{who}: {self.about} ({named})." if named else f"{who}: {self.about}."
 
-    def sentence(self, values: Values) -> str:
-        """``said``, with the values in it."""
-        return self.said.format_map(values)
+
+_PLAIN: Final = Names()
+
+
+def operation(
+    http: str, role: Role, effect: Effect, *, done: str = "Done.", asks: str = "", names: Names = _PLAIN,
+    offline: bool = False,
+) -> Callable[[Callable[..., Any]], Operation]:  # fmt: skip
+    """Make an operation of the function below; see ``Operation``."""
+
+    def declared(function: Callable[..., Any]) -> Operation:
+        return Operation(function, http, role, effect, done, asks, names, offline)
+
+    return declared
+
+
+def _without_none(hint: Any) -> Any:
+    """``X`` of ``X | None``."""
+    kinds = [kind for kind in getattr(hint, "__args__", ()) if kind is not NoneType]
+    optional = not hasattr(hint, "__metadata__") and NoneType in getattr(hint, "__args__", ())
+    return kinds[0] if optional else hint

@@ -1,303 +1,533 @@
-"""The table of operations. A new one needs a declaration here and a method of ``StageKiosk`` (of ``FolderKiosk`` if it
-works offline).
+"""Every operation of a kiosk: a function for each, from which HTTP, socket, commands and building control are made.
+
+To add one, write a function here and the method of ``Kiosk`` that it calls (of ``FolderKiosk``, too, if it works
+offline). The types of its arguments say what may be sent; its docstring is the text of the help and of the document.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Protocol
 
-from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
 from controller.kiosk.decide.days import expanded
+from controller.kiosk.interface import (
+    Aiming,
+    Appearance,
+    Changes,
+    Comparison,
+    Computed,
+    EventRow,
+    Finding,
+    Fit,
+    FoundDevice,
+    Job,
+    Kiosk,
+    KioskState,
+    LampDay,
+    Reach,
+    Results,
+    Scene,
+    Schedule,
+    ScheduleRow,
+    TriedDevice,
+)
 from controller.kiosk.operations.accounts import ACCOUNT_OPERATIONS
-from controller.kiosk.operations.fields import NAME, Field, Flag
-from controller.kiosk.operations.operation import Answer, Effect, Operation, Values
+from controller.kiosk.operations.arguments import (
+    MOST_EVENTS,
+    AfterNumber,
+    AppearanceName,
+    BackupFile,
+    Black,
+    CheckTime,
+    ComparisonPicture,
+    DeviceKey,
+    FadeSeconds,
+    FitName,
+    FullOrQuick,
+    Hours,
+    HoursRow,
+    Identifying,
+    JobNumber,
+    MostEvents,
+    NewName,
+    OnlyAppearance,
+    OnlyLevel,
+    OnlyProjector,
+    Outline,
+    Paused,
+    Percent,
+    PictureFile,
+    ProjectorName,
+    ReachPicture,
+    RunName,
+    SceneName,
+    StageText,
+    TargetFile,
+    TargetKey,
+    TimeZone,
+    UpToNumber,
+)
+from controller.kiosk.operations.operation import (
+    Download,
+    Effect,
+    Jpeg,
+    Names,
+    Operation,
+    Page,
+    Picture,
+    operation,
+)
 from controller.kiosk.roles import Role
-from controller.kiosk.values import NewTarget, Schedule, ScheduleRow
+from controller.kiosk.values import NewTarget
 
 VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN
 LOOKS, SHOWS, CHANGES, WORKS = Effect.LOOKS, Effect.SHOWS, Effect.CHANGES, Effect.WORKS
-_ABOUT_NAME: Final = "an appearance's name, 1 to 64 letters, digits, spaces, dots, dashes"
-APPEARANCE: Final = Field("name", _ABOUT_NAME, pattern=NAME, names="appearance")
-NEW_NAME: Final = Field("name", "a name of 1 to 64 letters, digits, - and _; the first is a letter or digit",
-                        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", names="appearance")  # fmt: skip
-"""The same rule as in stage.toml."""
-TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
-DAY: Final = r"^[^\u0000-\u001f\u007f]+$"
-"""Which days it names, ``decide.days`` finds out."""
-ROW: Final = (
-    Field("day", ALLOWED_DAYS, pattern=DAY, longest=64),
-    Field("opens", "a time such as 10:00; default: closed", pattern=TIME, longest=5, required=False),
-    Field("closes", "a time such as 18:00; default: closed", pattern=TIME, longest=5, required=False),
-    Field(
-        "appearance",
-        "an appearance's name, or * for all in turn; default: the last one",
-        pattern=rf"^({NAME[1:-1]}|\*)?$",
-        required=False,
-    ),
+
+
+class Targets(Protocol):
+    """The uploaded targets of a panel; ``controller.panel.uploads`` has them."""
+
+    def add(self, uploaded: Path, fit: Fit = "fit") -> str: ...
+    def restrict(self, key: str, text: str) -> None: ...
+    def path(self, key: str) -> Path: ...
+
+
+# -- the stage now
+
+
+@operation("GET /state", VIEWER, LOOKS, names=Names(socket="status", part_of="kiosk status"))
+def state(kiosk: Kiosk) -> KioskState:
+    """The state, as on the first page."""
+    return kiosk.snapshot()
+
+
+@operation("GET /events", VIEWER, LOOKS, names=Names(part_of="kiosk events"), offline=True)
+def events(
+    kiosk: Kiosk, after: AfterNumber = 0, level: OnlyLevel | None = None, most: MostEvents = MOST_EVENTS
+) -> Sequence[EventRow]:
+    """The event log, oldest first."""
+    return [row for row in kiosk.events(after) if level in (None, row.level)][-most:]
+
+
+@operation("POST /start", OPERATOR, SHOWS, done="The stage opens.", names=Names(verb="open"))
+def start(kiosk: Kiosk) -> None:
+    """Switch the lamps on, and play. It stays open until the next scheduled change."""
+    kiosk.start()
+
+
+@operation("POST /stop", OPERATOR, SHOWS, done="The stage closes; the lamps cool down.",
+           asks="Close the stage? It becomes black, and the lamps have to cool before they can be lit again.",
+           names=Names(verb="close"))  # fmt: skip
+def stop(kiosk: Kiosk) -> None:
+    """Stop playing, and cool the lamps down. It stays closed until the next scheduled change."""
+    kiosk.stop()
+
+
+@operation("POST /play", OPERATOR, SHOWS, done="{name} plays now.", names=Names(command="show"))
+def play(kiosk: Kiosk, name: AppearanceName, fade_s: FadeSeconds | None = None) -> None:
+    """Show this appearance now. A closed stage opens."""
+    kiosk.play(name, fade_s)
+
+
+@operation("POST /rotate", OPERATOR, SHOWS, done="All appearances are shown in turn.")
+def rotate(kiosk: Kiosk) -> None:
+    """Show all appearances in turn, with their times and fades. Their times are shown_s and fade_s in stage.toml. A
+    closed stage opens.
+    """
+    kiosk.rotate()
+
+
+@operation("POST /next", OPERATOR, SHOWS, done="The next appearance is shown.", names=Names("next"))
+def next_appearance(kiosk: Kiosk, fade_s: FadeSeconds | None = None) -> None:
+    """Show the next appearance. The order is that of the playlist, else of the bundle."""
+    kiosk.next(fade_s)
+
+
+@operation("POST /black", OPERATOR, SHOWS)
+def black(kiosk: Kiosk, on: Black, fade_s: FadeSeconds | None = None) -> None:
+    """Show black with the lamps lit, or the picture again. It ends when an appearance is chosen, or when the stage
+    closes.
+    """
+    kiosk.black(on, fade_s)
+
+
+@operation("POST /pause", OPERATOR, SHOWS)
+def pause(kiosk: Kiosk, on: Paused) -> None:
+    """Stay at the present appearance, or continue. It ends when an appearance is chosen, or when the stage closes."""
+    kiosk.pause(on)
+
+
+@operation("POST /brightness", OPERATOR, SHOWS, done="The brightness is {percent} %.")
+def brightness(kiosk: Kiosk, percent: Percent) -> None:
+    """Show a share of the light. It is 100 again when the stage closes."""
+    kiosk.brightness(percent)
+
+
+@operation("POST /identify", OPERATOR, SHOWS, done="Look at the projectors.")
+def identify(kiosk: Kiosk, on: Identifying) -> None:
+    """Show each projector's name on it, or stop that."""
+    kiosk.identify(on)
+
+
+@operation("GET /camera", VIEWER, LOOKS, names=Names(socket="camera-picture", part_of="kiosk aim"))
+def camera(kiosk: Kiosk) -> Jpeg:
+    """What the camera sees."""
+    return kiosk.camera_picture()
+
+
+@operation("GET /photograph", VIEWER, LOOKS, names=Names(part_of="kiosk status"))
+def photograph(kiosk: Kiosk) -> Jpeg:
+    """The newest photograph of the job that runs."""
+    return kiosk.photograph()
+
+
+@operation("GET /lamps", VIEWER, LOOKS, names=Names(command="lamps"), offline=True)
+def lamp_history(kiosk: Kiosk) -> Sequence[LampDay]:
+    """Hours and strikes of each lamp, day by day."""
+    return kiosk.lamp_history()
+
+
+# -- jobs
+
+
+@operation(
+    "POST /recalibrations", OPERATOR, WORKS, done="The recalibration has started.", names=Names(command="calibrate")
 )
-SCHEDULE: Final = (
-    Field("time_zone", "a time zone such as Europe/Vienna", pattern=r"^[A-Za-z][A-Za-z0-9_+/-]{1,63}$"),
-    Field("drift_check", "the time of the nightly check, such as 03:00", pattern=TIME, longest=5, required=False),
-    Field("rows", "the opening hours, at most 400 rows", kind="rows", most=400, columns=ROW),
+def recalibrate(kiosk: Kiosk, kind: FullOrQuick, projector: OnlyProjector | None = None) -> Job:
+    """Calibrate on the running kiosk."""
+    return kiosk.recalibrate(kind, projector)
+
+
+@operation("POST /cancel", OPERATOR, CHANGES, done="The job ends at its next safe point.")
+def cancel(kiosk: Kiosk) -> None:
+    """End the running job at its next safe point."""
+    kiosk.cancel()
+
+
+@operation("POST /appearances", OPERATOR, WORKS, done="The computation has started.", names=Names(command="add"))
+def compute(kiosk: Kiosk, name: NewName, target: TargetFile, fit: FitName = "fit") -> Job:
+    """Compute an appearance from a target picture. The target is added to stage.toml as an appearance, and
+    installed.
+    """
+    return kiosk.compute(name, target, fit)
+
+
+@operation("POST /appearances/rendered", OPERATOR, WORKS, done="The computation has started.",
+           names=Names(part_of="appearance"))  # fmt: skip
+def compute_scene(kiosk: Kiosk, name: NewName, scene: SceneName) -> Job:
+    """Render a scene with Blender, and compute an appearance from it. The scene is added to stage.toml as an
+    appearance; each calibration renders it again.
+    """
+    return kiosk.compute_scene(name, scene)
+
+
+@operation("POST /comparisons", OPERATOR, WORKS, names=Names(command="photograph"),
+           done="The appearances are shown and photographed, one after the other.")  # fmt: skip
+def compare(kiosk: Kiosk, name: OnlyAppearance | None = None) -> Job:
+    """Photograph the installed appearances, and compare them with their targets."""
+    return kiosk.compare(name)
+
+
+@operation(
+    "POST /aiming/shots", TECHNICIAN, WORKS, done="The test shots have started.", names=Names(part_of="kiosk aim")
 )
-TARGET_KEY: Final = r"^[0-9a-f]{24}$"
-TARGET: Final = Field("target", "the key of an uploaded target", "target", pattern=TARGET_KEY, longest=24,
-                      metavar="PNG")  # fmt: skip
-FIT: Final = Field(
-    "fit", "how a picture of another size is fitted to the camera's view: fit (whole picture), fill (edges are cut), "
-    "crop (original pixels) or wrap (around the object); default: fit", required=False,
-    choices=("fit", "fill", "crop", "wrap"),
-)  # fmt: skip
-SETTINGS: Final = Field("text", "the text of stage.toml", longest=1 << 20)
-RUN: Final = Field("run", "a run's name", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$", longest=96)
-_KINDS: Final = ("before", "target", "achieved", "error", "resolution")
-PICTURE: Final = Field("picture", "before, target, achieved, error or resolution", choices=_KINDS)
-REACH_PICTURE: Final = Field("picture", "target, result or map", choices=("target", "result", "map"))
-MOST_EVENTS: Final = 2000
-EVENTS: Final = (
-    Field("after", "only events after this number", "integer", False, most=1e12),
-    Field("level", "only this level", required=False, choices=("info", "warning", "error")),
-    Field("most", "only this many of the newest events", "integer", False, least=1, most=MOST_EVENTS),
+def test_shots(kiosk: Kiosk) -> Job:
+    """Take test shots that show how projectors and camera are aimed."""
+    return kiosk.test_shots()
+
+
+# -- appearances
+
+
+@operation("GET /appearances", VIEWER, LOOKS, offline=True)
+def appearances(kiosk: Kiosk) -> Sequence[Appearance]:
+    """List the appearances."""
+    return kiosk.appearances()
+
+
+@operation("GET /appearances/{name}/preview", VIEWER, LOOKS, names=Names(part_of="bundle inspect"), offline=True)
+def preview(kiosk: Kiosk, name: AppearanceName) -> Picture:
+    """A picture of how an appearance will look."""
+    return next((row.preview for row in kiosk.appearances() if row.name == name), None)
+
+
+@operation("GET /appearances/{name}/projectors/{projector}", VIEWER, LOOKS, names=Names(part_of="bundle inspect"),
+           offline=True)  # fmt: skip
+def projector_picture(kiosk: Kiosk, name: AppearanceName, projector: ProjectorName) -> Picture:
+    """A small picture of what a projector shows of an appearance."""
+    return kiosk.projector_picture(name, projector)
+
+
+@operation("GET /view", OPERATOR, LOOKS, offline=True, names=Names(command="canvas"))
+def view(kiosk: Kiosk) -> Picture:
+    """The object in white light as the camera sees it, to paint a target on."""
+    return kiosk.view()
+
+
+@operation("DELETE /appearances/{name}", TECHNICIAN, CHANGES, done="A new bundle without {name} is being made.",
+           asks="Remove the appearance {name}?", names=Names(command="remove"))  # fmt: skip
+def remove_appearance(kiosk: Kiosk, name: AppearanceName) -> None:
+    """Remove an appearance. An appearance that is playing, or that is in the schedule, can't be removed."""
+    kiosk.remove_appearance(name)
+
+
+@operation("POST /targets", OPERATOR, CHANGES, done="The picture is uploaded.", names=Names(part_of="kiosk add"))
+def upload_target(targets: Targets, file: PictureFile, fit: FitName = "fit") -> NewTarget:
+    """Upload a picture as a target."""
+    return NewTarget(targets.add(file, fit))
+
+
+@operation("GET /targets/{target}", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))
+def target_picture(targets: Targets, target: TargetKey) -> Picture:
+    """An uploaded target, as it is stored."""
+    return targets.path(target)
+
+
+@operation("PUT /targets/{target}/outline", OPERATOR, CHANGES, done="The outline is used.",
+           names=Names(part_of="kiosk add"))  # fmt: skip
+def outline_target(targets: Targets, target: TargetKey, outline: Outline) -> None:
+    """Use only these parts of an uploaded target; everything else stays dark."""
+    targets.restrict(target, outline)
+
+
+@operation("GET /targets/{target}/reach", OPERATOR, LOOKS, offline=True)
+def reach(kiosk: Kiosk, target: TargetFile) -> Reach:
+    """How much of a target the projectors can make."""
+    return kiosk.reach(target)
+
+
+@operation("GET /targets/{target}/reach/{picture}", OPERATOR, LOOKS, offline=True, names=Names(part_of="kiosk reach"))
+def reach_picture(kiosk: Kiosk, target: TargetFile, picture: ReachPicture) -> Picture:
+    """The target, what it will look like, or a map of what is out of reach."""
+    return kiosk.reach(target).pictures.get(picture)
+
+
+@operation("GET /targets/{target}/computed", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))
+def computed_preview(kiosk: Kiosk, target: TargetFile) -> Computed:
+    """What the object will look like by a whole solve on a graphics processor."""
+    return kiosk.computed(target)
+
+
+@operation("GET /targets/{target}/computed/picture", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))
+def computed_picture(kiosk: Kiosk, target: TargetFile) -> Picture:
+    """A picture of a whole solve on a graphics processor."""
+    return kiosk.computed(target).pictures["result"]
+
+
+@operation("GET /targets/{target}/feasibility", OPERATOR, LOOKS, offline=True, names=Names(part_of="kiosk reach"))
+def feasibility(kiosk: Kiosk, target: TargetFile) -> Picture:
+    """A map of where the target can't be reached."""
+    return kiosk.reach(target).pictures["map"]
+
+
+@operation("GET /scenes", OPERATOR, LOOKS, names=Names(part_of="appearance"), offline=True)
+def scenes(kiosk: Kiosk) -> Sequence[Scene]:
+    """Scenes that Blender can render on the object."""
+    return kiosk.scenes()
+
+
+@operation("GET /scenes/{scene}/picture", OPERATOR, LOOKS, names=Names(part_of="appearance"), offline=True)
+def scene_picture(kiosk: Kiosk, scene: SceneName) -> Picture:
+    """A small picture of a scene."""
+    return next((row.preview for row in kiosk.scenes() if row.name == scene), None)
+
+
+@operation("GET /scenes/{scene}/reach", OPERATOR, LOOKS, names=Names(part_of="appearance"), offline=True)
+def scene_reach(kiosk: Kiosk, scene: SceneName) -> Reach:
+    """How much of a scene the projectors can make."""
+    return kiosk.scene_reach(scene)
+
+
+@operation("GET /scenes/{scene}/reach/{picture}", OPERATOR, LOOKS, names=Names(part_of="appearance"), offline=True)
+def scene_reach_picture(kiosk: Kiosk, scene: SceneName, picture: ReachPicture) -> Picture:
+    """The scene, what it will look like, or a map of what is out of reach."""
+    return kiosk.scene_reach(scene).pictures.get(picture)
+
+
+# -- results
+
+
+@operation("GET /comparisons", VIEWER, LOOKS, names=Names(part_of="kiosk results"), offline=True)
+def comparisons(kiosk: Kiosk) -> Sequence[Comparison]:
+    """How close the photographed appearances are to their targets."""
+    return kiosk.comparisons()
+
+
+@operation(
+    "GET /appearances/{name}/pictures/{picture}", VIEWER, LOOKS, names=Names(part_of="kiosk results"), offline=True
 )
-OUTLINE: Final = Field(
-    "outline", "regions as lists of corners [x, y], each from 0 to 1 of the picture, such as [[[0,0],[1,0],[1,1]]]",
-    longest=1 << 16,
-)  # fmt: skip
-SCENE: Final = Field("scene", "a scene's name, as `scenes` lists it", pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,47}$",
-                     longest=48)  # fmt: skip
-_FULL_OR_QUICK: Final = Field(
-    "kind", "full or quick", choices=("full", "quick"),
-    flag=Flag("--quick", "Redo only what changed since the last calibration.", "quick", "full"),
-)  # fmt: skip
-PROJECTOR: Final = Field("projector", "a projector's name", pattern=r"^[^\u0000-\u001f\u007f/\\]+$", names="projector")
-_ONE_PROJECTOR: Final = Field("projector", "only this projector", required=False,
-                              pattern=r"^[^\u0000-\u001f\u007f/\\]+$", names="projector")  # fmt: skip
-_IDENTIFYING: Final = Field(
-    "on", "true or false", "boolean", flag=Flag("--off", "Stop identifying and resume.", False, True)
-)
-
-FADE: Final = Field("fade_s", "seconds of the fade, 0 to 600; default: as the playlist says", "number", False, most=600)
-PERCENT: Final = Field("percent", "share of the light, 0 to 100", "number", most=100)
-_BLACK: Final = Field("on", "true or false", "boolean", flag=Flag("--off", "Show the picture again.", False, True))
-_PAUSE: Final = Field("on", "true or false", "boolean", flag=Flag("--off", "Continue.", False, True))
+def comparison_picture(kiosk: Kiosk, name: AppearanceName, picture: ComparisonPicture) -> Picture:
+    """A picture of such a comparison."""
+    return next((row.pictures.get(picture) for row in kiosk.comparisons() if row.name == name), None)
 
 
-def _after(values: Values) -> Mapping[str, Any]:
-    return {"after": values.get("after", 0)}
+@operation("GET /runs", VIEWER, LOOKS, names=Names(part_of="kiosk results"), offline=True)
+def runs(kiosk: Kiosk) -> Sequence[str]:
+    """Runs with results, newest first."""
+    return kiosk.runs()
 
 
-def _chosen_events(rows: Any, values: Values) -> Any:
-    level = values.get("level")
-    return [row for row in rows if level in (None, row.level)][-values.get("most", MOST_EVENTS) :]
+@operation("GET /runs/{run}", VIEWER, LOOKS, names=Names(part_of="kiosk results"), offline=True)
+def results(kiosk: Kiosk, run: RunName) -> Results:
+    """Grade and figures of a run."""
+    return kiosk.results(run)
 
 
-def _schedule_of(values: Values) -> Mapping[str, Any]:
-    rows = tuple(
-        ScheduleRow(row["day"], row.get("opens", ""), row.get("closes", ""), row.get("appearance", ""))
-        for row in values["rows"]
-    )
-    return {"schedule": Schedule(values["time_zone"], expanded(rows), values.get("drift_check", ""))}
+@operation("GET /runs/{run}/pictures/{picture}", VIEWER, LOOKS, names=Names(part_of="kiosk results"), offline=True)
+def run_picture(kiosk: Kiosk, run: RunName, picture: ComparisonPicture) -> Picture:
+    """A picture of a run."""
+    return kiosk.results(run).pictures.get(picture)
 
 
-def _its_picture(answer: Any, values: Values) -> Any:
-    """The chosen picture of a result, or of the result in a list that has the name."""
-    if isinstance(answer, list | tuple):
-        answer = next((item for item in answer if item.name == values["name"]), None)
-    return None if answer is None else answer.pictures.get(values["picture"])
+@operation("GET /runs/{run}/report", VIEWER, LOOKS, names=Names(part_of="report"))
+def report(kiosk: Kiosk, run: RunName) -> Page:
+    """A run's report, one HTML file."""
+    return kiosk.report(run)
 
 
-def _preview(answer: Any, values: Values) -> Any:
-    return next((item.preview for item in answer if item.name == values["name"]), None)
+@operation("GET /aiming", TECHNICIAN, LOOKS, names=Names(part_of="kiosk aim"))
+def aiming(kiosk: Kiosk) -> Aiming:
+    """Coverage, focus and exposure now."""
+    return kiosk.aiming()
 
 
-def _nothing(values: Values) -> Mapping[str, Any]:
-    return {}
+@operation("GET /aiming/picture", TECHNICIAN, LOOKS, names=Names(part_of="kiosk aim"))
+def aiming_picture(kiosk: Kiosk) -> Picture:
+    """A picture of the object that marks the problems."""
+    return kiosk.aiming().picture
 
 
-def _uploaded(values: Values) -> Mapping[str, Any]:
-    return {"uploaded": values["file"], "fit": values.get("fit", "fit")}
+@operation("POST /failures/seen", OPERATOR, CHANGES, done="The failures are confirmed.", names=Names(command="confirm"))
+def seen(kiosk: Kiosk, number: UpToNumber | None = None) -> None:
+    """Confirm failures, so that they leave the state."""
+    kiosk.seen(number)
 
 
-def _only_target(values: Values) -> Mapping[str, Any]:
-    return {"target": values["target"]}
+# -- settings
 
 
-def _only_run(values: Values) -> Mapping[str, Any]:
-    return {"run": values["run"]}
+def schedule_of(time_zone: str, rows: list[HoursRow], drift_check: str = "") -> Schedule:
+    """The schedule of checked values. Raises UsageError for a day that does not exist."""
+    hours = tuple(ScheduleRow(row.day, row.opens, row.closes, row.appearance) for row in rows)
+    return Schedule(time_zone, expanded(hours), drift_check)
 
 
-OPERATIONS: Final[tuple[Operation, ...]] = (
-    # -- the stage now
-    Operation("state", "The state, as on the first page", VIEWER, LOOKS, call="snapshot", at_socket="status",
-              within="kiosk status"),
-    Operation("events", "The event log, oldest first", VIEWER, LOOKS, EVENTS, take=_after, part=_chosen_events,
-              offline=True, within="kiosk events"),
-    Operation("start", "Switch the lamps on, and play", OPERATOR, SHOWS, answer=Answer.NOTHING, verb="open",
-              said="The stage opens.",
-              more="It stays open until the next scheduled change."),
-    Operation("stop", "Stop playing, and cool the lamps down", OPERATOR, SHOWS, answer=Answer.NOTHING, verb="close",
-              said="The stage closes; the lamps cool down.",
-              asks="Close the stage? It becomes black, and the lamps have to cool before they can be lit again.",
-              more="It stays closed until the next scheduled change."),
-    Operation("play", "Show this appearance now", OPERATOR, SHOWS, (APPEARANCE, FADE), Answer.NOTHING, command="show",
-              said="{name} plays now.", more="A closed stage opens."),
-    Operation("rotate", "Show all appearances in turn, with their times and fades", OPERATOR, SHOWS,
-              answer=Answer.NOTHING, verb="rotate", said="All appearances are shown in turn.",
-              more="Their times are shown_s and fade_s in stage.toml. A closed stage opens."),
-    Operation("next", "Show the next appearance", OPERATOR, SHOWS, (FADE,), Answer.NOTHING,
-              said="The next appearance is shown.", more="The order is that of the playlist, else of the bundle."),
-    Operation("black", "Show black with the lamps lit, or the picture again", OPERATOR, SHOWS, (_BLACK, FADE),
-              Answer.NOTHING, said="Done.", more="It ends when an appearance is chosen, or when the stage closes."),
-    Operation("pause", "Stay at the present appearance, or continue", OPERATOR, SHOWS, (_PAUSE,), Answer.NOTHING,
-              said="Done.", more="It ends when an appearance is chosen, or when the stage closes."),
-    Operation("brightness", "Show a share of the light", OPERATOR, SHOWS, (PERCENT,), Answer.NOTHING,
-              said="The brightness is {percent} %.", more="It is 100 again when the stage closes."),
-    Operation("identify", "Show each projector's name on it, or stop that", OPERATOR, SHOWS, (_IDENTIFYING,),
-              Answer.NOTHING, said="Look at the projectors."),
-    Operation("camera", "What the camera sees", VIEWER, LOOKS, answer=Answer.JPEG, call="camera_picture",
-              at_socket="camera-picture", within="kiosk aim"),
-    Operation("photograph", "The newest photograph of the job that runs", VIEWER, LOOKS, answer=Answer.JPEG,
-              within="kiosk status"),
-    Operation("lamp-history", "Hours and strikes of each lamp, day by day", VIEWER, LOOKS, offline=True,
-              http=("GET", "/lamps"), command="lamps"),
-    # -- jobs
-    Operation("recalibrate", "Calibrate on the running kiosk", OPERATOR, WORKS, (_FULL_OR_QUICK, _ONE_PROJECTOR),
-              http=("POST", "/recalibrations"), command="calibrate", said="The recalibration has started."),
-    Operation("cancel", "End the running job at its next safe point", OPERATOR, CHANGES, answer=Answer.NOTHING,
-              said="The job ends at its next safe point."),
-    Operation("compute", "Compute an appearance from a target picture", OPERATOR, WORKS, (NEW_NAME, TARGET, FIT),
-              http=("POST", "/appearances"), command="add", said="The computation has started.",
-              more="The target is added to stage.toml as an appearance, and installed."),
-    Operation("compute-scene", "Render a scene with Blender, and compute an appearance from it", OPERATOR, WORKS,
-              (NEW_NAME, SCENE), http=("POST", "/appearances/rendered"), within="appearance",
-              said="The computation has started.",
-              more="The scene is added to stage.toml as an appearance; each calibration renders it again."),
-    Operation("compare", "Photograph the installed appearances, and compare them with their targets", OPERATOR, WORKS,
-              (Field("name", "only this appearance", required=False, pattern=NAME, names="appearance", argument=True),),
-              http=("POST", "/comparisons"), command="photograph",
-              said="The appearances are shown and photographed, one after the other."),
-    Operation("test-shots", "Take test shots that show how projectors and camera are aimed", TECHNICIAN, WORKS,
-              http=("POST", "/aiming/shots"), within="kiosk aim", said="The test shots have started."),
-    # -- appearances
-    Operation("appearances", "List the appearances", VIEWER, LOOKS, offline=True),
-    Operation("preview", "A picture of how an appearance will look", VIEWER, LOOKS, (APPEARANCE,), Answer.PICTURE,
-              call="appearances", take=_nothing, part=_preview, offline=True,
-              http=("GET", "/appearances/{name}/preview"), within="bundle inspect"),
-    Operation("projector-picture", "A small picture of what a projector shows of an appearance", VIEWER, LOOKS,
-              (APPEARANCE, PROJECTOR), Answer.PICTURE, offline=True,
-              http=("GET", "/appearances/{name}/projectors/{projector}"), within="bundle inspect"),
-    Operation("view", "The object in white light as the camera sees it, to paint a target on", OPERATOR, LOOKS,
-              answer=Answer.PICTURE, offline=True, command="canvas"),
-    Operation("remove-appearance", "Remove an appearance", TECHNICIAN, CHANGES, (APPEARANCE,), Answer.NOTHING,
-              http=("DELETE", "/appearances/{name}"), command="remove", asks="Remove the appearance {name}?",
-              said="A new bundle without {name} is being made.",
-              more="An appearance that is playing, or that is in the schedule, can't be removed."),
-    Operation("upload-target", "Upload a picture as a target", OPERATOR, CHANGES,
-              (Field("file", "a PNG, JPEG, TIFF or WebP", "file"), FIT), holder="targets", call="add",
-              take=_uploaded, part=lambda key, values: NewTarget(key), gives=NewTarget,
-              http=("POST", "/targets"), within="kiosk add", said="The picture is uploaded."),
-    Operation("target-picture", "An uploaded target, as it is stored", OPERATOR, LOOKS,
-              (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24),), Answer.PICTURE, holder="targets",
-              call="path", take=lambda values: {"key": values["target"]}, http=("GET", "/targets/{target}"),
-              within="kiosk add"),
-    Operation("outline-target", "Use only these parts of an uploaded target; everything else stays dark", OPERATOR,
-              CHANGES, (Field("target", TARGET.about, pattern=TARGET_KEY, longest=24), OUTLINE), Answer.NOTHING,
-              holder="targets", call="restrict",
-              take=lambda values: {"key": values["target"], "text": values["outline"]},
-              http=("PUT", "/targets/{target}/outline"), within="kiosk add", said="The outline is used."),
-    Operation("reach", "How much of a target the projectors can make", OPERATOR, LOOKS, (TARGET,), offline=True,
-              http=("GET", "/targets/{target}/reach")),
-    Operation("reach-picture", "The target, what it will look like, or a map of what is out of reach", OPERATOR, LOOKS,
-              (TARGET, REACH_PICTURE), Answer.PICTURE, call="reach", take=_only_target, part=_its_picture,
-              offline=True, http=("GET", "/targets/{target}/reach/{picture}"), within="kiosk reach"),
-    Operation("computed-preview", "What the object will look like by a whole solve on a graphics processor", OPERATOR,
-              LOOKS, (TARGET,), call="computed", http=("GET", "/targets/{target}/computed"), within="kiosk add"),
-    Operation("computed-picture", "A picture of a whole solve on a graphics processor", OPERATOR, LOOKS, (TARGET,),
-              Answer.PICTURE, call="computed", part=lambda found, values: found.pictures["result"],
-              http=("GET", "/targets/{target}/computed/picture"), within="kiosk add"),
-    Operation("feasibility", "A map of where the target can't be reached", OPERATOR, LOOKS, (TARGET,), Answer.PICTURE,
-              call="reach", part=lambda found, values: found.pictures["map"], offline=True,
-              http=("GET", "/targets/{target}/feasibility"), within="kiosk reach"),
-    Operation("scenes", "Scenes that Blender can render on the object", OPERATOR, LOOKS, offline=True,
-              within="appearance"),
-    Operation("scene-picture", "A small picture of a scene", OPERATOR, LOOKS, (SCENE,), Answer.PICTURE, call="scenes",
-              take=_nothing, part=lambda found, values: next(
-                  (one.preview for one in found if one.name == values["scene"]), None),
-              offline=True, http=("GET", "/scenes/{scene}/picture"), within="appearance"),
-    Operation("scene-reach", "How much of a scene the projectors can make", OPERATOR, LOOKS, (SCENE,), offline=True,
-              http=("GET", "/scenes/{scene}/reach"), within="appearance"),
-    Operation("scene-reach-picture", "The scene, what it will look like, or a map of what is out of reach", OPERATOR,
-              LOOKS, (SCENE, REACH_PICTURE), Answer.PICTURE, call="scene_reach",
-              take=lambda values: {"scene": values["scene"]}, part=_its_picture, offline=True,
-              http=("GET", "/scenes/{scene}/reach/{picture}"), within="appearance"),
-    # -- results
-    Operation("comparisons", "How close the photographed appearances are to their targets", VIEWER, LOOKS, offline=True,
-              within="kiosk results"),
-    Operation("comparison-picture", "A picture of such a comparison", VIEWER, LOOKS, (APPEARANCE, PICTURE),
-              Answer.PICTURE, call="comparisons", take=_nothing, part=_its_picture, offline=True,
-              http=("GET", "/appearances/{name}/pictures/{picture}"), within="kiosk results"),
-    Operation("runs", "Runs with results, newest first", VIEWER, LOOKS, offline=True, within="kiosk results"),
-    Operation("results", "Grade and figures of a run", VIEWER, LOOKS, (RUN,), offline=True, http=("GET", "/runs/{run}"),
-              within="kiosk results"),
-    Operation("run-picture", "A picture of a run", VIEWER, LOOKS, (RUN, PICTURE), Answer.PICTURE, call="results",
-              take=_only_run, part=_its_picture, offline=True, http=("GET", "/runs/{run}/pictures/{picture}"),
-              within="kiosk results"),
-    Operation("report", "A run's report, one HTML file", VIEWER, LOOKS, (RUN,), Answer.PAGE,
-              http=("GET", "/runs/{run}/report"), within="report"),
-    Operation("aiming", "Coverage, focus and exposure now", TECHNICIAN, LOOKS, within="kiosk aim"),
-    Operation("aiming-picture", "A picture of the object that marks the problems", TECHNICIAN, LOOKS,
-              answer=Answer.PICTURE, call="aiming", part=lambda aiming, values: aiming.picture,
-              http=("GET", "/aiming/picture"), within="kiosk aim"),
-    Operation("seen", "Confirm failures, so that they leave the state", OPERATOR, CHANGES,
-              (Field("number", "the event number of the newest one to confirm; default: all", "integer", False,
-                     most=1e12),),
-              Answer.NOTHING, http=("POST", "/failures/seen"), command="confirm", said="The failures are confirmed."),
-    # -- settings
-    Operation("schedule", "Opening hours", VIEWER, LOOKS, offline=True, within="kiosk schedule"),
-    Operation("set-schedule", "Replace the opening hours", OPERATOR, CHANGES, SCHEDULE, Answer.NOTHING,
-              take=_schedule_of, offline=True, http=("PUT", "/schedule"), within="kiosk schedule",
-              said="The schedule is in use."),
-    Operation("effect-of-schedule", "What people see when this schedule is saved", OPERATOR, LOOKS, SCHEDULE,
-              Answer.TEXT, take=_schedule_of, offline=True, http=("POST", "/schedule/effect"), within="kiosk schedule"),
-    Operation("settings", "The text of stage.toml", TECHNICIAN, LOOKS, answer=Answer.TEXT, offline=True,
-              within="kiosk settings"),
-    Operation("check-settings", "Check a stage.toml without saving it", TECHNICIAN, LOOKS, (SETTINGS,), Answer.NOTHING,
-              call="validate_settings", offline=True, http=("POST", "/settings/check"), at_socket="validate-settings",
-              within="kiosk settings", said="The settings are valid."),
-    Operation("effect-of-settings", "What people see when this stage.toml is saved", TECHNICIAN, LOOKS, (SETTINGS,),
-              Answer.TEXT, offline=True, http=("POST", "/settings/effect"), within="kiosk settings"),
-    Operation("save-settings", "Check stage.toml, save it, and apply it", TECHNICIAN, CHANGES, (SETTINGS,),
-              Answer.NOTHING, offline=True, http=("PUT", "/settings"), within="kiosk settings",
-              said="The settings are in use."),
-    # -- maintenance
-    Operation("doctor", "Find problems", OPERATOR, LOOKS, http=("POST", "/doctor"), within="doctor"),
-    Operation("changes", "What changed since the last good day", OPERATOR, LOOKS, offline=True,
-              more="Kernel, drivers, packages, outputs, adapters, projectors, camera, settings, clock, network."),
-    Operation("test-alerts", "Send a test alert to everybody that stage.toml names", TECHNICIAN, CHANGES,
-              answer=Answer.NOTHING, http=("POST", "/alerts/test"), said="The test alert was taken by every server."),
-    Operation("test-backup", "Make a backup now at every place that stage.toml names, and read it back", TECHNICIAN,
-              CHANGES, answer=Answer.NOTHING, http=("POST", "/backup/test"),
-              said="The backup is at every place, and was read back."),
-    Operation("backup", "Make a backup of settings, calibration and appearances", TECHNICIAN, LOOKS, answer=Answer.FILE,
-              offline=True, http=("POST", "/backup"), more="It does not contain accounts and keys."),
-    Operation("restore", "Replace settings, calibration and appearances with a backup", TECHNICIAN, CHANGES,
-              (Field("backup", "a Velatura backup", "file", metavar="FILE"),), Answer.NOTHING, offline=True,
-              said="The backup is in use.",
-              asks="Replace settings, calibration and appearances with those of the backup?"),
-    Operation("diagnostics", "Make a diagnostics file for remote support", TECHNICIAN, LOOKS, answer=Answer.FILE,
-              offline=True, http=("POST", "/diagnostics"),
-              more="It contains events, journals and states, but no secrets and no pictures."),
-    Operation("find-devices", "Search for devices", TECHNICIAN, LOOKS, http=("POST", "/devices/found"),
-              within="doctor"),
-    Operation("try-device", "Open a found device and read its identity", TECHNICIAN, LOOKS,
-              (Field("key", "the key of a found device", longest=256),), http=("POST", "/devices/tried"),
-              within="doctor"),
-    *ACCOUNT_OPERATIONS,
-)  # fmt: skip
+@operation("GET /schedule", VIEWER, LOOKS, names=Names(part_of="kiosk schedule"), offline=True)
+def schedule(kiosk: Kiosk) -> Schedule:
+    """Opening hours."""
+    return kiosk.schedule()
 
-JOB: Final = Operation(
-    "job", "A requested job, also after it has ended", VIEWER, LOOKS,
-    (Field("number", "the number that was returned when the job was requested", "integer", most=1e12),),
-)  # fmt: skip
-"""For a client that follows a job at the socket; all others see the last job in the state."""
+
+@operation("PUT /schedule", OPERATOR, CHANGES, done="The schedule is in use.", names=Names(part_of="kiosk schedule"),
+           offline=True)  # fmt: skip
+def set_schedule(kiosk: Kiosk, time_zone: TimeZone, rows: Hours, drift_check: CheckTime = "") -> None:
+    """Replace the opening hours."""
+    kiosk.set_schedule(schedule_of(time_zone, rows, drift_check))
+
+
+@operation("POST /schedule/effect", OPERATOR, LOOKS, names=Names(part_of="kiosk schedule"), offline=True)
+def effect_of_schedule(kiosk: Kiosk, time_zone: TimeZone, rows: Hours, drift_check: CheckTime = "") -> str:
+    """What people see when this schedule is saved."""
+    return kiosk.effect_of_schedule(schedule_of(time_zone, rows, drift_check))
+
+
+@operation("GET /settings", TECHNICIAN, LOOKS, names=Names(part_of="kiosk settings"), offline=True)
+def settings(kiosk: Kiosk) -> str:
+    """The text of stage.toml."""
+    return kiosk.settings()
+
+
+@operation("POST /settings/check", TECHNICIAN, LOOKS, done="The settings are valid.",
+           names=Names(socket="validate-settings", part_of="kiosk settings"), offline=True)  # fmt: skip
+def check_settings(kiosk: Kiosk, text: StageText) -> None:
+    """Check a stage.toml without saving it."""
+    kiosk.validate_settings(text)
+
+
+@operation("POST /settings/effect", TECHNICIAN, LOOKS, names=Names(part_of="kiosk settings"), offline=True)
+def effect_of_settings(kiosk: Kiosk, text: StageText) -> str:
+    """What people see when this stage.toml is saved."""
+    return kiosk.effect_of_settings(text)
+
+
+@operation("PUT /settings", TECHNICIAN, CHANGES, done="The settings are in use.", names=Names(part_of="kiosk settings"),
+           offline=True)  # fmt: skip
+def save_settings(kiosk: Kiosk, text: StageText) -> None:
+    """Check stage.toml, save it, and apply it."""
+    kiosk.save_settings(text)
+
+
+# -- maintenance
+
+
+@operation("POST /doctor", OPERATOR, LOOKS, names=Names(part_of="doctor"))
+def doctor(kiosk: Kiosk) -> Sequence[Finding]:
+    """Find problems."""
+    return kiosk.doctor()
+
+
+@operation("GET /changes", OPERATOR, LOOKS, offline=True)
+def changes(kiosk: Kiosk) -> Changes:
+    """What changed since the last good day. Kernel, drivers, packages, outputs, adapters, projectors, camera, settings,
+    clock, network.
+    """
+    return kiosk.changes()
+
+
+@operation("POST /alerts/test", TECHNICIAN, CHANGES, done="The test alert was taken by every server.")
+def test_alerts(kiosk: Kiosk) -> None:
+    """Send a test alert to everybody that stage.toml names."""
+    kiosk.test_alerts()
+
+
+@operation("POST /backup/test", TECHNICIAN, CHANGES, done="The backup is at every place, and was read back.")
+def test_backup(kiosk: Kiosk) -> None:
+    """Make a backup now at every place that stage.toml names, and read it back."""
+    kiosk.test_backup()
+
+
+@operation("POST /backup", TECHNICIAN, LOOKS, offline=True)
+def backup(kiosk: Kiosk) -> Download:
+    """Make a backup of settings, calibration and appearances. It does not contain accounts and keys."""
+    return kiosk.backup()
+
+
+@operation("POST /restore", TECHNICIAN, CHANGES, done="The backup is in use.",
+           asks="Replace settings, calibration and appearances with those of the backup?", offline=True)  # fmt: skip
+def restore(kiosk: Kiosk, backup: BackupFile) -> None:
+    """Replace settings, calibration and appearances with a backup."""
+    kiosk.restore(backup)
+
+
+@operation("POST /diagnostics", TECHNICIAN, LOOKS, offline=True)
+def diagnostics(kiosk: Kiosk) -> Download:
+    """Make a diagnostics file for remote support. It contains events, journals and states, but no secrets and no
+    pictures.
+    """
+    return kiosk.diagnostics()
+
+
+@operation("POST /devices/found", TECHNICIAN, LOOKS, names=Names(part_of="doctor"))
+def find_devices(kiosk: Kiosk) -> Sequence[FoundDevice]:
+    """Search for devices."""
+    return kiosk.find_devices()
+
+
+@operation("POST /devices/tried", TECHNICIAN, LOOKS, names=Names(part_of="doctor"))
+def try_device(kiosk: Kiosk, key: DeviceKey) -> TriedDevice:
+    """Open a found device and read its identity."""
+    return kiosk.try_device(key)
+
+
+@operation("", VIEWER, LOOKS)
+def job(kiosk: Kiosk, number: JobNumber) -> Job | None:
+    """A requested job, also after it has ended. For a client that follows a job at the socket; all others see the last
+    job in the state.
+    """
+    return kiosk.job(number)
+
+
+_DECLARED: Final = (*(each for each in list(globals().values()) if isinstance(each, Operation)), *ACCOUNT_OPERATIONS)
+OPERATIONS: Final[tuple[Operation, ...]] = tuple(each for each in _DECLARED if each.http)
+AT_SOCKET: Final[tuple[Operation, ...]] = _DECLARED

@@ -15,9 +15,10 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from controller.core.errors import UsageError
-from controller.kiosk.operations.fields import parse
-from controller.kiosk.operations.operation import Answer, Operation, Values
-from controller.kiosk.operations.table import ROW
+from controller.kiosk.operations.arguments import HoursRow
+from controller.kiosk.operations.fields import Values, missing, parse
+from controller.kiosk.operations.operation import Answer, Operation
+from controller.kiosk.operations.table import schedule_of
 from controller.kiosk.values import NewTarget
 from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
@@ -27,6 +28,7 @@ from controller.panel.words.days import canonical
 from controller.panel.words.language import gettext
 
 MOST_FIELDS = 2000
+_COLUMNS: Final = tuple(HoursRow.model_fields)
 LEADS_TO: Final = {
     **dict.fromkeys(
         ("recalibrate", "cancel", "start", "stop", "identify", "compute", "compute-scene", "compare", "seen"), "/"
@@ -90,7 +92,7 @@ class Forms:
                 self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
-            visitor.session.notes.append(("good", gettext(operation.said).format_map(values)))
+            visitor.session.notes.append(("good", gettext(operation.done).format_map(values)))
             return RedirectResponse("/" if back == "/" else _then(operation, result, values), 303)
 
         return answer
@@ -101,7 +103,7 @@ class Forms:
             effect = await self._panel.in_thread(lambda: self._panel.kiosk.effect_of_settings(values["text"]))
             return " ".join((gettext("Save these settings now?"), effect)) if effect else ""
         if operation.name == "set-schedule":
-            schedule = operation.take(values)["schedule"]
+            schedule = schedule_of(**values)
             effect = await self._panel.in_thread(lambda: self._panel.kiosk.effect_of_schedule(schedule))
             return " ".join((gettext("Save these hours now?"), effect)) if effect else ""
         return gettext(operation.asks).format_map(values)
@@ -207,10 +209,13 @@ async def _read(form: FormData, sent: Sent, folder: Path) -> None:
 def _values(operation: Operation, sent: Sent) -> Values:
     if operation.name == "set-schedule":
         return _schedule_values(operation, sent)
-    values = parse(answers.fields_from_path(operation), sent.texts, strings=True)
-    if operation.upload is not None:
-        values |= parse((operation.upload,), {operation.upload.name: sent.file} if sent.file else {}, strings=False)
-    return values
+    file = operation.upload
+    values = parse([field for field in operation.fields if field is not file], sent.texts, strings=True)
+    if file is None:
+        return values
+    if sent.file is None:
+        raise missing(file.name, file.about)
+    return values | {file.name: sent.file}
 
 
 def _schedule_values(operation: Operation, sent: Sent) -> Values:
@@ -218,14 +223,11 @@ def _schedule_values(operation: Operation, sent: Sent) -> Values:
 
     Raises UsageError("form-cut") if the columns have different lengths, because hours would move to another row.
     """
-    columns = [sent.many.get(column.name, []) for column in ROW]
+    columns = [sent.many.get(name, []) for name in _COLUMNS]
     if len({len(column) for column in columns}) > 1:
         raise UsageError("form-cut", what="The table of hours is incomplete.", remedy="Load the page again.")
     rows = [
-        {
-            column.name: canonical(text) if column.name == "day" else text.strip()
-            for column, text in zip(ROW, row, strict=True)
-        }
+        {name: canonical(text) if name == "day" else text.strip() for name, text in zip(_COLUMNS, row, strict=True)}
         for row in zip(*columns, strict=True)
         if row[0].strip()
     ]
@@ -235,9 +237,9 @@ def _schedule_values(operation: Operation, sent: Sent) -> Values:
 
 def _typed_rows(sent: Sent) -> list[dict[str, str]]:
     """The rows of a table as they were typed, also where a column was cut off."""
-    columns = [sent.many.get(column.name, []) for column in ROW]
+    columns = [sent.many.get(name, []) for name in _COLUMNS]
     rows = itertools.zip_longest(*columns, fillvalue="")
-    return [typed for row in rows if any((typed := {f.name: text for f, text in zip(ROW, row, strict=True)}).values())]
+    return [typed for row in rows if any((typed := dict(zip(_COLUMNS, row, strict=True))).values())]
 
 
 def _then(operation: Operation, result: Any, values: Values) -> str:

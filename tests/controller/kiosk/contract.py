@@ -30,10 +30,11 @@ from controller.kiosk.interface import (
     Schedule,
     TriedDevice,
 )
-from controller.kiosk.operations.dispatch import AT_SOCKET, local_values
+from controller.kiosk.operations.dispatch import local_values
 from controller.kiosk.operations.operation import Answer
-from controller.panel.answer_schemas import Schemas
+from controller.kiosk.operations.table import AT_SOCKET
 from controller.panel.answers import plain
+from controller.panel.api import answer_schemas
 from controller.stage.blender.job import BUILTIN
 from tests.controller.kiosk import vase
 
@@ -243,7 +244,7 @@ def shows_names(stage: Stage) -> bool:
 
 def ask(stage: Stage, op: str, sent: dict[str, Any]) -> Any:
     operation = next(one for one in AT_SOCKET if one.name == op)
-    return operation.of(stage.kiosk, local_values(operation, sent))
+    return operation.function(stage.kiosk, **local_values(operation, sent))
 
 
 class Contract:
@@ -300,12 +301,12 @@ def schema_errors(op: str, answer: Any) -> list[str]:
     operation = next(one for one in AT_SOCKET if one.name == op)
     if operation.answer is not Answer.VALUE:
         return []
-    schemas = Schemas()
-    schema = schemas.of(operation) | {"components": {"schemas": schemas.components}}
+    answered, objects = answer_schemas([operation])
+    schema = answered[op] | {"components": {"schemas": objects}}
     # An object may have more than a document says, so that a later version can; here, nothing is more.
-    for component in schemas.components.values():
+    for component in objects.values():
         component["additionalProperties"] = False
-    return [error.message for error in jsonschema_rs.validator_for(schema).iter_errors(plain(answer))]
+    return [error.message for error in jsonschema_rs.validator_for(schema).iter_errors(plain(operation, answer))]
 
 
 def test_every_operation_of_a_kiosk_is_in_the_contract() -> None:

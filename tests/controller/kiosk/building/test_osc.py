@@ -20,11 +20,13 @@ from controller.kiosk.building.protocol import read
 from controller.kiosk.building.rates import Rate
 from controller.kiosk.building.server import serving
 from controller.kiosk.building.verbs import Verbs
-from controller.kiosk.operations.table import FADE, PERCENT
+from controller.kiosk.operations.table import brightness, next_appearance
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port
 from tests.waiting import wait_for
 
+(PERCENT,) = brightness.fields
+(FADE,) = next_appearance.fields
 LAYOUT = Path(__file__).parents[4] / "docs" / "examples" / "show-control" / "osc-layout.json"
 liblo = pytest.mark.skipif(
     shutil.which("oscsend") is None or shutil.which("oscdump") is None,

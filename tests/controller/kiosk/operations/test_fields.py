@@ -5,24 +5,36 @@ from __future__ import annotations
 import json
 import math
 import re
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import BaseModel
+from pydantic import Field as Limits
 
 from controller.core.errors import UsageError
-from controller.kiosk.operations.fields import NAME, Field, object_schema, parse
-from controller.kiosk.operations.table import OPERATIONS, ROW
+from controller.kiosk.operations.arguments import Hours
+from controller.kiosk.operations.fields import INTEGER, NAME, NUMBER, TEXT, Field, object_schema, parse
+from controller.kiosk.operations.table import OPERATIONS
 
-TEXT = Field("text", "a text of any letters", longest=40)
-NUMBER = Field("number", "a number from -1 to 2.5", "number", least=-1, most=2.5)
-COUNT = Field("count", "a whole number from 1 to 20", "integer", least=1, most=20)
-TICK = Field("tick", "yes or no", "boolean")
-LEVEL = Field("level", "high or low", choices=("high", "low"), required=False)
-CALLED = Field("name", "a name", pattern=NAME)
-ROWS = Field("rows", "at most two rows", "rows", most=2, columns=(COUNT, LEVEL))
-ALL = (TEXT, NUMBER, COUNT, TICK, LEVEL, CALLED, ROWS)
+
+class Row(BaseModel, extra="forbid"):
+    count: Annotated[int, Limits(ge=1, le=20, description="a whole number from 1 to 20"), INTEGER]
+    level: Annotated[Literal["high", "low"], Limits(description="high or low")] = "high"
+
+
+WORDS = Field("text", Annotated[str, Limits(max_length=40, description="a text of any letters"), TEXT], True)
+FRACTION = Field(
+    "number",
+    Annotated[float, Limits(ge=-1, le=2.5, allow_inf_nan=False, description="a number from -1 to 2.5"), NUMBER], True,
+)  # fmt: skip
+COUNT = Field("count", Annotated[int, Limits(ge=1, le=20, description="a whole number from 1 to 20"), INTEGER], True)
+TICK = Field("tick", Annotated[bool, Limits(description="yes or no")], True)
+LEVEL = Field("level", Annotated[Literal["high", "low"], Limits(description="high or low")], False)
+CALLED = Field("name", Annotated[str, Limits(pattern=NAME, description="a name"), TEXT], True)
+ROWS = Field("rows", Annotated[list[Row], Limits(max_length=2, description="at most two rows")], True)
+ALL = (WORDS, FRACTION, COUNT, TICK, LEVEL, CALLED, ROWS)
 GOOD: dict[str, Any] = {
     "text": "a\nb", "number": 0.5, "count": 3, "tick": True, "name": "Köpfe 1", "rows": [{"count": 2, "level": "low"}],
 }  # fmt: skip
@@ -36,7 +48,7 @@ def code_of(fields: tuple[Field, ...], sent: dict[str, Any], *, strings: bool = 
 
 
 def test_what_fits_comes_back_as_it_was_sent() -> None:
-    assert parse(ALL, GOOD, strings=False) == GOOD
+    assert parse(ALL, GOOD, strings=False) == GOOD | {"rows": [Row(count=2, level="low")]}
 
 
 @pytest.mark.parametrize(
@@ -66,7 +78,7 @@ def test_what_is_missing_or_unknown_is_refused_without_saying_it_back() -> None:
 
 
 def test_a_form_says_everything_as_text() -> None:
-    fields = (TEXT, NUMBER, COUNT, TICK, LEVEL, CALLED)
+    fields = (WORDS, FRACTION, COUNT, TICK, LEVEL, CALLED)
     sent = {"text": "a\r\nb", "number": "-0.5", "count": "7", "tick": "on", "level": "", "name": "x"}
     assert parse(fields, sent, strings=True) == {
         "text": "a\nb", "number": -0.5, "count": 7, "tick": True, "name": "x",
@@ -92,7 +104,7 @@ def test_whatever_is_sent_to_any_operation_is_within_its_document_or_refused(
     data: st.DataObject, strings: bool
 ) -> None:
     operation = data.draw(st.sampled_from(OPERATIONS))
-    fields = tuple(field for field in operation.fields if field.kind != "file")
+    fields = tuple(field for field in operation.fields if field.sent is None)
     sent = data.draw(st.fixed_dictionaries({}, optional={field.name: ANYTHING for field in fields}))
     try:
         values = parse(fields, sent, strings=strings)
@@ -101,23 +113,23 @@ def test_whatever_is_sent_to_any_operation_is_within_its_document_or_refused(
     for field in fields:
         if field.name in values:
             _fits(field, values[field.name])
-    json.dumps(values, ensure_ascii=False, allow_nan=False).encode()
+    json.dumps(values, ensure_ascii=False, allow_nan=False, default=lambda row: row.model_dump()).encode()
 
 
 def _fits(field: Field, value: Any) -> None:
-    schema = field.schema()
+    schema = field.schema
     if schema["type"] == "string":
-        assert len(value) <= schema["maxLength"]
+        assert len(value) <= schema.get("maxLength", len(value))
         assert re.search(schema.get("pattern", ""), value)
         assert value in schema.get("enum", (value,))
     elif schema["type"] in ("integer", "number"):
         assert schema["minimum"] <= value <= schema["maximum"]
     elif schema["type"] == "array":
         assert len(value) <= schema["maxItems"]
-        assert all(set(row) >= set(schema["items"]["required"]) for row in value)
+        assert all(row.day for row in value)
 
 
 def test_the_document_of_rows_forbids_what_is_refused() -> None:
-    schema = object_schema(ROW)
+    schema = object_schema([Field("rows", Hours, True)])["$defs"]["HoursRow"]
     assert schema["required"] == ["day"]
     assert schema["additionalProperties"] is False
