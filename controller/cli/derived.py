@@ -78,7 +78,7 @@ def job(stage: Path, op: str, arguments: Mapping[str, Any]) -> None:
     """Start a job of the running kiosk and wait for its end."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.kiosk.jobs.follow_job import ask_and_follow
+        from controller.kiosk.api.offline_dispatch import ask_and_follow
 
         return ask_and_follow(stage=stage, op=op, arguments=arguments, reporter=reporter, cancel=cancel)
 

@@ -19,7 +19,7 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.kiosk.building import server as building
+from controller.kiosk.building import protocol as building
 from controller.kiosk.building.protocol import Configured
 from controller.kiosk.building.protocol import read as read_protocols
 from controller.kiosk.operations.dispatch import socket_table
@@ -203,9 +203,9 @@ def _set_up_picture(kiosk: StageKiosk, entrance: PanelAccess | None) -> contextl
     """How to reach the panel, on the projectors of an installed kiosk that has no stage yet."""
     if entrance is None or (kiosk.stage / FILE).exists() or not kiosk_places.is_installed(kiosk.stage):
         return contextlib.nullcontext()
-    from controller.kiosk.supervisors.setup_picture import shown
+    from controller.kiosk.serving import setup_picture
 
-    return shown(entrance.lines)
+    return setup_picture(entrance.lines)
 
 
 def _open_panel(

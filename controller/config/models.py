@@ -283,7 +283,7 @@ class KeyPanelTable(OpenConfigTable):
 
 
 class HoursTable(ConfigTable):
-    """Opening hours of a weekday or a date; see ``controller.kiosk.decide.hours`` for what they mean together."""
+    """Opening hours of a weekday or a date; see ``controller.kiosk.schedule`` for what they mean together."""
 
     day: str = Field(
         description='weekdays such as "mon", "mon-fri" or "daily", or a date such as "2026-12-24", which comes first'

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from controller.kiosk.changes.values import Change, Changes
 from controller.kiosk.state import (
     BundleIdentity,
     DeviceRow,
@@ -34,6 +33,8 @@ from controller.kiosk.values import (
     Achieved,
     Aiming,
     Appearance,
+    Change,
+    Changes,
     Comparison,
     Computed,
     Finding,

@@ -12,8 +12,8 @@ from typing import Final
 from controller.core import kiosk_places
 from controller.core.errors import SEND_DIAGNOSTICS, WorkError
 from controller.core.storage import runtime_folder
-from controller.kiosk.alerts.alerts import Alerts
-from controller.kiosk.backup.nightly import NightlyBackup
+from controller.kiosk.alerts import Alerts
+from controller.kiosk.backup import NightlyBackup
 from controller.kiosk.changes.inventory import Inventory
 from controller.kiosk.changes.watch import InventoryWatch
 from controller.kiosk.decide.clock import TrustedClock, beginning
@@ -23,16 +23,15 @@ from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of
-from controller.kiosk.store import settings_change
-from controller.kiosk.store.bundle_store import BundleStore
+from controller.kiosk.schedule import ScheduleFile
+from controller.kiosk.store.bundle_store import BundleStore, BundleWatch
+from controller.kiosk.store.disk_space import TIDY_S, purge_old_photographs
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.photo_retention import TIDY_S, purge_old_photographs
-from controller.kiosk.store.schedule_file import ScheduleFile
-from controller.kiosk.supervisors.bundle_watch import BundleWatch
+from controller.kiosk.store.settings import GoodSettings
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
-from controller.kiosk.supervisors.lamp_history import LampHistory
+from controller.kiosk.supervisors.light_records import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Thread, World
@@ -117,7 +116,7 @@ class Service:
             stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log,
             monotonic=world.monotonic, wall=world.wall, ways=world.ways_out,
         )  # fmt: skip
-        self.good_settings = settings_change.GoodSettings()
+        self.good_settings = GoodSettings()
         self.changed: Callable[[], None] = lambda: None
         self._stop = world.event()
         self._threads: list[Thread] = []
@@ -202,7 +201,7 @@ class Service:
         self.log.add(Decision("service-ended", "The kiosk has stopped."))
 
     def use(self, checked: Checked) -> None:
-        """Use settings that differ only in what no device depends on (``settings_change``)."""
+        """Use settings that differ only in what no device depends on (``store.settings.change``)."""
         self.checked, self.problem = checked, None
         self.devices.use(checked)
         self.good_settings.keep(checked)

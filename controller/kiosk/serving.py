@@ -3,22 +3,68 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from controller.core.errors import UsageError
+from controller.core.kiosk_places import PLAYER_OPTIONS, PLAYER_SOCKET, RUNTIME
+from controller.kiosk.interface import EventRow
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.service import MakeJobs, Service
-from controller.kiosk.store import archive, settings_change
+from controller.kiosk.store import archive
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.journal import journal_of
-from controller.kiosk.store.settings import checked_settings
+from controller.kiosk.store.settings import checked_settings, last_good
+from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.world import World
+from controller.play.control.attached import AttachedPlayer
+from controller.play.control.launch import PlayerSettings
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Stop
+
+SOCKET: Final = "/run/systemd/journal/socket"
+_PRIORITIES: Final = {"info": "6", "warning": "4", "error": "3"}
+"""Those of syslog."""
+
+
+def journal_of(
+    stage: str, environment: Mapping[str, str] = os.environ, path: str = SOCKET
+) -> Callable[[EventRow], None] | None:
+    """What sends an event to the journal; None where systemd did not start this process with its journal."""
+    if "JOURNAL_STREAM" not in environment:
+        return None
+
+    def send(row: EventRow) -> None:
+        datagram = fields(row, stage)
+        # A journal that is full or gone must not stop the kiosk, which has its own event log.
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+            channel.setblocking(False)
+            channel.sendto(datagram, path)
+
+    return send
+
+
+def fields(row: EventRow, stage: str) -> bytes:
+    """An event as the journal's datagram."""
+    named = {
+        "MESSAGE": row.text,
+        "PRIORITY": _PRIORITIES[row.level],
+        "SYSLOG_IDENTIFIER": "velatura",
+        "VELATURA_CODE": row.code,
+        "VELATURA_STAGE": stage,
+        "VELATURA_EVENT": str(row.number),
+    }
+    return b"".join(_field(name, value.encode("utf-8", "replace")) for name, value in named.items())
+
+
+def _field(name: str, value: bytes) -> bytes:
+    """With its length, so that a line break in a device's text begins no new field."""
+    return name.encode() + b"\n" + len(value).to_bytes(8, "little") + value + b"\n"
 
 
 def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
@@ -26,7 +72,7 @@ def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
     try:
         return checked_settings(stage, world.drivers), None
     except UsageError as error:
-        return settings_change.last_good(stage, error, world.drivers)
+        return last_good(stage, error, world.drivers)
 
 
 @contextlib.contextmanager
@@ -75,3 +121,35 @@ def serving(
                 if loop.is_alive():
                     loop.join(10.0)
                 service.end(leave_lit=leave_lit or (isinstance(cancel, Stop) and cancel.restarting))
+
+
+_SETUP_STEP_S: Final = 0.5
+
+
+@contextlib.contextmanager
+def setup_picture(lines: Callable[[], tuple[str, ...]]) -> Iterator[None]:
+    """Show ``lines()`` on one projector after the other until the end: how to reach the panel of a kiosk that has no
+    stage yet.
+    """
+    supervisor = PlayerSupervisor(
+        RUNTIME,
+        lambda _: PlayerSettings((), None),
+        lambda _: None,
+        attach=lambda _: AttachedPlayer(PLAYER_SOCKET, PLAYER_OPTIONS, None),
+    )
+    ended = threading.Event()
+    thread = threading.Thread(target=partial(_show_lines, supervisor, lines, ended), name="set-up picture", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(10.0)
+        supervisor.close()
+
+
+def _show_lines(supervisor: PlayerSupervisor, lines: Callable[[], tuple[str, ...]], ended: threading.Event) -> None:
+    while not ended.is_set():
+        supervisor.notice = lines()
+        supervisor.step()
+        ended.wait(_SETUP_STEP_S)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field
 
@@ -17,6 +17,10 @@ from controller.kiosk.state import EventLevel, Grade
 RecalibrationKind = Literal["full", "quick"]
 Fit = Literal["fit", "fill", "crop", "wrap"]
 Unsubscribe = Callable[[], None]
+Turn: TypeAlias = tuple[str, float, float]
+"""An appearance's name, the seconds for which it is shown, and those of them in which it fades in."""
+IN_TURN: Final = "*"
+"""In the place of an appearance's name: all of the bundle, in turn."""
 Picture = Annotated[Path | None, Field(exclude=True)]
 """A file of this machine, which the HTTP API leaves out: it has an address for each picture."""
 Pictures = Annotated[dict[str, Path], Field(exclude=True)]
@@ -241,3 +245,32 @@ class Results:
     grade: Grade | None
     pictures: Pictures = field(default_factory=dict)
     figures: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One thing that differs from the last good day.
+
+    ``kind`` is a key of ``compare.KINDS``; ``name``: which one; ``before`` and ``now`` as they were read, empty where
+    there was or is none; ``sentence`` says it, ``remedy`` what to do. ``since_unix_s``: when it was first seen.
+    """
+
+    kind: str
+    name: str
+    before: str
+    now: str
+    sentence: str
+    remedy: str
+    since_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """``good_unix_s``: when the last good day's inventory was taken, None if there is none; ``run``: what graded well;
+    ``unknown``: what can't be read now, so that it is not compared.
+    """
+
+    good_unix_s: float | None
+    run: str
+    changes: tuple[Change, ...]
+    unknown: tuple[str, ...]

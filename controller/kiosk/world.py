@@ -14,16 +14,15 @@ from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from controller.config.models import AlertsTable, StageTables
-from controller.kiosk.alerts.alerts import Send, ways_out
+from controller.kiosk.alerts import Send, ways_out
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.watch import take
 from controller.kiosk.decide.clock import synchronised
-from controller.kiosk.supervisors.player_supervisor import Process, launched
-from controller.play.control.launch import PlayerSettings
+from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
 from controller.stage.rig.lamp_ledger import SystemClock
 from controller.stage.sessions.run import open_context
 from hal.deadline import Deadline
@@ -55,6 +54,35 @@ class Lock(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None: ...
+
+
+READY_S: Final = 8.0
+"""In which a player has to be ready."""
+
+
+class Process(Protocol):
+    """A running player, as ``play.control.launch.PlayerProcess``."""
+
+    @property
+    def socket(self) -> Path: ...
+
+    @property
+    def pid(self) -> int: ...
+
+    @property
+    def alive(self) -> bool: ...
+
+    def wait_until_ready(self, timeout_s: float = READY_S) -> dict[str, Any]: ...
+
+    def kill(self) -> None: ...
+
+    def terminate(self) -> int: ...
+
+
+def launched(runtime: Path, settings: PlayerSettings) -> Process:
+    """A player that is being started, in the place of one that a killed starter left behind."""
+    end_leftover(runtime)
+    return PlayerProcess(runtime, settings)
 
 
 class World(SystemClock):

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from controller.kiosk.building.rates import Rate, Rates
+from controller.kiosk.building.verbs import Rate, Rates
 from controller.kiosk.operations.fields import PlainSchema, object_schema
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import OPERATIONS
@@ -147,7 +147,7 @@ def answer_schemas(operations: Sequence[Operation]) -> tuple[dict[str, Any], dic
         [(operation.name, "serialization", answers.adapter(operation)) for operation in values],
         schema_generator=_AnswerSchema, ref_template=REFERENCE,
     )  # fmt: skip
-    for name, schema in definitions["$defs"].items():
+    for name, schema in definitions.get("$defs", {}).items():
         objects[name] = schema | {"description": schema.get("description", "").replace("``", "")}
     general = {Answer.NOTHING: "Done", Answer.TEXT: "Text"}
     answered: dict[str, Any] = {

@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 from controller.config.models import AlertsTable, StageTables
 from controller.core.errors import WorkError
-from controller.kiosk.alerts.alerts import Send
+from controller.kiosk.alerts import Send
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.interface import EventRow
 from controller.kiosk.world import Lock as AnyLock

@@ -25,8 +25,8 @@ from controller.bundle.signing import load_signing_key
 from controller.bundle.writer import NewAppearance, write_bundle
 from controller.core.kiosk_places import RUNTIME
 from controller.kiosk.api.control import NAME as SOCKET
-from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.panel_address import FIRST_LOGIN
+from controller.kiosk.schedule import WEEKDAYS
 from tests.booted.machine import STAGE, Machine
 from tests.booted.trees import ROOT, built_packages, put_kernels, tree
 from tests.controller.play.wire import Frames, noise, same

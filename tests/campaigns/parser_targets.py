@@ -19,7 +19,8 @@ from controller.bundle import format as bundle_format
 from controller.bundle.index import parse_index
 from controller.config import load_stage
 from controller.core.errors import BundleError, UsageError
-from controller.kiosk.building import artnet_packets, osc, pjlink_lines
+from controller.kiosk.building import artnet, osc
+from controller.kiosk.building import pjlink as pjlink_stage
 from controller.kiosk.building.sacn import SacnOptions, frame_of
 from hal.codecs import hid as hid_reports
 from hal.codecs.projectors import logins, pjlink, serial_protocol
@@ -76,7 +77,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "sacn": Target(_sacn, _levels(), (), 700),
         "osc": Target(lambda data: list(osc.requests(data)), (osc.message("play", "marble", 2.5),), ()),
         "pjlink-questions": Target(_pjlink_asked, (b"%1POWR ?\r", b"%2INPT 31\r"), ()),
-        "art-net": Target(artnet_packets.read, _ARTNET, ()),
+        "art-net": Target(artnet.read, _ARTNET, ()),
         "json-rpc": Target(_json_rpc, _JSON_RPC),
         "escapes": Target(lambda data: unescaped(data.decode("latin-1")), (b"on\\r\\x00\\\\",)),
         "pjlink-udp": Target(pjlink.parse_datagram, (b"%2ACKN=00:11:22:aa:bb:cc\r", b"%2ERST=000000\r%2POWR=1\r")),
@@ -333,8 +334,8 @@ def _levels() -> tuple[bytes, ...]:
 
 
 def _pjlink_asked(data: bytes) -> None:
-    if (command := pjlink_lines.parse_command(data)) is not None:
-        pjlink_lines.verb_for(command, ("marble", "warm wood"))
+    if (command := pjlink_stage.parse_command(data)) is not None:
+        pjlink_stage.verb_for(command, ("marble", "warm wood"))
 
 
 _ARTNET: Final = (

@@ -19,7 +19,7 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.config.loader import FILE
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
-from controller.kiosk.decide.hours import WEEKDAYS
+from controller.kiosk.schedule import WEEKDAYS
 from controller.stage.sessions.calibrations import KEY_FILE, output_sizes
 from controller.stage.sessions.check import check_stage
 from tests.campaigns.mini_stage import prepare_mini

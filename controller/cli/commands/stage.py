@@ -51,7 +51,7 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; use the devices found.")] = False,
 ) -> None:
     """Find the devices, and write stage.toml and a signing key."""
-    from controller.kiosk.setup import set_up
+    from controller.stage.services.setup import set_up
 
     def ask(question: str, suggestion: str) -> str:
         return suggestion if yes or console.as_json() else str(typer.prompt(question, default=suggestion))

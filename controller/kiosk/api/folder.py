@@ -21,12 +21,12 @@ from controller.kiosk.interface import (
     Scene,
     Schedule,
 )
+from controller.kiosk.schedule import ScheduleFile, check
 from controller.kiosk.store import archive, runs, settings
+from controller.kiosk.store.archive import diagnostics
 from controller.kiosk.store.bundle_store import BundleStore
-from controller.kiosk.store.diagnostics import diagnostics
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.store.schedule_file import ScheduleFile, check
-from controller.kiosk.supervisors.lamp_history import LampHistory
+from controller.kiosk.supervisors.light_records import LampHistory
 from controller.stage.sessions.calibrations import finished_calibration, stage_trust, worst_grade
 from controller.stage.sessions.check import Checked, check_stage
 

@@ -17,8 +17,8 @@ from controller.kiosk.api.control import plain
 from controller.kiosk.api.folder import appearances_of, projector_picture
 from controller.kiosk.api.photograph import newest_photograph
 from controller.kiosk.changes.watch import since_good
-from controller.kiosk.decide.changed_hours import effect
-from controller.kiosk.decide.interfaces import IN_TURN, Request
+from controller.kiosk.decide.interfaces import Request
+from controller.kiosk.decide.operator_overrides import effect
 from controller.kiosk.interface import (
     Aiming,
     Appearance,
@@ -37,10 +37,11 @@ from controller.kiosk.interface import (
     TriedDevice,
 )
 from controller.kiosk.jobs.job_runner import title_of
+from controller.kiosk.schedule import check
 from controller.kiosk.service import Service
-from controller.kiosk.store import archive, runs, settings, settings_change, targets
-from controller.kiosk.store.diagnostics import diagnostics
-from controller.kiosk.store.schedule_file import check
+from controller.kiosk.store import archive, runs, settings, targets
+from controller.kiosk.store.archive import diagnostics
+from controller.kiosk.values import IN_TURN
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
 
@@ -139,7 +140,7 @@ class StageKiosk(AttachedKiosk):
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         if fit == "wrap":
-            from controller.kiosk.preview.wrapped import wrapped
+            from controller.kiosk.store.targets import wrapped
 
             return wrapped(finished_calibration(self.stage), self.service.checked.names, target)
         picture, size_px = target.read_bytes(), self.view_px()
@@ -252,7 +253,7 @@ class StageKiosk(AttachedKiosk):
             service = self._service
             if service is not None:
                 after = check_stage(self.stage, drivers=self._world.drivers).stage.tables
-                service.cools_at_end = settings_change.change(self._in_use, after).lamps
+                service.cools_at_end = settings.change(self._in_use, after).lamps
             self.reload.set()
 
     def diagnostics(self) -> Path:
@@ -261,7 +262,7 @@ class StageKiosk(AttachedKiosk):
     def effect_of_settings(self, text: str) -> str:
         settings.validate(text)
         after = settings.tables_of(text)
-        return "" if self._service is None else settings_change.change(self._in_use, after).warning(self.stage)
+        return "" if self._service is None else settings.change(self._in_use, after).warning(self.stage)
 
     def save_settings(self, text: str) -> None:
         with self._idle():
@@ -281,7 +282,7 @@ class StageKiosk(AttachedKiosk):
             self.reload.set()
             return
         checked = settings.checked_settings(self.stage, self._world.drivers)
-        found = settings_change.change(self._in_use, checked.stage.tables)
+        found = settings.change(self._in_use, checked.stage.tables)
         if not found.restarts:
             service.use(checked)
             return

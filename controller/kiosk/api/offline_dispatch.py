@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 from controller.config import load_stage
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.text import printable
 from controller.kiosk.api.control import call_kiosk, is_running, plain, user_name
 from controller.kiosk.api.folder import FolderKiosk
-from controller.kiosk.decide.days import expanded
-from controller.kiosk.decide.hours import check_schedule
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import Accounts
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
+from controller.kiosk.schedule import check_schedule, expanded
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.run.progress import Phase, Progress, Reporter
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.run import stage_lock
+from hal.deadline import Cancelled
 
 LEVELS: Final = ("info", "warning", "error")
 LONG_S: Final = 600.0
@@ -144,3 +147,52 @@ def aiming_text(aiming: Mapping[str, Any]) -> str:
         lines = ["Nothing has been measured yet. Take test shots: `velatura kiosk aim STAGE --shots`."]
     pictures = [f"Picture: {aiming['picture']}"] if aiming["picture"] else []
     return "\n".join(map(printable, [*lines, *aiming["hints"], *pictures]))
+
+
+EVERY_S: Final = 0.5
+
+
+def ask_and_follow(
+    *,
+    stage: Path,
+    op: str,
+    arguments: Mapping[str, Any],
+    reporter: Reporter,
+    cancel: threading.Event,
+    every_s: float = EVERY_S,
+) -> Mapping[str, Any]:
+    """Start a job and return its result; ``cancel`` cancels the job, too.
+
+    Raises UsageError("not-serving"), the kiosk's refusal of the job, WorkError("job-given-up") if it will never start
+    (the lamps did not light, it was cancelled, the kiosk restarted), WorkError("job-failed") with the kiosk's own
+    sentence, and Cancelled.
+    """
+    number, began_s = int(call_kiosk(stage, op, **arguments)["number"]), time.monotonic()
+    last: object = None
+    while True:
+        job = call_kiosk(stage, "job", number=number)
+        if job is not None and job["ended"]:
+            return _ended(job)
+        if job is not None and job["steps"] != last and job["steps"]:
+            last = job["steps"]
+            reporter.progress(_progress(job, time.monotonic() - began_s))
+        if cancel.wait(every_s):
+            with contextlib.suppress(VelaturaError):  # it may have ended in the meantime
+                call_kiosk(stage, "cancel")
+            raise Cancelled
+
+
+def _ended(job: Mapping[str, Any]) -> Mapping[str, Any]:
+    if job["failed"]:
+        raise WorkError("job-failed", what=f"{job['name']}: {job['outcome']}",
+                        remedy="See `velatura kiosk events` for the decisions and their reasons.")  # fmt: skip
+    return {"job": job["name"], "outcome": job["outcome"], **({"run": job["run"]} if job["run"] else {})}
+
+
+def _progress(job: Mapping[str, Any], elapsed_s: float) -> Progress:
+    """The job lists only the steps so far, so the overall progress follows from the time left."""
+    index, step = len(job["steps"]) - 1, job["steps"][-1]
+    left_s = job["left_s"]
+    share = 0.0 if left_s is None else elapsed_s / max(elapsed_s + left_s, 1e-6)
+    phase = Phase.DONE if step["done"] >= 1 else Phase.RUNNING
+    return Progress(step["title"], index, max(job["count"], index + 1), phase, share, step["done"], elapsed_s, left_s)

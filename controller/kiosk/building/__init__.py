@@ -1,1 +1,1 @@
-"""A stage in a building's show control: `verbs` is all that may be asked, `server` runs a module for each protocol."""
+"""A stage in a building's show control: `verbs` says what may be asked, `protocol` serves them by network."""

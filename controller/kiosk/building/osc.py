@@ -16,8 +16,7 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 from pythonosc.osc_packet import OscPacket, ParseError
 
 from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
-from controller.kiosk.building.protocol import NetworkOptions, Protocol
-from controller.kiosk.building.server import changes
+from controller.kiosk.building.protocol import NetworkOptions, Protocol, changes
 from controller.kiosk.building.verbs import Verbs
 from controller.kiosk.interface import KioskState
 from controller.kiosk.operations.fields import Field as Value

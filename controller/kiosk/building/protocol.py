@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import importlib
 import ipaddress
+import logging
+import threading
 import tomllib
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, VelaturaError
 from controller.core.extras import extra_missing
 from controller.core.files import read_text
-from controller.kiosk.building.rates import Rate
-from controller.kiosk.building.verbs import Verbs
+from controller.kiosk.building.verbs import Rate, Verbs
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.panel_address import is_loopback
 from controller.kiosk.roles import Role
@@ -137,3 +140,73 @@ def _wrong(detail: str) -> UsageError:
     return UsageError(
         "building-wrong", what=f"{FILE} is not valid: {detail}.", remedy="Correct it; see the how-to on show control."
     )
+
+
+AGAIN_S: Final = (1.0, 5.0, 30.0)
+"""Pauses between attempts to listen."""
+_LOG: Final = logging.getLogger("velatura.building")
+
+
+@contextlib.contextmanager
+def serving(kiosk: Kiosk, protocols: Sequence[Configured]) -> Iterator[None]:
+    """Serve the protocols until the context ends."""
+    if not protocols:
+        yield
+        return
+    loop, started = asyncio.new_event_loop(), threading.Event()
+    tasks: list[asyncio.Task[None]] = []
+
+    async def run() -> None:
+        tasks.extend(asyncio.ensure_future(_kept(one, one.verbs(kiosk), kiosk)) for one in protocols)
+        started.set()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def work() -> None:
+        with contextlib.closing(loop):
+            loop.run_until_complete(run())
+
+    thread = threading.Thread(target=work, name="building", daemon=True)
+    thread.start()
+    started.wait()
+    try:
+        yield
+    finally:
+        for task in tasks:
+            loop.call_soon_threadsafe(task.cancel)
+        thread.join(10.0)
+
+
+async def _kept(one: Configured, verbs: Verbs, kiosk: Kiosk) -> None:
+    """Serve one protocol; if it fails, log that once and try again without end."""
+    failed = 0
+    while True:
+        try:
+            await one.protocol.serve(one.options, verbs)
+        except Exception as error:  # noqa: BLE001 - one protocol must not end the others
+            if not isinstance(error, OSError | VelaturaError):
+                _LOG.exception("%s failed.", one.protocol.title)
+            if not failed:
+                why = f"{error.what} {error.remedy}" if isinstance(error, VelaturaError) else str(error)
+                what = f"{one.protocol.title} does not work ({one.options.where}). {why}"
+                kiosk.record("building-failed", what, "error")
+        pause_s = AGAIN_S[min(failed, len(AGAIN_S) - 1)]
+        failed += 1
+        await asyncio.sleep(pause_s)
+
+
+@contextlib.contextmanager
+def changes(verbs: Verbs) -> Iterator[asyncio.Event]:
+    """An event of the running loop that is set after every change of the kiosk's state, and at the beginning."""
+    loop, changed = asyncio.get_running_loop(), asyncio.Event()
+
+    def notify() -> None:
+        # A kiosk may change while the loop ends.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(changed.set)
+
+    changed.set()
+    leave = verbs.subscribe(notify)
+    try:
+        yield changed
+    finally:
+        leave()

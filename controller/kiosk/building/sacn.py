@@ -12,8 +12,7 @@ from typing import Any, Final
 from pydantic import Field
 from sacn import DataPacket
 
-from controller.kiosk.building.desk import DeskOptions, follow
-from controller.kiosk.building.dmx import Frame, Sources
+from controller.kiosk.building.dmx import DeskOptions, Frame, Sources, follow
 from controller.kiosk.building.protocol import Protocol
 from controller.kiosk.building.verbs import Verbs
 

@@ -3,17 +3,53 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
-from controller.core.errors import UsageError
-from controller.kiosk.building.rates import Rate, Rates
+from controller.core.errors import UsageError, WorkError
 from controller.kiosk.interface import Kiosk, KioskState
 from controller.kiosk.operations.fields import Field, Values, parse
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
+
+MOST_SOURCES: Final = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """At most ``burst`` verbs at once, and ``per_s`` a second from then on, from each source."""
+
+    burst: int = 20
+    per_s: float = 10.0
+
+
+class Rates:
+    """What each source has used of a rate; thread-safe."""
+
+    def __init__(self, rate: Rate, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate, self._clock = rate, clock
+        self._used: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def take(self, source: str) -> None:
+        """Count one verb of a source, such as an address. Raises WorkError("too-many-verbs")."""
+        with self._lock:
+            now = self._clock()
+            level, then = self._used.get(source, (0.0, now))
+            level = max(0.0, level - (now - then) * self._rate.per_s)
+            if level > self._rate.burst - 1:
+                raise WorkError(
+                    "too-many-verbs", what="Too many requests came from this source.", remedy="Send them more slowly."
+                )
+            self._used[source] = (level + 1, now)
+            self._used.move_to_end(source)
+            while len(self._used) > MOST_SOURCES:
+                self._used.popitem(last=False)
 
 
 class Verbs:

@@ -1,3 +1,3 @@
-"""What changed since the last good day: `machine` and `devices` read facts, `inventory` keeps them on disk, `compare`
-names what differs and what to do, `watch` takes one after each good grade and each night. Start at `watch`.
+"""What changed since the last good day: `machine` and `devices` read facts, `inventory` keeps them on disk, and `watch`
+takes one after each good grade and each night, and names what differs and what to do. Start at `watch`.
 """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from controller.config.models import StageTables
 from controller.core.errors import VelaturaError
 from controller.core.text import printable
 from controller.kiosk.changes.inventory import Fact
-from controller.kiosk.install.outputs import Connected, connected
+from controller.kiosk.outputs import Connected
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device, WatchedCamera
@@ -93,16 +92,6 @@ def shown_facts(outputs: Sequence[Connected]) -> Iterator[Fact]:
                 yield Fact("mode", one.name, f"{width_px}x{height_px} at {rate_hz:.1f} Hz")
     for place, ((left, top), one) in enumerate(sorted(shown, key=lambda item: item[0]), 1):
         yield Fact("output order", one.name, f"number {place} from the left, at {left} {top}")
-
-
-def outputs_of_x() -> list[Connected]:
-    """The X server's outputs as `xrandr` tells them; none without an X server."""
-    # A library would end this process with the X server.
-    try:
-        done = subprocess.run(["xrandr", "--verbose"], capture_output=True, text=True, errors="replace", timeout=20)  # noqa: PLW1510, S607
-    except (OSError, subprocess.TimeoutExpired):
-        return []
-    return connected(done.stdout) if done.returncode == 0 else []
 
 
 def settings_facts(tables: StageTables) -> Iterator[Fact]:

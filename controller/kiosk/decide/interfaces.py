@@ -6,8 +6,9 @@ import enum
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol
 
+from controller.kiosk.values import Turn
 from hal.values import Power
 
 if TYPE_CHECKING:  # the log needs SQLite, and `velatura --help` gets here
@@ -66,12 +67,6 @@ class ProjectorPort(Protocol):
 
     @property
     def view(self) -> ProjectorView: ...
-
-
-Turn: TypeAlias = tuple[str, float, float]
-"""An appearance's name, the seconds for which it is shown, and those of them in which it fades in."""
-IN_TURN: Final = "*"
-"""In the place of an appearance's name: all of the bundle, in turn."""
 
 
 @dataclass(frozen=True, slots=True)

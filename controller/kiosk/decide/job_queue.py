@@ -2,17 +2,49 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide import kept_work
 from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import Decision, EventLog
+
+_NAME: Final = "work"
+_BACKGROUND: Final = "takeover"
+"""It is asked for again as long as it is needed."""
+
+
+def keep_work(log: EventLog, requests: Iterable[Request], again: frozenset[Request]) -> None:
+    """Keep these requests, but those that are asked for again as long as they are needed.
+
+    ``again``: those that were begun a second time.
+    """
+    rows = [[one.kind, one.light, list(one.arguments), one in again] for one in requests if _is_kept(one)]
+    log.keep(_NAME, json.dumps(rows))
+
+
+def unfinished_work(log: EventLog) -> list[tuple[Request, bool]]:
+    """What the previous service left undone, in its order, and whether that was the second attempt.
+
+    Nothing where what is kept can't be read: it must not keep a kiosk from starting.
+    """
+    with contextlib.suppress(ValueError, TypeError):
+        rows = json.loads(log.value(_NAME) or "[]")
+        return [
+            (Request(str(kind), bool(light), arguments=tuple(map(str, arguments))), bool(again))
+            for kind, light, arguments, again in rows
+        ]
+    return []
+
+
+def _is_kept(request: Request) -> bool:
+    return request.kind != _BACKGROUND
 
 
 class JobQueue:
@@ -31,7 +63,7 @@ class JobQueue:
         """What the previous service left undone, and whether it is done again: once, and not what needs the lamps."""
         left = [
             (request, not (request.light or second) and self._possible(request))
-            for request, second in kept_work.unfinished(self._log)
+            for request, second in unfinished_work(self._log)
         ]
         requests = [request for request, again in left if again]
         self._again = frozenset(requests)
@@ -182,7 +214,7 @@ class JobQueue:
         # A task of the schedule that was not begun is due again anyway.
         begun = self._log.done()
         waiting = [request for request in self._queue if not request.key or request.key in begun]
-        kept_work.keep(self._log, (*running, *waiting), self._again)
+        keep_work(self._log, (*running, *waiting), self._again)
 
     def _tell(self, outcome: Decision) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""

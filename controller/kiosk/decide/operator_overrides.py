@@ -4,12 +4,66 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import datetime
+from typing import Any, Final
 
-from controller.kiosk.decide.interfaces import IN_TURN
-from controller.kiosk.decide.planner import Plan
+from controller.kiosk.decide.planner import Plan, plan
+from controller.kiosk.interface import Schedule
+from controller.kiosk.schedule import openings, zone_of
 from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.values import IN_TURN
+
+KEY: Final = "live-changes"
+
+
+@dataclass(frozen=True, slots=True)
+class LiveChanges:
+    """``held``: the appearance at which the list is paused, or empty; ``first``: where the list begins, or empty;
+    ``fade_s``: how long the next picture fades in, None: as the list says; ``brightness``: 0..1.
+    """
+
+    black: bool = False
+    held: str = ""
+    first: str = ""
+    brightness: float = 1.0
+    fade_s: float | None = None
+
+
+class LiveChangesKept:
+    """They are stored in the event log's file, to survive a restart."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self.now = _read(log.value(KEY))
+
+    def change(self, **values: Any) -> None:
+        self._set(replace(self.now, **values))
+
+    def end(self) -> None:
+        """Back to the usual, as when the stage closes."""
+        self._set(LiveChanges())
+
+    def _set(self, changes: LiveChanges) -> None:
+        if changes != self.now:
+            self.now = changes
+            self._log.keep(KEY, json.dumps(asdict(changes)))
+
+
+def _read(text: str | None) -> LiveChanges:
+    """A damaged entry only ends the changes."""
+    try:
+        stored: Any = json.loads(text or "{}")
+    except (ValueError, RecursionError):
+        return LiveChanges()
+    usual = LiveChanges()
+    if not isinstance(stored, dict) or set(stored) != {field.name for field in fields(LiveChanges)}:
+        return usual
+    brightness, fade_s = stored["brightness"], stored["fade_s"]
+    right = isinstance(stored["black"], bool) and isinstance(stored["held"], str) and isinstance(stored["first"], str)
+    right = right and isinstance(brightness, int | float) and 0 <= brightness <= 1
+    right = right and (fade_s is None or (isinstance(fade_s, int | float) and 0 <= fade_s <= 600))
+    return LiveChanges(**stored) if right else usual
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,3 +166,22 @@ def _override_in(text: str | None) -> Override | None:
     if not isinstance(wanted, bool) or not isinstance(said, bool | None):
         return None
     return Override(wanted, said, float(until_s) if isinstance(until_s, int | float) else None)
+
+
+def effect(schedule: Schedule, overrides: OperatorOverrides, now: Plan, now_s: float) -> str:
+    """That the hours close an open stage, in sentences; empty if they do not. ``now``: the plan in use.
+
+    ``schedule`` must be checked. While the time is unknown (``now.open`` None), hours close nothing.
+    """
+    if now.open is None or not overrides.open(now):
+        return ""
+    if overrides.would_be_open(plan(now_s, schedule, (), since_s=now_s)):
+        return ""
+    zone = zone_of(schedule.time_zone)
+    moment = datetime.fromtimestamp(now_s, zone)
+    later = next((one.begins_s for one in openings(schedule, now_s) if one.begins_s > now_s), None)
+    again = "" if later is None else f" It opens again on {datetime.fromtimestamp(later, zone):%A at %H:%M}."
+    return (
+        f"The stage closes at once, and its lamps cool down: it is {moment:%A, %H:%M} in {schedule.time_zone}, "
+        f"outside these hours.{again}"
+    )

@@ -1,3 +1,3 @@
-"""`velatura kiosk install`: makes a bare Debian a kiosk, and takes that back. `system` does every change, `outputs`
-turns what the X server tells into its configuration, `files` has what is written, `steps` the order.
+"""`velatura kiosk install`: makes a bare Debian a kiosk, and takes that back. `system` does every change, `steps` has
+the order and what is written, `restored` fits a restored stage to this computer.
 """

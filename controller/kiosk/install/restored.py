@@ -19,8 +19,8 @@ from controller.config.models import StageTables
 from controller.core.errors import UsageError, WorkError
 from controller.core.kiosk_places import PLAYER_SOCKET, STAGE, STATE, USER
 from controller.kiosk.install import steps
-from controller.kiosk.install.outputs import Connected, placed
 from controller.kiosk.install.system import System
+from controller.kiosk.outputs import Connected, placed
 from controller.kiosk.store import archive
 from hal.errors import DeviceError
 from hal.player import PlayerClient

@@ -7,16 +7,52 @@ import re
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Final
 
+import firmware_configs
 from controller.core.errors import UsageError
 from controller.core.kiosk_places import PLAYER_OPTIONS, RUNTIME, STAGE, STATE, USER
-from controller.kiosk.install import files
-from controller.kiosk.install.outputs import Connected, Placed, connected, placed, player_outputs, x_configuration
 from controller.kiosk.install.system import System
+from controller.kiosk.outputs import Connected, Placed, connected, placed, player_outputs, x_configuration
 from controller.kiosk.panel_address import FIRST_LOGIN
 from controller.play.control.launch import PlayerSettings
+
+CONFIGURATION: Final = Path("/etc/velatura")
+CERTIFICATE: Final = CONFIGURATION / "panel.crt"
+KEY: Final = CONFIGURATION / "panel.key"
+CONTROLLER_OPTIONS: Final = CONFIGURATION / "controller.env"
+X_OUTPUTS: Final = Path("/etc/X11/xorg.conf.d/20-velatura-outputs.conf")
+COMMAND: Final = Path("/usr/local/bin/velatura")
+SHIPPED_PREFIX: Final = "/opt/velatura"
+"""Where the shipped units expect the program."""
+_FOLDERS: Final = {
+    "systemd": Path("/etc/systemd/system"),
+    "udev": Path("/etc/udev/rules.d"),
+    "x11": Path("/etc/X11/xorg.conf.d"),
+}
+
+
+def shipped(prefix: Path) -> dict[Path, str]:
+    """Files that are the same on every kiosk, whose program is installed in ``prefix``."""
+    found = {
+        Path("/etc/tmpfiles.d/velatura.conf"): f"d {RUNTIME} 0700 {USER} {USER} -\n",
+        Path("/etc/systemd/journald.conf.d/velatura.conf"): "[Journal]\nSystemMaxUse=200M\n",
+    }
+    for name, folder in _FOLDERS.items():
+        for file in sorted((resources.files(firmware_configs) / name).iterdir(), key=lambda one: one.name):
+            found[folder / file.name] = file.read_text().replace(SHIPPED_PREFIX, str(prefix))
+    return found
+
+
+def controller_options(host: str) -> str:
+    """The panel in the local network, with TLS; to be changed by people."""
+    return (
+        "# Options of `velatura kiosk serve` for this kiosk; `velatura kiosk serve --help` explains them.\n"
+        f"OPTIONS=--panel 0.0.0.0:8377 --certificate {CERTIFICATE} --key {KEY} --name {host} --name {host}.local\n"
+    )
+
 
 PACKAGES: Final = (
     "xserver-xorg-core", "xauth", "x11-xserver-utils", "libgl1-mesa-dri", "libgl1", "libxrandr2", "libxext6",
@@ -52,10 +88,10 @@ def install(
     check(system, prefix)
     _packages(system)
     _user(system)
-    changed = [system.write(path, text) for path, text in files.shipped(prefix).items()]
+    changed = [system.write(path, text) for path, text in shipped(prefix).items()]
     _folders(system)
-    if not os.path.lexists(system.at(files.COMMAND)):
-        system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(files.COMMAND))
+    if not os.path.lexists(system.at(COMMAND)):
+        system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(COMMAND))
     _panel(system)
     if any(changed):
         system.run("systemctl", "daemon-reload")
@@ -77,16 +113,16 @@ def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -
     """Take everything back but the stage and the packages. ``purge``: the stage, the settings and the user, too."""
     for unit in (TARGET, *SERVICES):
         system.run("systemctl", "disable", "--now", "--quiet", unit, may_fail=True)
-    for path in (*files.shipped(prefix), files.X_OUTPUTS, PLAYER_OPTIONS):
+    for path in (*shipped(prefix), X_OUTPUTS, PLAYER_OPTIONS):
         system.remove(path)
-    if system.at(files.COMMAND).is_symlink():
-        system.remove(files.COMMAND)
+    if system.at(COMMAND).is_symlink():
+        system.remove(COMMAND)
     system.remove(RUNTIME)
     system.run("systemctl", "daemon-reload", may_fail=True)
     system.run("udevadm", "control", "--reload", may_fail=True)
     if purge:
         system.remove(STATE)
-        system.remove(files.CONFIGURATION)
+        system.remove(CONFIGURATION)
         if system.look("getent", "passwd", USER) is not None:
             system.run("userdel", USER)
 
@@ -142,7 +178,7 @@ def _user(system: System) -> None:
 
 def _folders(system: System) -> None:
     owner = f"{USER}:{USER}"
-    system.folder(files.CONFIGURATION)
+    system.folder(CONFIGURATION)
     system.folder(STATE, mode=0o750, owner=owner)
     system.folder(STAGE, mode=0o750, owner=owner)
     if not system.at(RUNTIME).is_dir():
@@ -151,17 +187,17 @@ def _folders(system: System) -> None:
 
 def _panel(system: System) -> None:
     host = (system.look("hostname") or system.read(Path("/etc/hostname")) or "velatura").strip()
-    if system.read(files.KEY) is None:
+    if system.read(KEY) is None:
         names = f"subjectAltName=DNS:{host},DNS:{host}.local"
         system.run(
             "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
             "-days", "7300", "-subj", f"/CN={host}", "-addext", names,
-            "-keyout", str(files.KEY), "-out", str(files.CERTIFICATE),
+            "-keyout", str(KEY), "-out", str(CERTIFICATE),
         )  # fmt: skip
-        system.run("chown", f"root:{USER}", str(files.KEY))
-        system.run("chmod", "0640", str(files.KEY))
-    if system.read(files.CONTROLLER_OPTIONS) is None:
-        system.write(files.CONTROLLER_OPTIONS, files.controller_options(host))
+        system.run("chown", f"root:{USER}", str(KEY))
+        system.run("chmod", "0640", str(KEY))
+    if system.read(CONTROLLER_OPTIONS) is None:
+        system.write(CONTROLLER_OPTIONS, controller_options(host))
 
 
 def outputs(system: System) -> list[Connected]:
@@ -171,7 +207,7 @@ def outputs(system: System) -> list[Connected]:
 
 def write_outputs(system: System, found: Sequence[Placed]) -> None:
     """The X server's settings for these; it is restarted if they differ."""
-    if system.write(files.X_OUTPUTS, x_configuration(found)):
+    if system.write(X_OUTPUTS, x_configuration(found)):
         system.run("systemctl", "restart", "velatura-x11")
 
 
@@ -179,7 +215,7 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
     """X settings and the player's outputs, from what is plugged in; only once, because a projector that is off later
     looks like one that is gone.
     """
-    if not again and system.read(files.X_OUTPUTS) is not None:
+    if not again and system.read(X_OUTPUTS) is not None:
         return
     if system.dry:
         say("Then the X server is asked what is plugged in, and its settings and the player's outputs are written.")

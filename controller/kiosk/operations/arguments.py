@@ -7,8 +7,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, Field
 
-from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
 from controller.kiosk.operations.fields import INTEGER, NAME, NUMBER, TEXT, CommandLine, Flag, Sent
+from controller.kiosk.schedule import ALLOWED_DAYS
 from controller.kiosk.state import EventLevel
 from controller.kiosk.values import Fit
 
@@ -78,7 +78,7 @@ CheckTime = Annotated[str, Field(pattern=_TIME, max_length=5, description=(
 class HoursRow(BaseModel, extra="forbid"):
     """One row of the opening hours."""
 
-    # Which days it names, ``decide.days`` finds out.
+    # Which days it names, ``schedule.expanded`` finds out.
     day: Annotated[str, Field(pattern=r"^[^\u0000-\u001f\u007f]+$", max_length=64, description=ALLOWED_DAYS), TEXT]
     opens: Annotated[str, Field(pattern=_TIME, max_length=5, description=(
         "a time such as 10:00; default: closed")), TEXT] = ""  # fmt: skip

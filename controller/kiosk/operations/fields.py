@@ -155,8 +155,9 @@ def _model(fields: tuple[Field, ...], *, paths: bool) -> type[BaseModel]:
     for field in fields:
         hint = field.hint
         if field.sent is not None:
-            about = {"description": field.about}
-            info = FieldInfo(max_length=LONGEST_PATH, **about) if paths else FieldInfo(pattern=TARGET_KEY, **about)
+            info = FieldInfo(description=field.about, max_length=LONGEST_PATH)
+            if not paths:
+                info = FieldInfo(description=field.about, pattern=TARGET_KEY)
             hint = Annotated[str, info, TEXT]
         hints[field.name] = (hint, ... if field.required else None)
     return create_model("Values", __config__=ConfigDict(extra="forbid", strict=True), **hints)

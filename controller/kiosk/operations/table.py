@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Protocol
 
-from controller.kiosk.decide.days import expanded
 from controller.kiosk.interface import (
     Aiming,
     Appearance,
@@ -79,6 +78,7 @@ from controller.kiosk.operations.operation import (
     operation,
 )
 from controller.kiosk.roles import Role
+from controller.kiosk.schedule import expanded
 from controller.kiosk.values import NewTarget
 
 VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN

@@ -26,7 +26,7 @@ from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.kiosk.preview.computed import no_device
-from controller.kiosk.preview.pictures import write_picture
+from controller.kiosk.preview.reach import write_picture
 from controller.kiosk.store.targets import fitted, png_size
 from controller.optics.solve.bounded.engine import Processor, SolveContext
 from controller.optics.solve.engines import choose_engine

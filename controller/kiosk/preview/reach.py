@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, FloatImage, Mask, load_arrays
 from controller.core.storage import write_atomically
@@ -24,6 +25,25 @@ if TYPE_CHECKING:
     from controller.optics.solve.reach.feasibility import Feasibility
     from controller.optics.solve.request import Aim
     from controller.optics.solve.targets.values import Target
+
+LONGEST_PX: Final = 960
+"""The longer side."""
+
+
+def write_picture(path: Path, rgb: ByteImage, seen: Mask) -> None:
+    """``rgb`` (rows, columns, 3) where ``seen``, with black around it; the file's ending says how it is encoded."""
+    import cv2
+
+    from controller.stage.report.pictures import crop_around
+
+    box = crop_around(seen)
+    cut: npt.NDArray[np.uint8] = np.where(seen[..., None], rgb, 0).astype(np.uint8)[box.rows, box.columns, ::-1]
+    scale = LONGEST_PX / max(cut.shape[:2])
+    if scale < 1:
+        size_px = (max(1, round(cut.shape[1] * scale)), max(1, round(cut.shape[0] * scale)))
+        cut = np.asarray(cv2.resize(cut, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+    write_atomically(path, cv2.imencode(path.suffix, cut)[1].tobytes())
+
 
 FOLDER, KEPT = "kiosk/feasibility", 20
 FIGURES: Final = "reach.json"
@@ -72,7 +92,6 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 
 
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
-    from controller.kiosk.preview.pictures import write_picture
     from controller.kiosk.preview.preview_light import preview_light
     from controller.optics.solve.appearance import StageLight
     from controller.optics.solve.request import aim_at
@@ -144,7 +163,6 @@ def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
 
 def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
     """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
-    from controller.kiosk.preview.pictures import write_picture
     from controller.stage.report.pictures import to_screen
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())

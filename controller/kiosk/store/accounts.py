@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import hmac
 import json
 import re
@@ -21,7 +22,12 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.roles import ACCOUNT_NAME, LONGEST_PASSWORD, Role
-from controller.kiosk.store.digests import digest_of
+
+
+def digest_of(secret: str) -> str:
+    """SHA-256 in hex of a session's or a token's secret; the secret has too many bits to be guessed."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
 
 SHORTEST_PASSWORD: Final = 10
 FOLDER: Final = "kiosk/panel"

@@ -16,7 +16,8 @@ from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
-from controller.kiosk.decide.interfaces import Turn
+from controller.kiosk.store.event_log import Decision
+from controller.kiosk.values import Turn
 from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 from controller.stage.artefacts.names import safe_name
 
@@ -181,3 +182,33 @@ class BundleStore:
             index = bundle.index
         self._known[path] = index, now_s + UNREAD_S
         return index
+
+
+class BundleWatch:
+    """``warning``: what people must know, or None. One thread calls ``step`` about once a second."""
+
+    def __init__(self, bundles: BundleStore, tell: Callable[[Decision], object]) -> None:
+        self._bundles, self._tell = bundles, tell
+        self.warning: Decision | None = None
+
+    def step(self) -> None:
+        before, self.warning = self.warning, self._look()
+        if self.warning is not None and self.warning != before:
+            self._tell(self.warning)
+        elif self.warning is None and before is not None:
+            self._tell(Decision("bundle-newest", "The newest bundle plays again."))
+
+    def _look(self) -> Decision | None:
+        bundle = self._bundles.bundle()
+        if bundle is not None and self._bundles.index(bundle) is None:
+            return Decision("bundle-bad", "The installed bundle can't be read, so nothing of it is shown.",
+                            "Compute and publish the appearances again.", "error")  # fmt: skip
+        if not self._bundles.given_up():
+            return None
+        index = self._bundles.index(bundle)
+        made = "" if index is None else time.strftime(" of %Y-%m-%d %H:%M UTC", time.gmtime(index.created_unix_s))
+        return Decision(
+            "bundle-older-plays",
+            f"The newest bundle showed no picture, so the previous one{made} plays.",
+            "Compute and publish the appearances again.", "warning",
+        )  # fmt: skip

@@ -10,11 +10,24 @@ from typing import Final
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.reopening import pause_s
 from controller.kiosk.world import Lock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device
+
+LONGEST_S: Final = 15.0
+"""Not longer, because a person who plugs a cable in again waits for the result."""
+_SHORTEST_S: Final = 2.0
+_SHARE: Final = 0.25
+
+
+def pause_s(missing_s: float) -> float:
+    """Seconds until the next attempt, for a device that has been missing for ``missing_s``.
+
+    A share of that time: what is back after half a minute, as a projector that boots, is not waited for much longer.
+    """
+    return min(LONGEST_S, max(_SHORTEST_S, _SHARE * missing_s))
+
 
 OPEN_S: Final = 20.0
 LOOK_S: Final = 10.0

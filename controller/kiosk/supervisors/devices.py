@@ -16,7 +16,7 @@ from controller.kiosk.decide.interfaces import DISK_FULL, NOT_YET, Condition, Pr
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
-from controller.kiosk.supervisors.light_dose import LightDose
+from controller.kiosk.supervisors.light_records import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import World

@@ -4,24 +4,63 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from controller.bundle.install import Starts, before_it, chosen, is_readable
 from controller.core.errors import VelaturaError
-from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing, Turn
+from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
 from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
-from controller.kiosk.supervisors.player_patience import Patience
+from controller.kiosk.values import Turn
+from controller.kiosk.world import READY_S, Process, launched
 from controller.play.control.attached import AttachedPlayer
-from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover
+from controller.play.control.launch import PlayerSettings
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.player import PlayerClient
 
+MOST_MISSES: Final = 2
+"""Unanswered questions in a row after which a player counts as hung."""
+REFUSED_MORE: Final = 2
+"""So many more where the connection fails: a player that is about to end refuses it, too."""
+LONGER: Final = (1, 2, 4, 8)
+"""So many times as many questions, by how often it was ended in the last ``REMEMBERED_S``."""
+REMEMBERED_S: Final = 300.0
+
+
+class Patience:
+    """Counts the questions in a row that a player left unanswered, and its ends because of that.
+
+    A player whose answers are late or lost, because the computer is busy for example, may show its picture all the
+    time. Each end makes that black, and if it did not help, the next one will not either.
+    """
+
+    def __init__(self) -> None:
+        self._misses = 0
+        self._ends_s: deque[float] = deque(maxlen=len(LONGER) - 1)
+
+    def begins(self) -> None:
+        """The player was started, or it answered."""
+        self._misses = 0
+
+    def ends(self, now_s: float, *, as_wanted: bool, refused: bool = False) -> bool:
+        """Count one more question without an answer; whether the player is to be ended.
+
+        ``as_wanted``: it showed what it should when it answered last. Where it did not, nothing speaks for waiting.
+        """
+        self._misses += 1
+        lately = sum(now_s - end_s < REMEMBERED_S for end_s in self._ends_s)
+        most = MOST_MISSES * (LONGER[lately] if as_wanted else 1) + REFUSED_MORE * refused
+        if self._misses < most:
+            return False
+        self._ends_s.append(now_s)
+        return True
+
+
 ANSWER_S: Final = 0.8
-READY_S: Final = 8.0
 HEALTHY_S: Final = 20.0
 """A player that ran for so long is started again at once when it dies."""
 BACK_OFF_S: Final = (0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 15.0, 30.0)
@@ -39,31 +78,6 @@ STARTS_WITH_BUNDLE: Final = 6
 More than after which it goes back to the bundle before by itself (``bundle.fallback``), because a picture may have been
 on the outputs that was not seen here.
 """
-
-
-class Process(Protocol):
-    """A running player, as ``play.control.launch.PlayerProcess``."""
-
-    @property
-    def socket(self) -> Path: ...
-
-    @property
-    def pid(self) -> int: ...
-
-    @property
-    def alive(self) -> bool: ...
-
-    def wait_until_ready(self, timeout_s: float = READY_S) -> dict[str, Any]: ...
-
-    def kill(self) -> None: ...
-
-    def terminate(self) -> int: ...
-
-
-def launched(runtime: Path, settings: PlayerSettings) -> Process:
-    """A player that is being started, in the place of one that a killed starter left behind."""
-    end_leftover(runtime)
-    return PlayerProcess(runtime, settings)
 
 
 class PlayerSupervisor:

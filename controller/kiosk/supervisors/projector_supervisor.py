@@ -10,7 +10,7 @@ from typing import Final
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.reopening import pause_s
+from controller.kiosk.supervisors.device_supervisor import pause_s
 from controller.optics.capture.acquire import DISK_CODES
 from controller.stage.rig.lamp_guard import LampGuard, fatal_faults, faulty
 from controller.stage.rig.lamp_ledger import Clock, SystemClock

@@ -17,7 +17,7 @@ from typing import Final
 from controller.core.errors import VelaturaError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
-from controller.kiosk.store.digests import digest_of
+from controller.kiosk.store.accounts import digest_of
 
 LONGEST_S: Final = 12 * 3600.0
 """After this time a user must log in again, even if active."""

@@ -13,11 +13,10 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 
 from controller.core.errors import UsageError
-from controller.kiosk.decide.days import ALLOWED as ALLOWED_DAYS
-from controller.kiosk.decide.days import grouped
 from controller.kiosk.operations.fields import parse
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.roles import Role
+from controller.kiosk.schedule import ALLOWED_DAYS, grouped
 from controller.optics.calibrate.verify import error_causes
 from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor

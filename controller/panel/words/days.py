@@ -1,6 +1,6 @@
 """Days of a schedule as a reader of a language writes them, to and from the words that the kiosk knows.
 
-The kiosk knows English names and dates such as 2026-12-24 (``kiosk.decide.days``); in every language these stay right.
+The kiosk knows English names and dates such as 2026-12-24 (``kiosk.schedule``); in every language these stay right.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import date
 from typing import Final
 
-from controller.kiosk.decide.hours import WEEKDAYS
+from controller.kiosk.schedule import WEEKDAYS
 from controller.panel.words.figures import FIGURES
 from controller.panel.words.language import gettext, language, mark
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from controller.kiosk.decide.interfaces import Request
-from controller.kiosk.decide.live_changes import LiveChanges
+from controller.kiosk.decide.operator_overrides import LiveChanges
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State

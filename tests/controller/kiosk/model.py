@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from controller.kiosk.decide.clock import TrustedClock, beginning
-from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing, Turn
+from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.values import Turn
 from controller.run.state_machine import State
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampRecord

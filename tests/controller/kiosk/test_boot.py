@@ -33,7 +33,7 @@ height_px = 210
 PROBE: Final = """
 import sys
 from pathlib import Path
-from controller.stage.check import check_stage
+from controller.stage.sessions.check import check_stage
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.cli.kiosk_process import serve

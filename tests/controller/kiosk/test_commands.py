@@ -17,7 +17,7 @@ from controller.cli.groups import words_of
 from controller.core.errors import VelaturaError, WorkError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import NAME, ControlServer
-from controller.kiosk.jobs.follow_job import ask_and_follow
+from controller.kiosk.api.offline_dispatch import ask_and_follow
 from controller.kiosk.operations.table import OPERATIONS
 from controller.run.progress import Progress, Silent
 from hal.deadline import Cancelled

@@ -18,10 +18,10 @@ from controller.bundle.writer import NewAppearance, write_bundle
 from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.kiosk.decide.hours import WEEKDAYS
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
+from controller.kiosk.schedule import WEEKDAYS
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import Decision, EventLog
 from controller.stage.doctor.values import Examination

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import UsageError
-from controller.kiosk.setup import set_up
 from controller.stage.doctor.examine import Tools
+from controller.stage.services.setup import set_up
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.finding import Finder, Found, SearchScope

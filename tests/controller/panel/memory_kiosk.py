@@ -38,8 +38,8 @@ from controller.kiosk.interface import (
     ScheduleRow,
     TriedDevice,
 )
+from controller.kiosk.schedule import check
 from controller.kiosk.store import settings, targets
-from controller.kiosk.store.schedule_file import check
 from controller.stage.blender.job import BUILTIN
 from tests.controller.kiosk.vase import TEXT
 from tests.controller.panel import example_values as examples

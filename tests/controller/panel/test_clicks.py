@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from controller.kiosk.decide.hours import WEEKDAYS
+from controller.kiosk.schedule import WEEKDAYS
 from controller.kiosk.store.accounts import Accounts
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
 from tests.controller.panel.memory_kiosk import MemoryKiosk

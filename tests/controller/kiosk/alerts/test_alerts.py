@@ -15,7 +15,7 @@ from controller.config.loader import parse_stage
 from controller.config.models import AlertsTable
 from controller.config.problems import KeyLines, Place
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.alerts.alerts import AGAIN_S, GATHER_S, PAUSE_S, Alerts
+from controller.kiosk.alerts import AGAIN_S, GATHER_S, PAUSE_S, Alerts
 from controller.kiosk.store.event_log import Decision, EventLog
 from tests.controller.kiosk.alerts.servers import MailServer, WebServer
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.kiosk.api.finding import Examinations
-from controller.kiosk.api.places import places
+from controller.kiosk.api.snapshot import places
 from controller.kiosk.interface import Finding
 from tests.controller.kiosk.vase import graded_run, vase
 

@@ -11,8 +11,7 @@ import pytest
 
 from controller.config.models import BackupTable
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.kiosk.backup.nightly import AGAIN_S, NightlyBackup, places
-from controller.kiosk.backup.places import copied
+from controller.kiosk.backup import AGAIN_S, NightlyBackup, copied, places
 from controller.kiosk.store import archive
 from controller.kiosk.store.event_log import Decision, EventLog
 from tests.controller.kiosk.vase import TEXT, vase

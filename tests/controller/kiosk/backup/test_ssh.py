@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import VelaturaError
-from controller.kiosk.backup.ssh import Server
+from controller.kiosk.backup import Server
 from controller.kiosk.store import archive
 from tests.controller.kiosk.backup.ssh_server import CutLine, SshServer, make_key
 from tests.controller.kiosk.vase import TEXT, vase

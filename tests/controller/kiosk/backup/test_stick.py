@@ -12,8 +12,7 @@ import pytest
 
 from controller.config.models import BackupTable
 from controller.core.errors import WorkError
-from controller.kiosk.backup.nightly import NightlyBackup
-from controller.kiosk.backup.places import Stick
+from controller.kiosk.backup import NightlyBackup, Stick
 from controller.kiosk.store import archive
 from controller.kiosk.store.event_log import EventLog
 from tests.controller.kiosk.backup.test_nightly import NIGHT_S

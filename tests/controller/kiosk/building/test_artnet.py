@@ -17,12 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stupidArtnet import StupidArtnet
 
-from controller.kiosk.building import artnet, artnet_packets
-from controller.kiosk.building.artnet import ArtNetOptions, frame_of
-from controller.kiosk.building.artnet_packets import Levels, Poll
+from controller.kiosk.building import artnet
+from controller.kiosk.building.artnet import ArtNetOptions, Levels, Poll, frame_of
 from controller.kiosk.building.dmx import Frame, Sources
-from controller.kiosk.building.protocol import read
-from controller.kiosk.building.server import serving
+from controller.kiosk.building.protocol import read, serving
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.waiting import eventually, wait_for
 
@@ -150,23 +148,23 @@ POLL = b"Art-Net\0" + bytes((0x00, 0x20, 0, 14, 0x02, 0x10))
 
 def test_only_whole_packets_of_its_universe_count() -> None:
     options = ArtNetOptions(universe=UNIVERSE, channel=10)
-    found = artnet_packets.read(WHOLE)
+    found = artnet.read(WHOLE)
     assert isinstance(found, Levels)
     assert frame_of(found, "10.0.0.7", options) == Frame("10.0.0.7", 0, 7, False, (1, 2, 3))
     assert frame_of(found, "10.0.0.7", ArtNetOptions(universe=UNIVERSE + 1)) is None
     short = WHOLE[:16] + bytes((0, 11)) + WHOLE[18:29]
-    cut = artnet_packets.read(short)
+    cut = artnet.read(short)
     assert isinstance(cut, Levels)
     assert frame_of(cut, "10.0.0.7", options) is None, "the third channel is missing: it is not 0"
     for damaged in (WHOLE[:-1], WHOLE[:17], b"art-net" + WHOLE[7:], WHOLE[:10] + b"\0\x0d" + WHOLE[12:]):
-        assert artnet_packets.read(damaged) is None
-    assert artnet_packets.read(WHOLE[:8] + b"\x00\x52" + WHOLE[10:]) is None, "ArtSync"
+        assert artnet.read(damaged) is None
+    assert artnet.read(WHOLE[:8] + b"\x00\x52" + WHOLE[10:]) is None, "ArtSync"
 
 
 def test_a_poll_may_ask_for_some_universes() -> None:
-    assert artnet_packets.read(POLL) == Poll(0, 0x7FFF)
+    assert artnet.read(POLL) == Poll(0, 0x7FFF)
     targeted = POLL[:12] + bytes((0x22, 0x10, 0x12, 0x40, 0x12, 0x30))
-    assert artnet_packets.read(targeted) == Poll(0x1230, 0x1240)
+    assert artnet.read(targeted) == Poll(0x1230, 0x1240)
 
 
 def test_the_first_controller_counts_until_it_is_lost() -> None:
@@ -185,7 +183,7 @@ def test_the_first_controller_counts_until_it_is_lost() -> None:
     lambda cut: WHOLE[: cut[0]] + cut[1] + WHOLE[cut[0] + len(cut[1]) :]
 ) | st.integers(0, len(WHOLE)).map(lambda end: WHOLE[:end]))  # fmt: skip
 def test_no_datagram_raises(datagram: bytes) -> None:
-    found = artnet_packets.read(datagram)
+    found = artnet.read(datagram)
     if isinstance(found, Levels):
         assert 1 <= len(found.values) <= 512
         frame_of(found, "10.0.0.7", ArtNetOptions(channel=510))

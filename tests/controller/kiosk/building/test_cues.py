@@ -13,9 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.kiosk.building.cue_list import Cue, due, parse
-from controller.kiosk.building.protocol import read
-from controller.kiosk.building.server import serving
+from controller.kiosk.building.cues import Cue, due, parse
+from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.building.verbs import Verbs
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.waiting import wait_for

@@ -19,8 +19,7 @@ import pytest
 from aiopjlink import PJLinkERR3
 
 from controller.kiosk.building.osc import message
-from controller.kiosk.building.protocol import read
-from controller.kiosk.building.server import serving
+from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
 from hal.values import TECHNICIAN_KEYS

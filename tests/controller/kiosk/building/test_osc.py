@@ -16,10 +16,8 @@ from hypothesis import strategies as st
 from pythonosc.osc_packet import OscPacket
 
 from controller.kiosk.building.osc import OscOptions, message, named, requests, state_of
-from controller.kiosk.building.protocol import read
-from controller.kiosk.building.rates import Rate
-from controller.kiosk.building.server import serving
-from controller.kiosk.building.verbs import Verbs
+from controller.kiosk.building.protocol import read, serving
+from controller.kiosk.building.verbs import Rate, Verbs
 from controller.kiosk.operations.table import brightness, next_appearance
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port

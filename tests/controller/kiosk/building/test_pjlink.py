@@ -17,9 +17,8 @@ from pypjlink import MUTE_AUDIO, MUTE_VIDEO
 from pypjlink import Projector as PyPjLink
 from pypjlink.projector import ProjectorError
 
-from controller.kiosk.building import pjlink_lines as lines
-from controller.kiosk.building.protocol import read
-from controller.kiosk.building.server import serving
+from controller.kiosk.building import pjlink as lines
+from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.interface import KioskState
 from hal.codecs.projectors.pjlink import second_level_digest
 from tests.aiopjlink_client import talk

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from sacn import DataPacket, sACNsender
 
 from controller.kiosk.building.dmx import Follower, Frame, Sources
-from controller.kiosk.building.protocol import read
+from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.building.sacn import SacnOptions, frame_of
-from controller.kiosk.building.server import serving
 from controller.kiosk.interface import KioskState
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port

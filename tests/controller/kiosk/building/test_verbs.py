@@ -8,8 +8,7 @@ import pytest
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.building.protocol import NetworkOptions, read
-from controller.kiosk.building.rates import Rate
-from controller.kiosk.building.verbs import Verbs
+from controller.kiosk.building.verbs import Rate, Verbs
 from controller.kiosk.roles import Role
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 

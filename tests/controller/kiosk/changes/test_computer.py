@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.changes.compare import KINDS, changes
 from controller.kiosk.changes.inventory import Inventory
+from controller.kiosk.changes.watch import KINDS, changes
 from tests.controller.kiosk.changes.computer import Computer
 
 X_SETTINGS = "etc/X11/xorg.conf.d/20-velatura-outputs.conf"

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from controller.config import load_stage
-from controller.kiosk.changes.compare import changes, unknown
 from controller.kiosk.changes.devices import (
     ASK_S,
     camera_facts,
@@ -19,7 +18,8 @@ from controller.kiosk.changes.devices import (
     shown_facts,
 )
 from controller.kiosk.changes.inventory import Fact, Inventory
-from controller.kiosk.install.outputs import connected
+from controller.kiosk.changes.watch import changes, unknown
+from controller.kiosk.outputs import connected
 from controller.kiosk.world import World
 from hal.deadline import Deadline, in_seconds
 from hal.registry import OpenContext

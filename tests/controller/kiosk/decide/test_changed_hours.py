@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.decide.changed_hours import effect
-from controller.kiosk.decide.operator_overrides import OperatorOverrides
+from controller.kiosk.decide.operator_overrides import OperatorOverrides, effect
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.store.event_log import EventLog

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.decide.hours import WEEKDAYS, check_schedule
-from controller.kiosk.decide.interfaces import BLACK, IN_TURN, Showing
+from controller.kiosk.decide.interfaces import BLACK, Showing
 from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.schedule import WEEKDAYS, check_schedule
+from controller.kiosk.values import IN_TURN
 from controller.run.state_machine import State
 from tests.controller.kiosk.model import BUNDLE, Kiosk
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.kiosk.decide.hours import check_schedule, openings
 from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, WINDOW_S, Plan, believed, plan
 from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.schedule import check_schedule, openings
 
 VIENNA = ZoneInfo("Europe/Vienna")
 WEEK = tuple(ScheduleRow(day, "10:00", "18:00") for day in ("mon", "tue", "wed", "thu", "fri", "sat", "sun"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controller.kiosk.install.outputs import connected, placed, player_outputs, x_configuration
+from controller.kiosk.outputs import connected, placed, player_outputs, x_configuration
 from controller.play.frames import parse_outputs
 
 LEFT = """Screen 0: minimum 320 x 200, current 2800 x 1050, maximum 16384 x 16384

@@ -15,8 +15,8 @@ import pytest
 from controller.core.errors import UsageError, WorkError
 from controller.core.kiosk_places import STAGE
 from controller.kiosk.install import restored
-from controller.kiosk.install.outputs import Connected, connected
 from controller.kiosk.install.restored import Wanted, matched
+from controller.kiosk.outputs import Connected, connected
 from controller.kiosk.store import archive
 from tests.controller.kiosk.install.test_steps import FRESH, PREFIX, Recorded, debian
 from tests.controller.kiosk.vase import TEXT, graded_run, vase

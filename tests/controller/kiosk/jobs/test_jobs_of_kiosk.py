@@ -17,9 +17,9 @@ from controller.core.storage import runtime_folder, write_atomically
 from controller.kiosk.api import kiosk as kiosk_module
 from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.api.offline_dispatch import ask_and_follow
 from controller.kiosk.decide.interfaces import Request
 from controller.kiosk.interface import Job, Schedule
-from controller.kiosk.jobs.follow_job import ask_and_follow
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
 from controller.kiosk.store import archive

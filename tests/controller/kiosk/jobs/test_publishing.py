@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from controller.core.errors import CalibrationError, UsageError, WorkError
-from controller.kiosk.jobs.publishing import publish_appearances
+from controller.kiosk.jobs.job_handlers import publish_appearances
 from controller.run.progress import Silent
 from controller.stage.services import calibrate as services
 from controller.stage.sessions.session import BorrowedSession

@@ -15,8 +15,7 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.kiosk.store import archive
-from controller.kiosk.store.archive import FOLDER
-from controller.kiosk.store.diagnostics import LARGEST_TAPE, diagnostics
+from controller.kiosk.store.archive import FOLDER, LARGEST_TAPE, diagnostics
 from controller.stage.sessions.run import new_tape
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 

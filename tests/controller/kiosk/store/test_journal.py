@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.interface import EventRow
+from controller.kiosk.serving import journal_of
 from controller.kiosk.store.event_log import Decision, EventLog
-from controller.kiosk.store.journal import journal_of
 
 DAEMON = Path("/lib/systemd/systemd-journald")
 TEXT = "The projector »left« is missing.\nPRIORITY=7"

@@ -6,8 +6,8 @@ import os
 import time
 from pathlib import Path
 
+from controller.kiosk.store.disk_space import purge_old_photographs
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.store.photo_retention import purge_old_photographs
 from controller.run.journal import Journal
 from controller.stage.artefacts.names import CAPTURES
 

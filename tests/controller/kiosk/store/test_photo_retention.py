@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.store.photo_retention import GOING, KEPT_S, expired, purge
+from controller.kiosk.store.disk_space import KEPT_S, PHOTOGRAPHS_GOING, expired, purge
 from controller.run.journal import Journal
 from controller.stage.artefacts.names import CAPTURES
 
@@ -79,9 +79,9 @@ def test_what_a_power_cut_left_half_removed_is_removed_the_next_time(tmp_path: P
     old = run_of(tmp_path, "20260101-020000-drift")
     for day in (2, 3):
         run_of(tmp_path, f"2026010{day}-020000-drift")
-    (old / CAPTURES).rename(old / GOING)
+    (old / CAPTURES).rename(old / PHOTOGRAPHS_GOING)
     assert purge(expired(tmp_path, now_s=NOW_S)) == 1000
-    assert not (old / GOING).exists()
+    assert not (old / PHOTOGRAPHS_GOING).exists()
 
 
 def test_a_stage_without_runs_has_nothing_to_remove(tmp_path: Path) -> None:

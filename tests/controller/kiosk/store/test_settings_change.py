@@ -9,8 +9,8 @@ import pytest
 from controller.config import load_stage
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.kiosk.store import settings, settings_change
-from controller.kiosk.store.settings_change import GOOD, Change, GoodSettings, change, last_good
+from controller.kiosk.store import settings
+from controller.kiosk.store.settings import GOOD, Change, GoodSettings, change, last_good
 from controller.stage.sessions.calibrations import signing_key
 from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import TEXT, vase
@@ -117,7 +117,7 @@ def test_good_settings_that_a_full_disk_did_not_take_are_kept_once_it_has_room(
         raise WorkError("no-space", what="The disk is full.", remedy="Free some space.")
 
     with monkeypatch.context() as patched:
-        patched.setattr(settings_change, "write_atomically", full)
+        patched.setattr(settings, "write_atomically", full)
         good.keep(check_stage(stage))
         good.step()
         assert not (stage / GOOD).exists()

@@ -6,7 +6,7 @@ from datetime import date
 from pathlib import Path
 
 from controller.kiosk.interface import Lamp, LampDay
-from controller.kiosk.supervisors.lamp_history import EVERY_S, FILE, MOST_DAYS, LampHistory
+from controller.kiosk.supervisors.light_records import EVERY_S, FILE, MOST_DAYS, LampHistory
 
 MONDAY, TUESDAY = date(2026, 1, 5), date(2026, 1, 6)
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.kiosk.supervisors.devices import Devices
-from controller.kiosk.supervisors.light_dose import EVERY_S, FILE, LONGEST_GAP_S, LightDose
+from controller.kiosk.supervisors.light_records import DOSE_FILE, LONGEST_GAP_S, SAVED_EVERY_S, LightDose
 from controller.kiosk.world import World
 from controller.stage.sessions.check import check_stage
 from tests.controller.stage.sessions.test_relays_and_light import LIGHT, Hall
@@ -32,7 +32,7 @@ def test_an_hour_of_two_hundred_lux_is_two_hundred_lux_hours_also_after_a_restar
         clock.now_s += 10
     assert dose.lux_hours == pytest.approx(200)
     kept = LightDose(tmp_path, monotonic=clock).lux_hours
-    assert 200 - 200 * (EVERY_S + 10) / 3600 <= kept <= 200, "saved every ten minutes"
+    assert 200 - 200 * (SAVED_EVERY_S + 10) / 3600 <= kept <= 200, "saved every ten minutes"
     dose.save()
     again = LightDose(tmp_path, monotonic=clock)
     assert again.lux_hours == pytest.approx(200, abs=1e-3)
@@ -72,8 +72,8 @@ def test_it_never_falls_and_is_never_less_than_the_light(readings: list[tuple[fl
 
 @pytest.mark.parametrize("content", ["", "[]", '{"lux_hours": "x"}', '{"lux_hours": NaN}', '{"lux_hours": -5}'])
 def test_a_damaged_file_begins_at_nothing(tmp_path: Path, content: str) -> None:
-    (tmp_path / FILE).parent.mkdir()
-    (tmp_path / FILE).write_text(content)
+    (tmp_path / DOSE_FILE).parent.mkdir()
+    (tmp_path / DOSE_FILE).write_text(content)
     assert LightDose(tmp_path).lux_hours == 0
 
 

@@ -15,9 +15,8 @@ from controller.bundle.install import CURRENT, current, install
 from controller.bundle.signing import Trust, write_public_key
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.interfaces import Showing
-from controller.kiosk.store.bundle_store import BundleStore
+from controller.kiosk.store.bundle_store import BundleStore, BundleWatch
 from controller.kiosk.store.event_log import Decision
-from controller.kiosk.supervisors.bundle_watch import BundleWatch
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 from tests.controller.play.conftest import OUTPUTS, write_noise

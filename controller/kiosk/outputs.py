@@ -1,8 +1,9 @@
-"""From what ``xrandr --verbose`` prints to the X server's configuration and the player's outputs. No I/O."""
+"""From what ``xrandr --verbose`` prints to the X server's configuration and the player's outputs."""
 
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -88,6 +89,16 @@ def connected(text: str) -> list[Connected]:
             modes[-1].timing += [int(found[n]) for n in range(2, 6)]
     whole = [replace(one, modes=[mode for mode in one.modes if len(mode.timing) == 8]) for one in outputs]
     return [one for one in whole if one.modes]
+
+
+def outputs_of_x() -> list[Connected]:
+    """The X server's outputs as `xrandr` tells them; none without an X server."""
+    # A library would end this process with the X server.
+    try:
+        done = subprocess.run(["xrandr", "--verbose"], capture_output=True, text=True, errors="replace", timeout=20)  # noqa: PLW1510, S607
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return connected(done.stdout) if done.returncode == 0 else []
 
 
 def placed(outputs: Sequence[Connected], size_px: tuple[int, int] | None = None) -> list[Placed]:
