@@ -23,8 +23,8 @@ from controller.core.text import duration, printable
 from controller.run.progress import Phase, Progress, Reporter
 from hal.notices import Level
 
-PLAIN_EVERY: Final = 0.25
-"""Share of a step after which plain output prints another line."""
+SILENT_S: Final = 60.0
+"""After so many seconds, plain output prints a line within a step, too."""
 
 _JSON: ContextVar[bool] = ContextVar("json", default=False)
 
@@ -88,18 +88,17 @@ class JsonReporter:
 
 
 class PlainReporter:
-    """One line for each change of step, and for each quarter of a long one."""
+    """One line for each step, when it ends; one a minute within a long step."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._lock = threading.Lock()
-        self._last: tuple[int, Phase, int] | None = None
+        self._printed_s = 0.0
 
     def progress(self, now: Progress) -> None:
-        mark = (now.index, now.phase, int(now.step_fraction / PLAIN_EVERY) if now.phase is Phase.RUNNING else 0)
-        if mark == self._last:
+        if now.phase is Phase.RUNNING and now.elapsed_s - self._printed_s < SILENT_S:
             return
-        self._last = mark
+        self._printed_s = now.elapsed_s
         left = "" if now.left_s is None or now.fraction >= 1 else f", {duration(now.left_s)} left"
         what = {Phase.RUNNING: now.note or "...", Phase.DONE: "done", Phase.SKIPPED: "done earlier"}[now.phase]
         self._print(f"[{now.fraction:4.0%}{left}] {now.index + 1}/{now.count} {now.step}: {what}")

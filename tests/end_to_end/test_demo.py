@@ -119,7 +119,7 @@ def test_the_page_shows_direct_and_indirect_light(page: str) -> None:
 
 
 def test_the_page_shows_every_appearance_with_before_target_achieved_and_error(page: str, report: Any) -> None:
-    sections = re.findall(r"<section>.*?</section>", page, re.DOTALL)[: len(APPEARANCES)]
+    sections = re.findall(r"<section>\n<div class=\"near\">.*?</section>", page, re.DOTALL)[: len(APPEARANCES)]
     for section, one in zip(sections, report["appearances"], strict=True):
         assert re.findall(r"<figcaption>([A-Z][a-z ]+?) <span>", section) == [
             "Before", "Target", "Achieved", "Error", "Traditional", "Its error",

@@ -30,6 +30,7 @@ from controller.stage.report.page import (
     PictureRow,
     ReportPicture,
     judged_rows,
+    nearness,
     refined_row,
     write_report,
 )
@@ -43,7 +44,7 @@ LONGEST_PX: Final = 960
 GOAL_DELTA_E: Final = 4.0
 MOMENT: Final = "%d %B %Y, %H:%M"
 _SHOWN: Final = (
-    ("before", "Before", "all projectors at white"),
+    ("before", "Before", "in white light"),
     ("target", "Target", ""),
     ("achieved", "Achieved", "photograph"),
     ("error", "Error", "CIEDE2000"),
@@ -174,7 +175,7 @@ def _row(run: Path, one: Compared, zone: tzinfo | None) -> PictureRow:
         image = cv2.imread(str(path)) if path.exists() else None
         if image is not None:
             pictures.append(ReportPicture(caption, _rgb(image), note))
-    return PictureRow(one.title, tuple(known), tuple(pictures))
+    return PictureRow(one.title, nearness(one.delta_e00_median, one.reachable_share), tuple(known), tuple(pictures))
 
 
 def _rgb(image: Any) -> ByteImage:

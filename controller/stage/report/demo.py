@@ -26,7 +26,16 @@ from controller.stage.artefacts.solved import Solved, is_solved, read_base_figur
 from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.one_projector import OneProjector, as_figures, as_rows, one_projector
 from controller.stage.report.one_projector import goals as one_projector_goals
-from controller.stage.report.page import Goal, Page, PictureRow, ReportPicture, judged_rows, refined_row, write_report
+from controller.stage.report.page import (
+    Goal,
+    Page,
+    PictureRow,
+    ReportPicture,
+    judged_rows,
+    nearness,
+    refined_row,
+    write_report,
+)
 from controller.stage.report.pictures import Crop, crop_around, error_picture, fitted, to_screen
 from controller.stage.report.words import spent
 from controller.stage.sessions.check import Checked, check_stage
@@ -202,6 +211,7 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
     target = np.where(outside, calibration.black, requested).astype(np.float32)
     return PictureRow(
         title=appearance.title,
+        near=nearness(appearance.ours.delta_e00_median, float(str(appearance.solved.figures["reachable_share"]))),
         figures=(
             *judged_rows(appearance.judged),
             *as_rows(appearance.alone, appearance.ours),
@@ -212,7 +222,7 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
             *refined_row(appearance.solved.figures.get("refined")),
         ),
         pictures=(
-            ReportPicture("Before", before, "all projectors at white"),
+            ReportPicture("Before", before, "in white light"),
             ReportPicture("Target", screen(target)),
             ReportPicture("Achieved", screen(appearance.photograph), "photograph"),
             ReportPicture("Error", error(appearance.ours)),

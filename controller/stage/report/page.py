@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import jinja2
 
@@ -37,10 +37,43 @@ Gallery = tuple[str, str, tuple[ReportPicture, ...]]
 
 
 @dataclass(frozen=True, slots=True)
+class Nearness:
+    """How near a photograph is to its target: in words, as the median CIEDE2000, and on which part of the object."""
+
+    words: str
+    delta_e: float
+    part: str
+
+
+NEARNESS: Final = (
+    (1.0, "No visible difference"),
+    (2.0, "Very near"),
+    (4.0, "Near"),
+    (8.0, "A visible difference"),
+    (math.inf, "Not near"),
+)
+"""Words for a median colour difference (CIEDE2000) up to a limit. 1 is about the smallest that a trained eye sees."""
+WHOLE: Final = 0.95
+"""Share of the object in reach above which nothing is said of the rest."""
+
+
+def nearness(delta_e: float, reachable_share: float | None) -> Nearness:
+    """The words for a median difference over the pixels in reach, which are ``reachable_share`` of the object."""
+    words = next(words for limit, words in NEARNESS if delta_e <= limit)
+    if reachable_share is None or reachable_share >= WHOLE:
+        return Nearness(words, delta_e, "")
+    return Nearness(words, delta_e, f"on {reachable_share:.0%} of the object")
+
+
+@dataclass(frozen=True, slots=True)
 class PictureRow:
-    """One appearance on the page: a title, its figures in words, and its pictures from left to right."""
+    """One appearance on the page. The first three pictures are seen at once: before, target, achieved.
+
+    The other pictures and the figures, name and text, are below a fold.
+    """
 
     title: str
+    near: Nearness
     figures: tuple[tuple[str, str], ...]
     pictures: tuple[ReportPicture, ...]
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -34,16 +35,16 @@ def test_machines_get_one_object_a_line() -> None:
     assert message == {"message": {"level": "warning", "text": "three lamps"}}
 
 
-def test_plain_output_has_a_line_for_each_change_not_for_each_call() -> None:
+def test_plain_output_has_one_line_for_a_step_and_one_a_minute_within_a_long_one() -> None:
     stream = io.StringIO()
     with console.reporter(stream) as reporter:
         for hundredth in range(100):
             reporter.progress(now(step_fraction=hundredth / 100))
         reporter.progress(now(Phase.DONE))
+        for second in range(12, 100):
+            reporter.progress(replace(now(), elapsed_s=float(second)))
     lines = stream.getvalue().splitlines()
-    assert len(lines) == 5
-    assert lines[0] == "[ 30%, 1 min 05 s left] 2/4 Decode: ..."
-    assert lines[-1].endswith("2/4 Decode: done")
+    assert lines == ["[ 30%, 1 min 05 s left] 2/4 Decode: done", "[ 30%, 1 min 05 s left] 2/4 Decode: ..."]
 
 
 def test_a_terminal_sees_step_percentage_and_time_left() -> None:
