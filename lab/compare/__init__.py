@@ -1,3 +1,3 @@
-"""A public benchmark of methods that make an object look like a target. Entry: `methods`, `judging`; the interface of a
+"""Compares methods that make an object look like a target. Entry: `methods`, `evaluation`; the interface of a
 method is `lab.compare.api`.
 """

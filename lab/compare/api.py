@@ -3,11 +3,11 @@
 A method is a function. It gets a stage, measures it with photographs of patterns of its choice, and returns a second
 function, which makes the frames of one target::
 
-    def plain(stage: BenchmarkStage) -> Callable[[BenchmarkTarget], list[np.ndarray]]:
+    def plain(stage: ComparisonStage) -> Callable[[ComparisonTarget], list[np.ndarray]]:
         white = [np.full((height, width, 3), 255, np.uint8) for width, height in stage.projectors_px]
         lit = stage.photograph(white)
 
-        def frames(target: BenchmarkTarget) -> list[np.ndarray]:
+        def frames(target: ComparisonTarget) -> list[np.ndarray]:
             ...
 
         return frames
@@ -27,7 +27,7 @@ from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 
 @dataclass(frozen=True, slots=True)
-class BenchmarkTarget:
+class ComparisonTarget:
     """What the camera shall see, in the stage's unit of light. The arrays are the method's own copies.
 
     ``name``: of the target
@@ -45,7 +45,7 @@ class BenchmarkTarget:
 
 
 @dataclass(frozen=True, slots=True)
-class BenchmarkCalibration:
+class ComparisonCalibration:
     """Velatura's own calibration of the stage.
 
     ``calibration``, ``transport``, ``indirect``: as of ``CalibratedRun``; of the projectors that were asked for
@@ -58,7 +58,7 @@ class BenchmarkCalibration:
     geometry: Geometry
 
 
-class BenchmarkStage(Protocol):
+class ComparisonStage(Protocol):
     """A stage as a method sees it; the truth behind it is not available.
 
     ``projectors_px``: (width, height) of each projector, in the order of all frames
@@ -109,7 +109,7 @@ class BenchmarkStage(Protocol):
         Errors: ``benchmark-frames-wrong``, ``benchmark-white-wrong``, ``benchmark-photographs-spent``.
         """
 
-    def calibrated(self, which: Sequence[int] | None = None) -> BenchmarkCalibration:
+    def calibrated(self, which: Sequence[int] | None = None) -> ComparisonCalibration:
         """Velatura's own calibration of all projectors, or of ``which``, in that order.
 
         Its photographs of these projectors are counted, once. They may bring the count above the limit.
@@ -118,5 +118,5 @@ class BenchmarkStage(Protocol):
         """
 
 
-MakeFrames = Callable[[BenchmarkTarget], Sequence[ByteImage]]
-BenchmarkMethod = Callable[[BenchmarkStage], MakeFrames]
+MakeFrames = Callable[[ComparisonTarget], Sequence[ByteImage]]
+ComparisonMethod = Callable[[ComparisonStage], MakeFrames]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
 
-def benchmark(
+def compare(
     method: Annotated[
         list[str] | None,
         typer.Option(help="A method's name, module:function or file.py:function; repeat it for more (default: all)."),
@@ -24,15 +24,15 @@ def benchmark(
         list[str] | None, typer.Option(help="dark, flat, room or traced; repeat it for more (default: all).")
     ] = None,
     size: BenchSize = "small",
-    out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("benchmark"),
+    out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("comparison"),
     seed: Seeds = None,
 ) -> None:
     """Compare methods on fixed emulated scenes. Judges photographs of what they make. Continues unfinished work."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from lab.compare.service import benchmark
+        from lab.compare.service import compare
 
-        return benchmark(
+        return compare(
             methods=tuple(method or ()),
             scene_names=tuple(scene or ()),
             size=size,

@@ -1,6 +1,6 @@
 """The methods that are entered: ours, and earlier ones as their papers describe them.
 
-docs/how-to/benchmark.md says what each does, and what it leaves out.
+docs/how-to/compare-methods.md says what each does, and what it leaves out.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.calibrate.dots import CLEAR_GAIN
-from lab.compare.api import BenchmarkTarget, MakeFrames
-from lab.compare.counted import CountedStage
+from lab.compare.api import ComparisonTarget, MakeFrames
+from lab.compare.metered_stage import MeteredStage
 from lab.study.experiments.ablation import paper_model, raw_transport, with_metapixels
 from lab.study.subject.measuring import unbounded_inverse
 
@@ -36,14 +36,14 @@ SINGULAR: Final = 1e-6
 """A pixel's colours are too alike to be separated if the determinant is below this share of its light cubed."""
 
 
-def ours(stage: CountedStage) -> MakeFrames:
+def ours(stage: MeteredStage) -> MakeFrames:
     """Velatura: measured shares of light, all projectors solved together between bounds, with indirect light."""
     known = stage.calibrated()
     black = known.calibration.black
     return lambda target: _bounded(known.transport, target, black, known.calibration, known.indirect)
 
 
-def paper(stage: CountedStage) -> MakeFrames:
+def paper(stage: MeteredStage) -> MakeFrames:
     """The superimposed-projector paper's own way: Gaussians fitted to photographed dots, evened out, bounded solve."""
     known = stage.calibrated()
     plain = paper_model(known.calibration)
@@ -53,20 +53,20 @@ def paper(stage: CountedStage) -> MakeFrames:
     return lambda target: _bounded(transport, target, plain.black, plain, known.indirect)
 
 
-def inversion(stage: CountedStage) -> MakeFrames:
+def inversion(stage: MeteredStage) -> MakeFrames:
     """Full inversion (Wetzstein and Bimber 2007): pseudo-inverse of the measured light transport, then clipped."""
     known = stage.calibrated()
     plain = paper_model(known.calibration)
     transport = raw_transport(plain, [stage.dots(n).shares for n in range(len(plain.projectors))])
 
-    def frames(target: BenchmarkTarget) -> list[ByteImage]:
+    def frames(target: ComparisonTarget) -> list[ByteImage]:
         wanted = direct_part(transport, target.radiance, plain.black, known.indirect)
         return _device(plain, unbounded_inverse(transport, wanted, plain.black, iterations=STEPS))
 
     return frames
 
 
-def single(stage: CountedStage) -> MakeFrames:
+def single(stage: MeteredStage) -> MakeFrames:
     """One projector (Nayar 2003, Grossberg 2004): each pixel's own colour matrix, measured and inverted."""
     sizes = stage.projectors_px
     black = stage.photograph(_shown(sizes, 0, (0, 0, 0)))
@@ -76,7 +76,7 @@ def single(stage: CountedStage) -> MakeFrames:
     known = stage.calibrated([best])
     part = known.calibration.projectors[0]
 
-    def frames(target: BenchmarkTarget) -> list[ByteImage]:
+    def frames(target: ComparisonTarget) -> list[ByteImage]:
         whole = _shown(sizes, 0, (0, 0, 0))
         light = np.maximum(target.radiance - black, 0)
         whole[best] = to_device(divided(part, colours[best], light), part.radiometry)
@@ -85,7 +85,7 @@ def single(stage: CountedStage) -> MakeFrames:
     return frames
 
 
-def feathering(stage: CountedStage) -> MakeFrames:
+def feathering(stage: MeteredStage) -> MakeFrames:
     """Feathered projectors (Raskar 1999): each adds a share that falls to nothing at the edge of its light."""
     sizes = stage.projectors_px
     black = stage.photograph(_shown(sizes, 0, (0, 0, 0)))
@@ -93,7 +93,7 @@ def feathering(stage: CountedStage) -> MakeFrames:
     shares = feathers(_lit(colours, stage.object_mask))
     calibration = stage.calibrated().calibration
 
-    def frames(target: BenchmarkTarget) -> list[ByteImage]:
+    def frames(target: ComparisonTarget) -> list[ByteImage]:
         light = np.maximum(target.radiance - black, 0)
         parts = zip(calibration.projectors, colours, shares, strict=True)
         return _device(calibration, [divided(part, seen, share[..., None] * light) for part, seen, share in parts])
@@ -131,7 +131,7 @@ def divided(part: ProjectorCalibration, colours: Float64, light: FloatImage) -> 
 
 def _bounded(
     transport: LightTransport,
-    target: BenchmarkTarget,
+    target: ComparisonTarget,
     black: FloatImage,
     calibration: Calibration,
     indirect: IndirectLight | None,
@@ -153,7 +153,7 @@ def _shown(sizes: Sequence[tuple[int, int]], n: int, colour: tuple[int, int, int
     return frames
 
 
-def _colours(stage: CountedStage, n: int, black: FloatImage) -> Float64:
+def _colours(stage: MeteredStage, n: int, black: FloatImage) -> Float64:
     """(rows, columns, 3 camera channels, 3 projector channels): light of each channel of projector ``n`` at full."""
     channels = [tuple(255 if k == c else 0 for k in range(3)) for c in range(3)]
     seen = [stage.photograph(_shown(stage.projectors_px, n, (r, g, b))) - black for r, g, b in channels]

@@ -13,8 +13,8 @@ from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.optics.solve.reach.feasibility import direct_part
 from controller.optics.transport import LightTransport, build_transport
 from controller.stage.steps.appearance.solving import device_frames
-from lab.compare.api import BenchmarkTarget, MakeFrames
-from lab.compare.counted import CountedStage
+from lab.compare.api import ComparisonTarget, MakeFrames
+from lab.compare.metered_stage import MeteredStage
 from lab.study.experiments.ablation import paper_model, with_metapixels
 
 OFF_PX: Final = 0.5
@@ -29,7 +29,7 @@ TRIALS: Final = 300
 EDGE_PX: Final = 7
 
 
-def superresolution(stage: CountedStage) -> MakeFrames:
+def superresolution(stage: MeteredStage) -> MakeFrames:
     """Super-resolution on a plane (Damera-Venkata and Chang 2009, Majumder 2005): homographies, then descent."""
     known = stage.calibrated()
     plain = paper_model(known.calibration)
@@ -40,7 +40,7 @@ def superresolution(stage: CountedStage) -> MakeFrames:
     model = with_metapixels(plain, found)
     transport = build_transport(model)
 
-    def frames(target: BenchmarkTarget) -> list[ByteImage]:
+    def frames(target: ComparisonTarget) -> list[ByteImage]:
         wanted = direct_part(transport, target.radiance, plain.black, known.indirect)
         light = np.where(target.valid[..., None], np.maximum(wanted - plain.black, 0), 0).astype(np.float32)
         return list(device_frames(model, descended(transport, light, target.valid)).values())

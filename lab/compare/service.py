@@ -21,10 +21,10 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.check import Checked
-from lab.compare import board, counted, judging, scenes
-from lab.compare.counted import CameraFacts, CountedStage, calibration_effort
-from lab.compare.entering import Entry, entries
-from lab.compare.judging import fixed_targets, judge
+from lab.compare import evaluation, leaderboard, metered_stage, scenes
+from lab.compare.entries import Entry, entries
+from lab.compare.evaluation import evaluate, fixed_targets
+from lab.compare.metered_stage import CameraFacts, MeteredStage, calibration_effort
 from lab.compare.planar import flat_part
 from lab.compare.scenes import SCENES, chosen_scenes
 from lab.study.service import check_size, opened, prepare_scene, run_on_bench
@@ -39,7 +39,7 @@ SHOTS: Final = "study"
 """The kind of photographs that experiments and methods take (``RigPhotographer``)."""
 
 
-def benchmark(
+def compare(
     *,
     methods: Sequence[str],
     scene_names: Sequence[str],
@@ -58,16 +58,16 @@ def benchmark(
     entered, chosen = entries(methods), chosen_scenes(scene_names)
     check_size(size)
     out = out.resolve()
-    page = out / board.PAGE
+    page = out / leaderboard.PAGE
     for seed in dict.fromkeys(seeds):
         for scene in chosen:
             reporter.say(f"On {scene.title}, seed {seed}: {', '.join(entry.name for entry in entered)}.")
             rows = _on_scene(scene, entered, out, (size, seed), reporter, cancel)
             # After each scene, so that a failing one does not cost the results of the previous ones.
-            content = board.update_board(out, size, rows)
-            board.strips(out, content["results"], partial(_pictures, out))
-            page = board.write_page(out, content, _about(content, entered), _titles())
-    return {"page": str(page), "results": str(out / board.BOARD)}
+            content = leaderboard.update_leaderboard(out, size, rows)
+            leaderboard.strips(out, content["results"], partial(_pictures, out))
+            page = leaderboard.write_page(out, content, _about(content, entered), _titles())
+    return {"page": str(page), "results": str(out / leaderboard.RESULTS)}
 
 
 def _titles() -> dict[str, str]:
@@ -114,7 +114,7 @@ def _steps(
             Step(
                 StepId(KIND, item=entry.name),
                 partial(arena.take_part, entry),
-                inputs={"method": entry.code_sha256(), "judge": _judge_sha256()},
+                inputs={"method": entry.code_sha256(), "judge": _evaluation_sha256()},
                 after=(*stage.after, *(stage.dots if entry.dots else ())),
                 title=f"Method {entry.name}",
                 weight=entry.cost_s * stage.scale,
@@ -124,9 +124,9 @@ def _steps(
     ]
 
 
-def _judge_sha256() -> str:
-    """Of the files that say what is asked and how it is judged."""
-    return " ".join(sha256_of(Path(str(module.__file__))) for module in (counted, judging, scenes))
+def _evaluation_sha256() -> str:
+    """Of the files that define targets, scenes and scores."""
+    return " ".join(sha256_of(Path(str(module.__file__))) for module in (metered_stage, evaluation, scenes))
 
 
 @dataclass
@@ -152,16 +152,16 @@ class _Arena:
         light = RigPhotographer(self.rig, context, self.calibrated, entry.name, self.longest_s)
         subject = subject_of(self.size, int(self.conditions["seed"]), context)(self.calibrated, light, context.folder)
         shower = _RigShower(light, names)
-        stage = CountedStage(subject, shower, self.camera, effort, "own", check=context.check)
+        stage = MeteredStage(subject, shower, self.camera, effort, "own", check=context.check)
         targets = self._made(subject)
         context.advance(0.1, f"{entry.name} measures")
-        judged = judge(entry, stage, targets, shower)
+        result = evaluate(entry, stage, targets, shower)
         folder = context.folder / KIND
         folder.mkdir(exist_ok=True)
-        content = {**self.conditions, "method": entry.name, "about": entry.about, **board.as_content(judged)}
+        content = {**self.conditions, "method": entry.name, "about": entry.about, **leaderboard.as_content(result)}
         path = folder / f"{entry.name}.json"
-        write_atomically(path, board.encoded(content))
-        return [path, *board.save_pictures(folder, entry.name, subject, targets, judged)]
+        write_atomically(path, leaderboard.encoded(content))
+        return [path, *leaderboard.save_pictures(folder, entry.name, subject, targets, result)]
 
     def _made(self, subject: Subject) -> Mapping[str, ReachableTarget]:
         if not self._targets:

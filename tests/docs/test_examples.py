@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted((ROOT / "docs" / "examples").glob("*.py"))
 WRITTEN = {
     "calibrate_from_folder": ("show/gray-x-0.png", "show/phase-x-0.png", "calibration.npz"),
-    "benchmark_method": (),
+    "compared_method": (),
     "develop_and_merge": ("scene.exr",),
     "opencv_calibration": ("projector.png",),
     "read_dataset": ("dataset.png",),

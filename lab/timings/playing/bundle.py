@@ -60,7 +60,7 @@ def _bundle(swaps: Sequence[dict[str, ByteImage]], *, paper: bool) -> list[Row]:
         made = [NewAppearance(f"appearance-{number}", frames) for number, frames in enumerate(swaps)]
 
         def write() -> None:
-            write_bundle(path, stage="benchmark", calibration="benchmark", created_unix_s=0, outputs=outputs,
+            write_bundle(path, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
                          appearances=made)  # fmt: skip
 
         writing = timed(write, repeats=3)
@@ -113,7 +113,7 @@ def _one_way(
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
         path = Path(folder) / "bundle.vel"
         made = [NewAppearance(str(number), frames) for number, frames in enumerate(swaps)]
-        write_bundle(path, stage="benchmark", calibration="benchmark", created_unix_s=0, outputs=outputs,
+        write_bundle(path, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
                      appearances=made, packing=packing)  # fmt: skip
         raw = sum(frame.nbytes for frames in swaps for frame in frames.values())
         buffers = {name: np.empty_like(frame) for name, frame in swaps[0].items()}

@@ -90,7 +90,7 @@ def more_than_kept(set_bytes: int) -> int:
 def _settings(place: Path, swaps: Sequence[dict[str, ByteImage]]) -> PlayerSettings:
     outputs = [(name, frame.shape[1], frame.shape[0]) for name, frame in swaps[0].items()]
     bundle = place / "bundle.vel"
-    write_bundle(bundle, stage="benchmark", calibration="benchmark", created_unix_s=0, outputs=outputs,
+    write_bundle(bundle, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
                  appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(swaps)))  # fmt: skip
     return PlayerSettings(outputs, frames=place / "outputs.frame", bundle=bundle, allow_unsigned=True)
 

@@ -86,7 +86,7 @@ def _tiled(solved: str, width: int, height: int) -> list[dict[str, ByteImage]]:
 
 def _bundle(place: Path, sets: Sequence[dict[str, ByteImage]], width: int, height: int) -> Path:
     path = place / "bundle.vel"
-    write_bundle(path, stage="benchmark", calibration="benchmark", created_unix_s=0,
+    write_bundle(path, stage="timing", calibration="timing", created_unix_s=0,
                  outputs=[(name, width, height) for name in OUTPUTS],
                  appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(sets)))  # fmt: skip
     return path

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from controller.core.arrays import ByteImage, FloatImage
-from lab.compare.counted import CameraFacts, CountedStage, Effort
+from lab.compare.metered_stage import CameraFacts, Effort, MeteredStage
 from lab.study.subject.subject import Subject
 from tests.lab.study.array_stage import NOISE
 
@@ -31,6 +31,6 @@ class ArrayShower:
         return np.asarray(light + self.rng.normal(0, NOISE, light.shape), np.float32), EXPOSURES
 
 
-def counted(subject: Subject, shower: ArrayShower, most: int = 100) -> CountedStage:
+def counted(subject: Subject, shower: ArrayShower, most: int = 100) -> MeteredStage:
     effort = Effort(shared=5, projectors=[10, 20, 30], dots=[100, 200, 300])
-    return CountedStage(subject, shower, CameraFacts((0.001, 1.0)), effort, "own", most=most)
+    return MeteredStage(subject, shower, CameraFacts((0.001, 1.0)), effort, "own", most=most)

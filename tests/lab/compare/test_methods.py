@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.compare.entering import BUILT_IN
-from lab.compare.judging import Judged, fixed_targets, judge
+from lab.compare.entries import BUILT_IN
+from lab.compare.evaluation import Evaluation, evaluate, fixed_targets
 from lab.compare.methods import divided, feathers
 from lab.study.subject.subject import ReachableTarget, Subject
 from tests.lab.compare.arena import ArrayShower, counted
@@ -22,7 +22,7 @@ def subject() -> Subject:
 
 
 @pytest.fixture(scope="module")
-def found(subject: Subject) -> dict[str, Judged]:
+def found(subject: Subject) -> dict[str, Evaluation]:
     """Each method on one smooth target that all of them can reach, one projector alone too."""
     y, x = np.mgrid[0 : CAMERA[0], 0 : CAMERA[1]] / 20.0
     wave = (0.25 + 0.1 * np.sin(x) * np.cos(y)).astype(np.float32)
@@ -33,12 +33,12 @@ def found(subject: Subject) -> dict[str, Judged]:
     judged = {}
     for entry in EVERYWHERE:
         shower = ArrayShower(subject)
-        judged[entry.name] = judge(entry, counted(subject, shower), targets, shower)
+        judged[entry.name] = evaluate(entry, counted(subject, shower), targets, shower)
     return judged
 
 
 @pytest.mark.parametrize("name", [entry.name for entry in EVERYWHERE])
-def test_every_method_makes_an_easy_target(found: dict[str, Judged], name: str) -> None:
+def test_every_method_makes_an_easy_target(found: dict[str, Evaluation], name: str) -> None:
     judged = found[name]
     assert judged.failed is None
     (score,) = judged.scores
@@ -48,7 +48,7 @@ def test_every_method_makes_an_easy_target(found: dict[str, Judged], name: str) 
     assert median < 1.5
 
 
-def test_each_pays_for_the_photographs_that_it_needs(found: dict[str, Judged]) -> None:
+def test_each_pays_for_the_photographs_that_it_needs(found: dict[str, Evaluation]) -> None:
     all_projectors, dots, own = 5 + 60, 600, 2 * (1 + 9)
     assert {name: judged.photographs for name, judged in found.items()} == {
         "ours": all_projectors,

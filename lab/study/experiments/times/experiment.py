@@ -29,7 +29,7 @@ from lab.study.experiments.times.quoted import Quote, quoted
 from lab.study.subject.subject import Subject
 from lab.study.values import Cell, Criterion, Experiment, Result, ResultTable
 
-BENCHMARKS: Final = Path(controller.__file__).resolve().parents[1] / "lab" / "timings" / "README.md"
+TIMINGS: Final = Path(controller.__file__).resolve().parents[1] / "lab" / "timings" / "README.md"
 REPEATS: Final = 9
 PAPER_PX: Final = 1400 * 1050
 TWO_HOURS_S: Final = 7200.0
@@ -101,7 +101,7 @@ def times(subject: Subject) -> Result:
     load = os.getloadavg()[0]
     measured = _measured(subject)
     journal: Mapping[StepId, float] = subject.parts.context.journal.steps()
-    text = BENCHMARKS.read_text() if BENCHMARKS.exists() else ""
+    text = TIMINGS.read_text() if TIMINGS.exists() else ""
     here = {stage.name: _spent(stage, journal, measured) for stage in STAGES}
     rows = [_row(stage, here[stage.name], text) for stage in STAGES]
     criteria = tuple(_criterion(stage, here[stage.name], text, subject.size) for stage in STAGES if stage.judged)

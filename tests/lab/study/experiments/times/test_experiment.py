@@ -17,7 +17,7 @@ from lab.study.values import column
 from tests.lab.study.array_stage import array_subject
 
 PAGE = """\
-# Benchmarks
+# Timings and precision
 
 ## calibration
 | figure | value | goal |
@@ -70,7 +70,7 @@ def test_seconds_come_from_the_journal_and_from_solves_and_the_papers_size_is_qu
 ) -> None:
     page = tmp_path / "README.md"
     page.write_text(PAGE)
-    monkeypatch.setattr(experiment, "BENCHMARKS", page)
+    monkeypatch.setattr(experiment, "TIMINGS", page)
     result = times(stage())
     (table,) = result.tables
     names = list(column(table, "stage"))
@@ -94,7 +94,7 @@ def test_seconds_come_from_the_journal_and_from_solves_and_the_papers_size_is_qu
 
 
 def test_without_the_page_nothing_is_quoted_and_nothing_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(experiment, "BENCHMARKS", tmp_path / "absent.md")
+    monkeypatch.setattr(experiment, "TIMINGS", tmp_path / "absent.md")
     monkeypatch.setattr(experiment, "_measured", lambda subject: dict.fromkeys(
         (TRANSPORT, BASE, APPEARANCE, FULL), Durations(1.0, 0.5)))  # fmt: skip
     result = times(stage())
@@ -103,7 +103,7 @@ def test_without_the_page_nothing_is_quoted_and_nothing_judged(tmp_path: Path, m
 
 
 def test_a_run_at_the_papers_size_is_judged_by_its_own_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(experiment, "BENCHMARKS", tmp_path / "absent.md")
+    monkeypatch.setattr(experiment, "TIMINGS", tmp_path / "absent.md")
     slow = {TRANSPORT: Durations(1.0), BASE: Durations(60.0), APPEARANCE: Durations(1.5), FULL: Durations(9.0)}
     monkeypatch.setattr(experiment, "_measured", lambda subject: slow)
     held = {one.asked.split(":")[0]: one for one in times(stage("paper")).criteria}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import UsageError
-from lab.compare.entering import BUILT_IN, GROUP, entries
+from lab.compare.entries import BUILT_IN, GROUP, entries
 from lab.compare.scenes import chosen_scenes
 
 SOURCE = '''

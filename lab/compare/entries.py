@@ -17,7 +17,7 @@ from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
 from lab.compare import methods, planar
 
-GROUP: Final = "velatura.benchmark"
+GROUP: Final = "velatura.methods"
 """Entry points of installed methods."""
 NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 TARGET: Final = "target"
@@ -26,7 +26,7 @@ TARGET: Final = "target"
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A method that takes part. ``method``: ``api.BenchmarkMethod``; ``dots``: it needs photographs of dots."""
+    """A method that takes part. ``method``: ``api.ComparisonMethod``; ``dots``: it needs photographs of dots."""
 
     name: str
     method: Callable[[Any], Callable[[Any], Any]]

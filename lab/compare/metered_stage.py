@@ -12,7 +12,7 @@ from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.core.errors import UsageError, WorkError
 from controller.optics.capture.profile import CameraNoise
 from controller.optics.transport import build_transport
-from lab.compare.api import BenchmarkCalibration
+from lab.compare.api import ComparisonCalibration
 from lab.study.subject.subject import Dots, Subject
 
 MOST_PHOTOGRAPHS: Final = 3000
@@ -49,8 +49,8 @@ class Effort:
 
 
 @dataclass
-class CountedStage:
-    """``api.BenchmarkStage`` of one method on one calibrated stage.
+class MeteredStage:
+    """``api.ComparisonStage`` of one method on one calibrated stage.
 
     ``name``: of the method, for its photographs' names; ``check``: called before each photograph, where a stop takes
     hold; ``dots``: for the methods of this package alone
@@ -122,7 +122,7 @@ class CountedStage:
         self.photographs += taken
         return picture
 
-    def calibrated(self, which: Sequence[int] | None = None) -> BenchmarkCalibration:
+    def calibrated(self, which: Sequence[int] | None = None) -> ComparisonCalibration:
         subject, count = self.subject, len(self.subject.calibration.projectors)
         order = list(range(count)) if which is None else [int(n) for n in which]
         if unknown := [n for n in order if not 0 <= n < count]:
@@ -138,7 +138,7 @@ class CountedStage:
         if order != list(range(count)):
             calibration = subject.with_projectors(order)
             transport = build_transport(calibration)
-        return BenchmarkCalibration(calibration, transport, subject.indirect, subject.geometry)
+        return ComparisonCalibration(calibration, transport, subject.indirect, subject.geometry)
 
     def dots(self, n: int) -> Dots:
         """Projector ``n`` as dots show it; their photographs are counted, once."""

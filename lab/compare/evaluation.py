@@ -1,4 +1,4 @@
-"""The judge: fixed targets, and how near photographs of a method's frames are to them."""
+"""Fixed targets, and how near photographs of a method's frames are to them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from controller.optics.transport import LightTransport, build_transport
 from controller.stage.report.pictures import crop_around
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
-from lab.compare.api import BenchmarkTarget
-from lab.compare.counted import CountedStage, Shower, checked_frames
-from lab.compare.entering import Entry
+from lab.compare.api import ComparisonTarget
+from lab.compare.entries import Entry
+from lab.compare.metered_stage import MeteredStage, Shower, checked_frames
 from lab.study.experiments.adaptation import flip_of
 from lab.study.experiments.residual import brightest_first
 from lab.study.output.drawing import screen
@@ -51,7 +51,7 @@ class Failure:
 class Score:
     """One target of one method.
 
-    ``pixels`` as ``solve.judged``; ``flip``: mean of FLIP over all lit pixels, None where flip-evaluator is not
+    ``pixels`` as ``solve.result.metrics``; ``flip``: mean of FLIP over all lit pixels, None where flip-evaluator is not
     installed; ``photograph`` (rows, columns, 3) of its frames
     """
 
@@ -64,7 +64,7 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class Evaluation:
     """One method on one scene. ``failed``: it did not even measure the stage, so there are no scores."""
 
     seconds: float
@@ -76,7 +76,7 @@ class Judged:
 def fixed_targets(subject: Subject, only: Mask | None = None) -> dict[str, ReachableTarget]:
     """``TARGETS`` on this stage, each as bright as 95 % of the object can reach, by the reference calibration.
 
-    ``only`` (camera rows, columns): the part of the object on which they are judged; None: all of it
+    ``only`` (camera rows, columns): the part of the object on which they are scored; None: all of it
     """
 
     def wanted(target: Target, transport: LightTransport | None = None) -> ReachableTarget:
@@ -95,25 +95,25 @@ def fixed_targets(subject: Subject, only: Mask | None = None) -> dict[str, Reach
     }
 
 
-def judge(entry: Entry, stage: CountedStage, targets: Mapping[str, ReachableTarget], shower: Shower) -> Judged:
+def evaluate(entry: Entry, stage: MeteredStage, targets: Mapping[str, ReachableTarget], shower: Shower) -> Evaluation:
     """Let a method measure the stage and make each target; photograph its frames and compare them.
 
-    What the method raises is its result, not an error of the benchmark; but a stop and a device's error are raised.
+    What the method raises is its result, not an error of the comparison; but a stop and a device's error are raised.
     """
     began_s = time.perf_counter()
-    make, failed = _tried(lambda: _function(entry.method(stage)), stage.check)
+    make, failed = _attempt(lambda: _function(entry.method(stage)), stage.check)
     if failed is not None:
-        return Judged(time.perf_counter() - began_s, stage.photographs, (), failed)
+        return Evaluation(time.perf_counter() - began_s, stage.photographs, (), failed)
     seconds = time.perf_counter() - began_s
     scores = [_score(make, stage, name, wanted, shower) for name, wanted in targets.items()]
-    return Judged(seconds, stage.photographs, scores)
+    return Evaluation(seconds, stage.photographs, scores)
 
 
 def _score(
-    make: Callable[[Any], Any], stage: CountedStage, name: str, wanted: ReachableTarget, shower: Shower
+    make: Callable[[Any], Any], stage: MeteredStage, name: str, wanted: ReachableTarget, shower: Shower
 ) -> Score:
     began_s = time.perf_counter()
-    frames, failed = _tried(lambda: checked_frames(make(_given(name, wanted)), stage.projectors_px), stage.check)
+    frames, failed = _attempt(lambda: checked_frames(make(_copied(name, wanted)), stage.projectors_px), stage.check)
     seconds = time.perf_counter() - began_s
     if failed is not None:
         return Score(name, seconds, {}, failed=failed)
@@ -129,9 +129,9 @@ def _flip(subject: Subject, picture: FloatImage, wanted: ReachableTarget) -> flo
     return flip_of(reference, shown, wanted.valid & subject.mask, crop)
 
 
-def _given(name: str, wanted: ReachableTarget) -> BenchmarkTarget:
-    """Copies: a method may write into its arrays, and is still judged by the judge's."""
-    return BenchmarkTarget(name, wanted.radiance.copy(), wanted.white, wanted.mask.copy(), wanted.valid.copy())
+def _copied(name: str, wanted: ReachableTarget) -> ComparisonTarget:
+    """Copies: a method may write into its arrays, and is scored by the originals."""
+    return ComparisonTarget(name, wanted.radiance.copy(), wanted.white, wanted.mask.copy(), wanted.valid.copy())
 
 
 def _function(made: Any) -> Any:
@@ -140,7 +140,7 @@ def _function(made: Any) -> Any:
     return made
 
 
-def _tried(work: Callable[[], Any], check: Callable[[], None]) -> tuple[Any, Failure | None]:
+def _attempt(work: Callable[[], Any], check: Callable[[], None]) -> tuple[Any, Failure | None]:
     """What ``work`` returns, or why there is nothing.
 
     A stop and a device's error are raised, and so is what ``check`` raises: the run's end is not the method's fault.

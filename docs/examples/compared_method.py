@@ -1,7 +1,7 @@
 # %% [markdown]
 # A method for `velatura benchmark`: every projector shows one even colour, the best for the mean of the target.
 #
-#     velatura benchmark --method docs/examples/benchmark_method.py:even_colour --method ours --scene dark
+#     velatura benchmark --method docs/examples/compared_method.py:even_colour --method ours --scene dark
 
 # %%
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from lab.compare.api import BenchmarkStage, BenchmarkTarget
+from lab.compare.api import ComparisonStage, ComparisonTarget
 
 Frames = list[npt.NDArray[np.uint8]]
 
 
 # %% Light of several device values, then, for each target, the value whose mean light is nearest.
-def even_colour(stage: BenchmarkStage) -> Callable[[BenchmarkTarget], Frames]:
+def even_colour(stage: ComparisonStage) -> Callable[[ComparisonTarget], Frames]:
     """One even colour on all projectors, by photographs of five greys."""
 
     def even(colour: npt.ArrayLike) -> Frames:
@@ -27,7 +27,7 @@ def even_colour(stage: BenchmarkStage) -> Callable[[BenchmarkTarget], Frames]:
     mask = stage.object_mask
     light = np.stack([stage.photograph(even(value))[mask].mean(axis=0) for value in values])
 
-    def frames(target: BenchmarkTarget) -> Frames:
+    def frames(target: ComparisonTarget) -> Frames:
         wanted = target.radiance[mask].mean(axis=0)
         return even([np.interp(wanted[channel], light[:, channel], values) for channel in range(3)])
 

@@ -1,4 +1,4 @@
-"""The benchmark's results on disk: its JSON file, its page and pictures; and what the command refuses."""
+"""Results of a comparison on disk: its JSON file, its page and pictures; and what the command refuses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from controller.optics.solve.result.metrics import PixelSet
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import ShotId
-from lab.compare.board import as_content, save_pictures, strips, update_board, write_page
-from lab.compare.counted import calibration_effort
-from lab.compare.judging import Failure, Judged, Score
-from lab.compare.service import benchmark
+from lab.compare.evaluation import Evaluation, Failure, Score
+from lab.compare.leaderboard import as_content, save_pictures, strips, update_leaderboard, write_page
+from lab.compare.metered_stage import calibration_effort
+from lab.compare.service import compare
 from lab.study.subject.subject import ReachableTarget
 from tests.lab.study.array_stage import array_subject
 
@@ -31,17 +31,19 @@ def score(target: str, median: float) -> Score:
     return Score(target, 2.0, sets)
 
 
-def row(method: str, judged: Judged, scene: str = "dark") -> dict[str, Any]:
+def row(method: str, judged: Evaluation, scene: str = "dark") -> dict[str, Any]:
     return {"scene": scene, "seed": 1, "method": method, "about": f"what {method} is", **as_content(judged)}
 
 
-GOOD = Judged(30.0, 120, [score("grey", 1.0), score("photograph", 2.0)])
-PARTLY = Judged(5.0, 12, [score("grey", 3.0), Score("photograph", 1.0, {}, failed=Failure("a-code", "It | broke."))])
-BAD = Judged(1.0, 3, (), Failure("other-code", "It broke at once."))
+GOOD = Evaluation(30.0, 120, [score("grey", 1.0), score("photograph", 2.0)])
+PARTLY = Evaluation(
+    5.0, 12, [score("grey", 3.0), Score("photograph", 1.0, {}, failed=Failure("a-code", "It | broke."))]
+)
+BAD = Evaluation(1.0, 3, (), Failure("other-code", "It broke at once."))
 
 
 def page(tmp_path: Path, rows: Sequence[dict[str, Any]]) -> str:
-    content = update_board(tmp_path, "small", rows)
+    content = update_leaderboard(tmp_path, "small", rows)
     about = {one["method"]: one["about"] for one in content["results"]}
     return write_page(tmp_path, content, about, {"dark": "a dark stage"}).read_text()
 
@@ -60,12 +62,12 @@ def test_the_page_shows_every_score_and_every_failure(tmp_path: Path) -> None:
 def test_later_results_replace_earlier_ones_of_the_same_method_and_scene_alone(tmp_path: Path) -> None:
     page(tmp_path, [row("good", GOOD), row("good", GOOD, "room")])
     text = page(tmp_path, [row("good", BAD), row("more", GOOD)])
-    kept = json.loads((tmp_path / "benchmark.json").read_text())["results"]
+    kept = json.loads((tmp_path / "comparison.json").read_text())["results"]
     assert [(one["scene"], one["method"]) for one in kept] == [("dark", "good"), ("dark", "more"), ("room", "good")]
     assert kept[0]["failed"]["code"] == "other-code"
     assert text.index("## dark, seed 1") < text.index("## room, seed 1")
     assert kept[2]["targets"]["grey"]["pixels"]["in_reach"]["delta_e00_median"] == 1.0
-    (tmp_path / "benchmark.json").write_text("{}")
+    (tmp_path / "comparison.json").write_text("{}")
     with pytest.raises(UsageError) as caught:
         page(tmp_path, [row("good", GOOD)])
     assert caught.value.code == "benchmark-unreadable"
@@ -76,7 +78,7 @@ def test_pictures_of_all_methods_stand_side_by_side(tmp_path: Path) -> None:
     image = np.full((*subject.mask.shape, 3), 0.3, np.float32)
     targets = {"grey": ReachableTarget(image, subject.mask, 0.6)}
     for name in ("first", "second"):
-        save_pictures(tmp_path, name, subject, targets, Judged(1.0, 1, [Score("grey", 1.0, {}, image)]))
+        save_pictures(tmp_path, name, subject, targets, Evaluation(1.0, 1, [Score("grey", 1.0, {}, image)]))
     save_pictures(tmp_path, "third", subject, targets, BAD)
     results = [row(name, GOOD) for name in ("first", "second", "third")]
     strips(tmp_path / "out", results, lambda scene, seed: tmp_path)
@@ -112,7 +114,7 @@ def test_wrong_names_are_refused_before_anything_is_written(
     tmp_path: Path, methods: tuple[str, ...], scenes: tuple[str, ...], size: str, code: str
 ) -> None:
     with pytest.raises(UsageError) as caught:
-        benchmark(methods=methods, scene_names=scenes, size=size, out=tmp_path / "out", seeds=(1,),
+        compare(methods=methods, scene_names=scenes, size=size, out=tmp_path / "out", seeds=(1,),
                   reporter=Silent(), cancel=threading.Event())  # fmt: skip
     assert caught.value.code == code
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""What the benchmark leaves: one JSON file with every score, and a page with tables and pictures made of it."""
+"""Results of a comparison: one JSON file with every score, and a page with tables and pictures made from it."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.optics.solve.result.metrics import TITLES, as_table
 from controller.stage.report.pictures import crop_around
-from lab.compare.entering import TARGET
-from lab.compare.judging import TARGETS, Judged
+from lab.compare.entries import TARGET
+from lab.compare.evaluation import TARGETS, Evaluation
 from lab.study.output.drawing import LabelledPicture, encoded_webp, screen, strip
 from lab.study.output.keeping import plain
 from lab.study.output.pages import markdown
 from lab.study.subject.subject import ReachableTarget, Subject
 
 FORMAT: Final = 1
-BOARD, PAGE, PICTURES = "benchmark.json", "README.md", "pictures"
+RESULTS, PAGE, PICTURES = "comparison.json", "README.md", "pictures"
 
 INTRODUCTION: Final = """\
 Each method measured the same emulated stages with photographs of its own patterns, then made frames for the same
-targets. The judge showed these frames and photographed them. Nothing knows the true values of a stage. The bench's
+targets. These frames were then shown and photographed. Nothing knows the true values of a stage. The bench's
 optics share no code with the controller.
 
 Error: CIEDE2000, median / 95 % of the pixels. *In reach*: where Velatura's calibration says that the projectors can
 make the target. *All lit pixels*: where some projector lights the object. *Whole visible object*: also where none does.
 FLIP: its mean over all lit pixels, where flip-evaluator is installed. Photographs: every exposure until the last
-target's frames were made; those of the judge are not counted. Seconds: to measure the stage, and to make the frames of
-a target; they depend on the computer and its load."""
+target's frames were made; those that score the frames are not counted. Seconds: to measure the stage, and to make the
+frames of a target; they depend on the computer and its load."""
 
 
-def as_content(judged: Judged) -> dict[str, Any]:
+def as_content(evaluation: Evaluation) -> dict[str, Any]:
     """One method on one scene, for the JSON file."""
-    failed = None if judged.failed is None else {"code": judged.failed.code, "what": judged.failed.what}
+    failed = None if evaluation.failed is None else {"code": evaluation.failed.code, "what": evaluation.failed.what}
     return {
-        "photographs": judged.photographs,
-        "seconds": judged.seconds,
+        "photographs": evaluation.photographs,
+        "seconds": evaluation.seconds,
         "failed": failed,
         "targets": {
             score.target: {
@@ -51,19 +51,19 @@ def as_content(judged: Judged) -> dict[str, Any]:
                 "pixels": as_table(dict(score.pixels)) if score.pixels else None,
                 "flip": score.flip,
             }
-            for score in judged.scores
+            for score in evaluation.scores
         },
     }
 
 
 def save_pictures(
-    folder: Path, name: str, subject: Subject, targets: Mapping[str, ReachableTarget], judged: Judged
+    folder: Path, name: str, subject: Subject, targets: Mapping[str, ReachableTarget], evaluation: Evaluation
 ) -> list[Path]:
     """Crops of the method's photographs as a screen shows them, ``NAME-TARGET.png``, and of the targets."""
     crop = crop_around(subject.mask)
     matrix, paths = subject.calibration.camera_to_xyz, []
     shown = {target: wanted.radiance for target, wanted in targets.items()}
-    photographs = {score.target: score.photograph for score in judged.scores if score.photograph is not None}
+    photographs = {score.target: score.photograph for score in evaluation.scores if score.photograph is not None}
     for who, images in ((TARGET, shown), (name, photographs)):
         for target, image in images.items():
             picture = screen(image, matrix, targets[target].white, crop)
@@ -79,12 +79,12 @@ def encoded(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-def update_board(out: Path, size: str, rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def update_leaderboard(out: Path, size: str, rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Take over rows (scene, seed, method and ``as_content``) into ``out``'s JSON file; others stay. The content.
 
     Raises UsageError("benchmark-unreadable").
     """
-    path = out / BOARD
+    path = out / RESULTS
     kept: dict[tuple[str, int, str], Any] = {}
     if path.exists():
         try:
@@ -93,7 +93,7 @@ def update_board(out: Path, size: str, rows: Iterable[Mapping[str, Any]]) -> dic
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(
                 "benchmark-unreadable",
-                what=f"{path} can't be read as results of the benchmark ({error}).",
+                what=f"{path} can't be read as results of a comparison ({error}).",
                 remedy="Remove the file; the same command writes it again from the finished work.",
             ) from error
     kept.update({_key(row): row for row in rows})
@@ -126,7 +126,7 @@ def write_page(out: Path, content: Mapping[str, Any], about: Mapping[str, str], 
     """Write the page of all results in ``content``; ``about`` methods and ``scenes``: in a line each."""
     results = content["results"]
     listed = [f"- **{name}**: {text}." for name, text in about.items()]
-    parts = ["# Benchmark", INTRODUCTION, f"Size {content['size']}.", "## Methods", "\n".join(listed)]
+    parts = ["# Comparison of methods", INTRODUCTION, f"Size {content['size']}.", "## Methods", "\n".join(listed)]
     parts += ["## All targets", "Means over the targets of a scene.", _overall(results)]
     for scene, seed in _stages(results):
         rows = [row for row in results if (row["scene"], row["seed"]) == (scene, seed)]
@@ -135,7 +135,7 @@ def write_page(out: Path, content: Mapping[str, Any], about: Mapping[str, str], 
             name = _strip_name(scene, seed, target)
             if (out / PICTURES / name).exists():
                 parts.append(f"![{target}]({PICTURES}/{name})\n\n*{target}: {text}.*")
-    parts.append(f"Every figure: [{BOARD}]({BOARD}).")
+    parts.append(f"Every figure: [{RESULTS}]({RESULTS}).")
     page = out / PAGE
     write_atomically(page, ("\n\n".join(parts) + "\n").encode())
     return page

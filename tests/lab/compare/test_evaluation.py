@@ -12,15 +12,15 @@ import pytest
 from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.errors import WorkError
 from hal.deadline import Cancelled
-from lab.compare.api import BenchmarkStage, BenchmarkTarget, MakeFrames
-from lab.compare.entering import Entry, entries
-from lab.compare.judging import Judged, judge
+from lab.compare.api import ComparisonStage, ComparisonTarget, MakeFrames
+from lab.compare.entries import Entry, entries
+from lab.compare.evaluation import Evaluation, evaluate
 from lab.study.subject.subject import ReachableTarget, Subject
 from tests.lab.compare.arena import EXPOSURES, ArrayShower, counted
 from tests.lab.study.array_stage import array_subject
 
 Frames = Sequence[ByteImage]
-EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "benchmark_method.py"
+EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "compared_method.py"
 
 
 @pytest.fixture(scope="module")
@@ -37,16 +37,16 @@ def ramp(subject: Subject) -> dict[str, ReachableTarget]:
     return {"ramp": ReachableTarget(radiance, reach, 1.0, None, subject.mask)}
 
 
-def judged(subject: Subject, method: Any, most: int = 100, shower: ArrayShower | None = None) -> Judged:
+def judged(subject: Subject, method: Any, most: int = 100, shower: ArrayShower | None = None) -> Evaluation:
     shower = ArrayShower(subject) if shower is None else shower
-    return judge(Entry("mine", method), counted(subject, shower, most), ramp(subject), shower)
+    return evaluate(Entry("mine", method), counted(subject, shower, most), ramp(subject), shower)
 
 
-def grey_frames(stage: BenchmarkStage, value: int = 90) -> Frames:
+def grey_frames(stage: ComparisonStage, value: int = 90) -> Frames:
     return [np.full((height, width, 3), value, np.uint8) for width, height in stage.projectors_px]
 
 
-def grey(stage: BenchmarkStage) -> MakeFrames:
+def grey(stage: ComparisonStage) -> MakeFrames:
     """Even grey."""
     return lambda target: grey_frames(stage)
 
@@ -101,14 +101,14 @@ def test_the_figures_are_those_of_another_computation(subject: Subject) -> None:
 
 
 def test_each_exposure_is_counted_and_the_judges_are_not(subject: Subject) -> None:
-    def looks(stage: BenchmarkStage) -> MakeFrames:
+    def looks(stage: ComparisonStage) -> MakeFrames:
         stage.photograph(grey_frames(stage))
         assert stage.photographs == EXPOSURES
         stage.calibrated([1])
         stage.calibrated([1, 2])
         assert stage.photographs == EXPOSURES + 5 + 20 + 30
 
-        def frames(target: BenchmarkTarget) -> Frames:
+        def frames(target: ComparisonTarget) -> Frames:
             stage.photograph(grey_frames(stage, 30))
             return grey_frames(stage)
 
@@ -121,7 +121,7 @@ def test_each_exposure_is_counted_and_the_judges_are_not(subject: Subject) -> No
 
 
 def test_a_method_that_wants_too_many_photographs_is_refused(subject: Subject) -> None:
-    def greedy(stage: BenchmarkStage) -> MakeFrames:
+    def greedy(stage: ComparisonStage) -> MakeFrames:
         while True:
             stage.photograph(grey_frames(stage))
 
@@ -157,7 +157,7 @@ def test_a_photograph_for_no_light_is_refused(subject: Subject) -> None:
 
 
 def test_what_a_method_raises_is_its_result(subject: Subject) -> None:
-    def broken(stage: BenchmarkStage) -> MakeFrames:
+    def broken(stage: ComparisonStage) -> MakeFrames:
         raise ZeroDivisionError("no light")
 
     found = judged(subject, broken)
@@ -166,8 +166,8 @@ def test_what_a_method_raises_is_its_result(subject: Subject) -> None:
     assert "ZeroDivisionError: no light" in found.failed.what
     assert judged(subject, lambda stage: None).failed is not None
 
-    def later(stage: BenchmarkStage) -> MakeFrames:
-        def frames(target: BenchmarkTarget) -> Frames:
+    def later(stage: ComparisonStage) -> MakeFrames:
+        def frames(target: ComparisonTarget) -> Frames:
             raise KeyError(target.name)
 
         return frames
@@ -185,21 +185,21 @@ def test_a_stop_ends_the_work(subject: Subject) -> None:
     stage = counted(subject, shower)
     stage.check = stopped
     with pytest.raises(Cancelled):
-        judge(Entry("mine", lambda stage: stage.photograph(grey_frames(stage))), stage, ramp(subject), shower)
+        evaluate(Entry("mine", lambda stage: stage.photograph(grey_frames(stage))), stage, ramp(subject), shower)
 
     def ended() -> None:
         raise WorkError("run-too-slow", what="The run's time is over.", remedy="Run it again.")
 
     stage.check = ended
     with pytest.raises(WorkError):
-        judge(Entry("mine", lambda stage: {}[stage]), stage, ramp(subject), shower)
+        evaluate(Entry("mine", lambda stage: {}[stage]), stage, ramp(subject), shower)
 
 
 def test_a_method_can_not_change_what_it_is_judged_by(subject: Subject) -> None:
-    def cheating(stage: BenchmarkStage) -> MakeFrames:
+    def cheating(stage: ComparisonStage) -> MakeFrames:
         stage.object_mask[:] = False
 
-        def frames(target: BenchmarkTarget) -> Frames:
+        def frames(target: ComparisonTarget) -> Frames:
             target.radiance[:] = 0
             target.valid[:] = False
             target.in_reach[:] = False
@@ -214,7 +214,7 @@ def test_a_method_can_not_change_what_it_is_judged_by(subject: Subject) -> None:
 def test_the_example_is_a_method(subject: Subject) -> None:
     (entry,) = entries((f"{EXAMPLE}:even_colour",))
     shower = ArrayShower(subject)
-    found = judge(entry, counted(subject, shower), ramp(subject), shower)
+    found = evaluate(entry, counted(subject, shower), ramp(subject), shower)
     (score,) = found.scores
     assert (score.failed, found.photographs) == (None, 5 * EXPOSURES)
     assert score.photograph is not None
