@@ -19,7 +19,8 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.files import read_text
 from controller.core.text import printable
 from controller.kiosk.interface import EventRow
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 PATIENCE_S: Final = 20.0
 SUBJECT: Final = 120
@@ -133,12 +134,12 @@ class Channel:
             self._send(stage, name, table, rows[-MOST_EVENTS:])
         except WorkError as error:
             if not self._failed:
-                self._log.add(Decision(error.code, error.what, error.remedy, "warning"))
+                self._log.add(Notice(error.code, error.what, error.remedy, Level.WARNING))
             self._next_s = self._monotonic() + AGAIN_S[min(self._failed, len(AGAIN_S) - 1)]
             self._failed += 1
             return
         if self._failed:
-            self._log.add(Decision("alert-sent", "Alerts are sent again."))
+            self._log.add(Notice("alert-sent", "Alerts are sent again."))
         self._failed, self._due_s = 0, None
         self._next_s = self._monotonic() + PAUSE_S
         self._sent(rows[-1].number)

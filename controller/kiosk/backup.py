@@ -25,7 +25,8 @@ from controller.core.storage import sha256_of, sync_folder
 from controller.core.text import printable
 from controller.kiosk.schedule import zone_of
 from controller.kiosk.store import archive
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 LONGEST_S: Final = 6 * 3600.0
 QUIET_S: Final = 15
@@ -62,7 +63,7 @@ class Server:
         self._folder = unquote(parts.path).rstrip("/") or "/"
         self._key_file, self._host_key, self._longest_s = key_file, host_key, longest_s
 
-    def store(self, source: Path, day: str, keep: int) -> Decision:
+    def store(self, source: Path, day: str, keep: int) -> Notice:
         """As ``Place.store``. Raises WorkError with one of the codes of ``_CAUSES``, or "backup-server-failed"."""
         if self._key_file is None or self._host_key is None:
             raise UsageError("backup-ssh-incomplete", what="The backup by SSH needs a key and the key of the server.",
@@ -85,7 +86,7 @@ class Server:
         if old := ours[:-keep]:
             self._sftp(*(f'rm "{self._at(one)}"' for one in old))
         size_mb = source.stat().st_size / 1e6
-        return Decision("backup-made", f"The backup {name} ({size_mb:.0f} MB) was sent to {self._host} and read back.")
+        return Notice("backup-made", f"The backup {name} ({size_mb:.0f} MB) was sent to {self._host} and read back.")
 
     def _at(self, name: str) -> str:
         return f"{self._folder.rstrip('/')}/{name}"
@@ -148,7 +149,7 @@ class Place(Protocol):
     @property
     def name(self) -> str: ...
 
-    def store(self, source: Path, day: str, keep: int) -> Decision:
+    def store(self, source: Path, day: str, keep: int) -> Notice:
         """Store the backup ``source`` of a day (20260504), read it back, and remove all of ours but the newest
         ``keep``; returns what to tell. Raises WorkError, UsageError("not-a-backup") and OSError; nothing that was there
         is lost then.
@@ -163,7 +164,7 @@ class Folder:
     def __init__(self, folder: Path, stage: Path) -> None:
         self._folder, self._stage = folder, stage
 
-    def store(self, source: Path, day: str, keep: int) -> Decision:
+    def store(self, source: Path, day: str, keep: int) -> Notice:
         """As ``Place.store``."""
         folder = self._folder
         if not folder.is_dir():
@@ -176,8 +177,8 @@ class Folder:
         text = f"The backup {copy.name} ({copy.stat().st_size / 1e6:.0f} MB) was made and read back."
         if folder.stat().st_dev == self._stage.stat().st_dev:
             remedy = "It is on the same disk as the stage. Choose a folder on another disk."
-            return Decision("backup-same-disk", text, remedy, "warning")
-        return Decision("backup-made", text)
+            return Notice("backup-same-disk", text, remedy, Level.WARNING)
+        return Notice("backup-made", text)
 
 
 class Stick:
@@ -190,12 +191,10 @@ class Stick:
     def __init__(self, label: str, stage: Path, root: Path = Path("/")) -> None:
         self._label, self._stage, self._root = label, stage, root
 
-    def store(self, source: Path, day: str, keep: int) -> Decision:
+    def store(self, source: Path, day: str, keep: int) -> Notice:
         """As ``Place.store``. Raises WorkError("backup-stick-missing") as well."""
         stored = Folder(self._mounted(), self._stage).store(source, day, keep)
-        return Decision(
-            stored.code, f"{stored.reason} It is on the USB stick {self._label}.", stored.remedy, stored.level
-        )
+        return Notice(stored.code, f"{stored.what} It is on the USB stick {self._label}.", stored.remedy, stored.level)
 
     def _mounted(self) -> Path:
         device = next((link.resolve() for link in self._links() if _unescaped(link.name) == self._label), None)
@@ -343,7 +342,7 @@ class NightlyBackup:
             # Once a day for each place: it is tried again many times.
             self._failed_keys.add(key)
             said = _explained(error) if isinstance(error, OSError) else error
-            self._log.add_failure(Decision("backup-failed", f"No backup was made. {said.what}", said.remedy, "error"))
+            self._log.add_failure(Notice("backup-failed", f"No backup was made. {said.what}", said.remedy, Level.ERROR))
 
 
 def _key(place: Place, day: str) -> str:

@@ -52,6 +52,7 @@ from controller.kiosk.values import (
     TriedDevice,
     Unsubscribe,
 )
+from hal.notices import Notice
 
 
 class Kiosk(Protocol):
@@ -194,7 +195,7 @@ class Kiosk(Protocol):
     def seen(self, number: int | None = None) -> None:
         """Confirm the failures up to this number of the event log, or all; they leave the state."""
 
-    def doctor(self) -> Sequence[Finding]:
+    def doctor(self) -> Sequence[Notice]:
         """Find problems of the machine, the stage and the devices. Seconds."""
 
     def changes(self) -> Changes:

@@ -26,7 +26,7 @@ from controller.kiosk.jobs.job_runner import JobHandler, JobRunner, title_of
 from controller.kiosk.schedule import ScheduleFile
 from controller.kiosk.store.bundle_store import BundleStore, BundleWatch
 from controller.kiosk.store.disk_space import TIDY_S, purge_old_photographs
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.settings import GoodSettings
 from controller.kiosk.supervisors.devices import Devices
 from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
@@ -42,6 +42,7 @@ from controller.stage.sessions.calibrations import finished_calibrations, stage_
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.open import player_settings, technicians_panel
 from hal.interfaces import ButtonPanel
+from hal.notices import Level, Notice
 
 STEP_S: Final = 0.25
 LOOK_S: Final = 1.0
@@ -64,7 +65,7 @@ class Service:
     """
 
     def __init__(
-        self, checked: Checked, log: EventLog, problem: Decision | None = None, world: World | None = None,
+        self, checked: Checked, log: EventLog, problem: Notice | None = None, world: World | None = None,
         jobs: MakeJobs = JobHandlers.table,
     ) -> None:  # fmt: skip
         stage = checked.stage
@@ -133,7 +134,7 @@ class Service:
         self.log.add(beginning(self.log))
         if self.schedule.problem is not None:
             problem = self.schedule.problem
-            self.log.add(Decision(problem.code, problem.what, problem.remedy, "error"))
+            self.log.add(Notice(problem.code, problem.what, problem.remedy, Level.ERROR))
         if self.problem is not None:
             self.log.add(self.problem)
         self._go_on()
@@ -163,7 +164,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                 # The watchdog is not fed, so systemd restarts the service if the error persists.
                 what = f"The kiosk met an unexpected error ({type(error).__name__}: {error})."
-                self.log.add(Decision("crash", what, SEND_DIAGNOSTICS, "error"))
+                self.log.add(Notice("crash", what, SEND_DIAGNOSTICS, Level.ERROR))
                 cancel.wait(AFTER_CRASH_S)
                 continue
             if hurried:
@@ -198,7 +199,7 @@ class Service:
         self.lamp_history.note(self.lamps, self._world.today(), now=True)
         self.player.close()
         self.devices.close()
-        self.log.add(Decision("service-ended", "The kiosk has stopped."))
+        self.log.add(Notice("service-ended", "The kiosk has stopped."))
 
     def use(self, checked: Checked) -> None:
         """Use settings that differ only in what no device depends on (``store.settings.change``)."""
@@ -227,17 +228,17 @@ class Service:
         for request, again in self.reconciler.go_on():
             what = f"{title_of(request)} was cut off when the kiosk ended."
             if again:
-                self.log.add(Decision("work-cut-off", what, "It is done again.", "warning"))
+                self.log.add(Notice("work-cut-off", what, "It is done again.", Level.WARNING))
             else:
                 remedy = "Start it again: it continues where it stopped."
-                self.log.add_failure(Decision("work-cut-off", what, remedy, "error"))
+                self.log.add_failure(Notice("work-cut-off", what, remedy, Level.ERROR))
 
-    def _tell(self, decision: Decision) -> None:
+    def _tell(self, notice: Notice) -> None:
         """A device's event. That nothing can be written is one event, not one of each device."""
-        if decision.code == DISK_FULL:
-            self.disk.suspect(decision)
+        if notice.code == DISK_FULL:
+            self.disk.suspect(notice)
         else:
-            self.log.add(decision)
+            self.log.add(notice)
 
     def _settings(self, with_bundle: bool) -> PlayerSettings:
         return player_settings(self.checked.stage, self.runtime, plays=with_bundle)
@@ -261,11 +262,11 @@ class Service:
         lit = " ".join(view.name for view in views if view.shines)
         return f"{shown.bundle} {shown.appearance} {lit}"
 
-    def _missing_for_work(self) -> Decision | None:
+    def _missing_for_work(self) -> Notice | None:
         """The device that photographs need and that is missing, or None."""
         problem = self.player.view.outputs
         if problem is not None:
-            return replace(problem, reason=f"No photographs are possible without it. {problem.reason}")
+            return replace(problem, what=f"No photographs are possible without it. {problem.what}")
         return self.devices.missing_for_work()
 
     def _calibrated(self) -> bool:
@@ -289,8 +290,8 @@ class Service:
             self._world.sleep(0.1)
         names = [projector.name for projector in projectors if projector.view.maybe_lit]
         if names:
-            self.log.add(Decision("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
-                                   "Switch it off with its remote control.", "error"))  # fmt: skip
+            self.log.add(Notice("lamp-still-lit", f"The lamp of {', '.join(names)} could not be switched off.",
+                                   "Switch it off with its remote control.", Level.ERROR))  # fmt: skip
 
     def _thread(
         self, name: str, step: Callable[[], None], every_s: float, *, first_s: float = 0.0,
@@ -303,7 +304,7 @@ class Service:
                     step()
                 except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it reports and continues
                     what = f"{name} met an unexpected error ({type(error).__name__}: {error})."
-                    self.log.add(Decision("crash", what, SEND_DIAGNOSTICS, "error"))
+                    self.log.add(Notice("crash", what, SEND_DIAGNOSTICS, Level.ERROR))
                     self._stop.wait(AFTER_CRASH_S)
                 (sooner or self._stop).wait(every_s)
                 if sooner is not None:

@@ -17,7 +17,7 @@ from controller.kiosk.interface import EventRow
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.service import MakeJobs, Service
 from controller.kiosk.store import archive
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.settings import checked_settings, last_good
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.world import World
@@ -26,6 +26,7 @@ from controller.play.control.launch import PlayerSettings
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Stop
+from hal.notices import Notice
 
 SOCKET: Final = "/run/systemd/journal/socket"
 _PRIORITIES: Final = {"info": "6", "warning": "4", "error": "3"}
@@ -67,7 +68,7 @@ def _field(name: str, value: bytes) -> bytes:
     return name.encode() + b"\n" + len(value).to_bytes(8, "little") + value + b"\n"
 
 
-def _usable(stage: Path, world: World) -> tuple[Checked, Decision | None]:
+def _usable(stage: Path, world: World) -> tuple[Checked, Notice | None]:
     """The stage's settings, or the last good ones and why. Raises what ``checked_settings`` raises."""
     try:
         return checked_settings(stage, world.drivers), None

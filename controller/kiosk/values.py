@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field
 
 from controller.kiosk.state import EventLevel, Grade
+from hal.notices import Notice
 
 RecalibrationKind = Literal["full", "quick"]
 Fit = Literal["fit", "fill", "crop", "wrap"]
@@ -167,6 +168,11 @@ class Finding:
     title: str
     what: str
     remedy: str
+
+    @classmethod
+    def of(cls, notice: Notice) -> Self:
+        """As the HTTP API and the command line show it."""
+        return cls(notice.level.value, notice.about, notice.what, notice.remedy)
 
 
 @dataclass(frozen=True, slots=True)

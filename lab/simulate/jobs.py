@@ -9,10 +9,10 @@ from typing import Final
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.jobs.job_handlers import PUBLISH, QUICK, VARIANTS, JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
-from controller.kiosk.store.event_log import Decision
 from controller.stage.rig.rig import Rig
 from hal.deadline import Cancelled
 from hal.errors import DeviceRefused
+from hal.notices import Level, Notice
 from hal.values import Power
 from lab.simulate.disk import STAGE
 from lab.simulate.stage import NAMES, publish
@@ -76,8 +76,8 @@ class SimulatedJobs:
         if request.kind == "drift":
             drifted, world.drifted = world.drifted, False
             if not drifted:
-                return Finished(request, Decision("drift-none", "Nothing has moved or dimmed since the calibration."))
-            changed = Decision("drift-found", "The stage has changed.", "A quick recalibration follows.", "warning")
+                return Finished(request, Notice("drift-none", "Nothing has moved or dimmed since the calibration."))
+            changed = Notice("drift-found", "The stage has changed.", "A quick recalibration follows.", Level.WARNING)
             return Finished(request, changed, then=(Request("quick", light=QUICK.light, key=request.key),))
         if request.kind in ("quick", "projector", "full"):
             then = (Request(PUBLISH.kind, key=request.key),)
@@ -89,4 +89,4 @@ class SimulatedJobs:
                 publish(STAGE, int(world.wall()), (name,))
         elif request.kind == "takeover":
             publish(STAGE, int(world.wall()), request.arguments)
-        return Finished(request, Decision("work-done", f"Done: {request.kind}."), then=then)
+        return Finished(request, Notice("work-done", f"Done: {request.kind}."), then=then)

@@ -18,8 +18,8 @@ from controller.kiosk.operations.accounts import Accounts as AccountsInUse
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.kiosk.service import Service
 from controller.kiosk.store.accounts import Accounts, stage_accounts
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.world import World
+from hal.notices import Level, Notice
 
 LIT_FOR_NOTICE_S: Final = 900.0
 """The longest time for a text on the projectors, so that no lamp burns for it all night."""
@@ -53,7 +53,7 @@ class AttachedKiosk(FolderKiosk):
         self._examinations = finding.Examinations(lambda: finding.findings(stage, self._service))
         self._notice: tuple[tuple[str, ...], Callable[[], bool]] | None = None
         self._notice_ends_s = float("inf")
-        self._unlogged: deque[Decision] = deque(maxlen=MOST_UNLOGGED)
+        self._unlogged: deque[Notice] = deque(maxlen=MOST_UNLOGGED)
 
     def attach(self, service: Service | None, reason: str = "") -> None:
         """Use this service from now on; None with the ``reason`` why there is none."""
@@ -133,12 +133,12 @@ class AttachedKiosk(FolderKiosk):
         return () if self._service is None else self._service.log.after(after)
 
     def record(self, code: str, what: str, level: EventLevel = "info") -> None:
-        decision = Decision(code, what, "", level)
+        notice = Notice(code, what, "", Level(level))
         with self._lock:
             if self._service is not None:
-                self._service.log.add(decision)
+                self._service.log.add(notice)
             else:
-                self._unlogged.append(decision)
+                self._unlogged.append(notice)
 
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         with self._lock:

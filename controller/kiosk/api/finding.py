@@ -6,13 +6,14 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from controller.config.writer import toml_text
 from controller.core.errors import VelaturaError
 from controller.core.text import printable
-from controller.kiosk.interface import Finding, FoundDevice, TriedDevice
+from controller.kiosk.interface import FoundDevice, TriedDevice
 from controller.kiosk.service import Service
 from controller.run.progress import Silent
 from controller.stage.doctor.examine import Tools, examine
@@ -20,6 +21,7 @@ from controller.stage.doctor.values import Examination
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.finding import Found
+from hal.notices import Level, Notice
 from hal.registry import OpenContext, load_drivers, open_device
 
 LOW_DISK_BYTES: Final = 2 << 30
@@ -30,11 +32,11 @@ _LISTS: Final = ("projectors", "relays")
 class Examinations:
     """One search of the buses at a time: two would take each other's ports. Who asks meanwhile gets the same answer."""
 
-    def __init__(self, search: Callable[[], Sequence[Finding]]) -> None:
+    def __init__(self, search: Callable[[], Sequence[Notice]]) -> None:
         self._search, self._lock = search, threading.Lock()
-        self._ended_s, self._found = float("-inf"), tuple[Finding, ...]()
+        self._ended_s, self._found = float("-inf"), tuple[Notice, ...]()
 
-    def findings(self) -> Sequence[Finding]:
+    def findings(self) -> Sequence[Notice]:
         asked_s = time.monotonic()
         with self._lock:
             if self._ended_s < asked_s:
@@ -43,24 +45,24 @@ class Examinations:
             return self._found
 
 
-def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Finding]:
+def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Notice]:
     """Problems of the devices, the player, the disk and the buses."""
     problems = []
     for row in () if service is None else service.rows():
         if row.problem is not None:
-            problems.append(Finding("error", f"{row.kind} {row.name}", row.problem, row.remedy))
-    if service is not None and service.player.view.problem is not None:
-        problem = service.player.view.problem
-        problems.append(Finding("error", "player", problem.reason, problem.remedy))
-    if service is not None and service.player.view.warning is not None:
-        warning = service.player.view.warning
-        problems.append(Finding("warning", "player", warning.reason, warning.remedy))
+            problems.append(Notice("", row.problem, row.remedy, Level.ERROR, f"{row.kind} {row.name}"))
+    if service is not None:
+        player = service.player.view
+        problems += [
+            replace(notice, about="player") for notice in (player.problem, player.warning) if notice is not None
+        ]
     if shutil.disk_usage(stage).free < LOW_DISK_BYTES:
-        problems.append(Finding("warning", "disk", "Less than 2 GiB are free on the stage's disk.",
-                                "Delete old runs or backups. Playback continues; calibration may fail."))  # fmt: skip
-    for item in _search(tools).findings:
-        problems.append(Finding("warning", printable(item.about or "bus"), printable(item.what),
-                                printable(item.remedy)))  # fmt: skip
+        problems.append(Notice.warning("disk-low", "Less than 2 GiB are free on the stage's disk.",
+                                       "Delete old runs or backups. Playback continues; calibration may fail.",
+                                       about="disk"))  # fmt: skip
+    for found in _search(tools).findings:
+        problems.append(Notice.warning(found.code, printable(found.what), printable(found.remedy),
+                                       about=printable(found.about or "bus")))  # fmt: skip
     return problems
 
 

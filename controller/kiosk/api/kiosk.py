@@ -25,7 +25,6 @@ from controller.kiosk.interface import (
     Changes,
     Comparison,
     Computed,
-    Finding,
     Fit,
     FoundDevice,
     Job,
@@ -44,6 +43,7 @@ from controller.kiosk.store.archive import diagnostics
 from controller.kiosk.values import IN_TURN
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
+from hal.notices import Notice
 
 LIT_FOR_AIMING_S: Final = 900.0
 """The lamps stay lit for so long after test shots, because the next ones follow soon."""
@@ -234,7 +234,7 @@ class StageKiosk(AttachedKiosk):
             self._last = replace(self._last, failures=log.failures, revision=self._last.revision + 1)
         self._notify()
 
-    def doctor(self) -> Sequence[Finding]:
+    def doctor(self) -> Sequence[Notice]:
         return self._examinations.findings()
 
     def changes(self) -> Changes:

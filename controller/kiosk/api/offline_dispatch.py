@@ -22,11 +22,12 @@ from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.schedule import check_schedule, expanded
 from controller.kiosk.store.bundle_store import BundleStore
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.run.progress import Phase, Progress, Reporter
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Cancelled
+from hal.notices import Notice
 
 LEVELS: Final = ("info", "warning", "error")
 LONG_S: Final = 600.0
@@ -53,7 +54,7 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
 def _record(folder: Path, text: str) -> None:
     """Add a line to the event log, as a running kiosk does before it changes something."""
     with contextlib.closing(EventLog(folder / EventLog.FILE)) as log:
-        log.add(Decision("done-by", text))
+        log.add(Notice("done-by", text))
 
 
 def _holder(operation: Operation, folder: Path) -> object:

@@ -162,5 +162,5 @@ class Snapshots:
 
     def _player_row(self, service: Service) -> DeviceRow:
         problem = service.player.view.problem
-        what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
+        what, remedy = (None, "") if problem is None else (problem.what, problem.remedy)
         return DeviceRow("player", "display", "player", (), what, remedy)

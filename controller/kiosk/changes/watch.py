@@ -18,12 +18,13 @@ from controller.kiosk.changes.devices import lens_facts, settings_facts, shown_f
 from controller.kiosk.changes.inventory import Fact, Inventory
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.outputs import outputs_of_x
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import Change, Changes
 from controller.stage.artefacts.grade import is_graded, passes
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import json_path, read_json, run_kind
 from controller.stage.sessions.calibrations import finished_calibrations
+from hal.notices import Level, Notice
 
 
 class _Kind(NamedTuple):
@@ -238,7 +239,7 @@ class InventoryWatch:
         inventory.keep_good(self._stage, taken)
         found = () if before is None else changes(before, taken)
         more = f" It differs in {len(found)} points from the good day before." if found else ""
-        self._log.add(Decision("inventory-taken", f"What the kiosk consists of was recorded after a good grade.{more}"))
+        self._log.add(Notice("inventory-taken", f"What the kiosk consists of was recorded after a good grade.{more}"))
 
     def _complete(self, good: Inventory) -> None:
         """Add what could not be read on the good day: many projectors tell their settings only while lit."""
@@ -263,7 +264,7 @@ class InventoryWatch:
             text = " ".join(one.sentence for one in unreported[:MOST_NAMED])
             more = f" And {len(unreported) - MOST_NAMED} more." if len(unreported) > MOST_NAMED else ""
             remedy = "See `velatura kiosk changes`, or the page Changes in the panel."
-            self._log.add(Decision("stage-changed", f"Since the last good day: {text}{more}", remedy, "warning"))
+            self._log.add(Notice("stage-changed", f"Since the last good day: {text}{more}", remedy, Level.WARNING))
 
 
 def _ahead(at_s: float, now_s: float) -> bool:
@@ -271,10 +272,10 @@ def _ahead(at_s: float, now_s: float) -> bool:
     return now_s < at_s <= now_s + COMPLETE_S
 
 
-def _not_kept(error: VelaturaError | OSError) -> Decision:
+def _not_kept(error: VelaturaError | OSError) -> Notice:
     if isinstance(error, VelaturaError):
         why, remedy = error.what, error.remedy
     else:
         why, remedy = f"{error.strerror or error}.", "Check the disk of the stage."
     what = f"What the kiosk consists of could not be recorded. {why}"
-    return Decision("inventory-not-kept", what, f"It is tried again. {remedy}", "warning")
+    return Notice("inventory-not-kept", what, f"It is tried again. {remedy}", Level.WARNING)

@@ -9,7 +9,8 @@ from datetime import UTC, datetime
 from typing import Final
 
 from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, believed
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 _UNSYNCHRONISED: Final = 0x40
 _KEEP_EVERY_S: Final = 60.0
@@ -87,24 +88,24 @@ class TrustedClock:
         return self._monotonic() - self._ahead_since_s >= _PROVE_S
 
 
-def beginning(log: EventLog) -> Decision:
+def beginning(log: EventLog) -> Notice:
     """What a starting service logs, so that the log explains the time without one."""
     last = next((row.code for row in reversed(log.after(0)) if row.code in (_BEGAN, "service-ended")), "")
     if last != _BEGAN:
-        return Decision(_BEGAN, "The kiosk is starting.")
+        return Notice(_BEGAN, "The kiosk is starting.")
     latest = log.value("latest")
     when = "" if latest is None else f" after {datetime.fromtimestamp(float(latest), UTC):%Y-%m-%d %H:%M} UTC"
-    return Decision(
+    return Notice(
         _BEGAN, f"The kiosk is starting. The previous run ended unexpectedly{when}.",
-        "If there was no power cut, check the system log.", "warning",
+        "If there was no power cut, check the system log.", Level.WARNING,
     )  # fmt: skip
 
 
-def _set(by_s: float) -> Decision:
+def _set(by_s: float) -> Notice:
     how = f"The clock was set {'forward' if by_s > 0 else 'back'} by {_span(abs(by_s))}."
     held = -HOLD_S <= by_s < 0
     then = "The schedule waits until the clock has caught up." if held else ""
-    return Decision("clock-set", how, then, "warning")
+    return Notice("clock-set", how, then, Level.WARNING)
 
 
 def _span(seconds: float) -> str:
@@ -112,10 +113,10 @@ def _span(seconds: float) -> str:
 
 
 _BEGAN: Final = "service-started"
-_LOST: Final = Decision(
+_LOST: Final = Notice(
     "clock-unknown",
     "The system time is unknown.",
     "Set the clock, or connect the network. Until then without_time under [schedule] applies.",
-    "error",
+    Level.ERROR,
 )
-_FOUND: Final = Decision("clock-known", "The system time is known again.")
+_FOUND: Final = Notice("clock-known", "The system time is known again.")

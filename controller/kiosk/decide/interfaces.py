@@ -6,13 +6,11 @@ import enum
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from controller.kiosk.values import Turn
+from hal.notices import Notice
 from hal.values import Power
-
-if TYPE_CHECKING:  # the log needs SQLite, and `velatura --help` gets here
-    from controller.kiosk.store.event_log import Decision
 
 DISK_FULL: Final = "disk-full"
 """The code of the one problem that several devices may have because nothing can be written."""
@@ -46,7 +44,7 @@ class ProjectorView:
     strikes: int = 0
     counter_hours: int | None = None
     looked: bool = False
-    problem: Decision | None = None
+    problem: Notice | None = None
 
     @property
     def shines(self) -> bool:
@@ -96,10 +94,10 @@ class PlayerView:
     """
 
     shown: Showing | None = None
-    problem: Decision | None = None
+    problem: Notice | None = None
     restarts: int = 0
-    warning: Decision | None = None
-    outputs: Decision | None = None
+    warning: Notice | None = None
+    outputs: Notice | None = None
 
 
 class PlayerPort(Protocol):
@@ -151,7 +149,7 @@ class Finished:
     """The result of a request. ``then``: the requests that follow from it."""
 
     request: Request
-    outcome: Decision
+    outcome: Notice
     failed: bool = False
     then: tuple[Request, ...] = ()
 
@@ -159,7 +157,7 @@ class Finished:
 class Jobs(Protocol):
     """Runs one request at a time."""
 
-    def refusal(self, request: Request) -> Decision | None:
+    def refusal(self, request: Request) -> Notice | None:
         """Why it can't run now (no camera, no calibration), or None. From memory."""
 
     def begin(self, request: Request) -> None: ...

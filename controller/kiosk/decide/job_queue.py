@@ -13,7 +13,8 @@ from typing import Final
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, Jobs, ProjectorView, Request
 from controller.kiosk.decide.planner import Plan, Task
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 _NAME: Final = "work"
 _BACKGROUND: Final = "takeover"
@@ -94,7 +95,7 @@ class JobQueue:
         self.check_idle()
         if (why := self._jobs.refusal(requests[0])) is not None:
             self._log.add(why)
-            raise WorkError(why.code, what=why.reason, remedy=why.remedy)
+            raise WorkError(why.code, what=why.what, remedy=why.remedy)
         self._queue.extend(requests)
         self._keep()
 
@@ -157,10 +158,10 @@ class JobQueue:
                 if why.code == NOT_YET:
                     continue
                 self._log.mark_done(task.key, why.code)
-                reason = f"The {task.what} ({task.key}) is skipped. {why.reason}"
-                self._log.add(replace(why, reason=reason, level="warning"))
+                reason = f"The {task.what} ({task.key}) is skipped. {why.what}"
+                self._log.add(replace(why, what=reason, level=Level.WARNING))
             else:
-                self._log.add(Decision("task-due", f"The {task.what} ({task.key}) is due."))
+                self._log.add(Notice("task-due", f"The {task.what} ({task.key}) is due."))
                 self._queue.append(request)
 
     def ready(self, views: Sequence[ProjectorView]) -> Request | None:
@@ -177,9 +178,9 @@ class JobQueue:
             return None
         dark = [view.name for view in views if view.condition is not Condition.LIT]
         if dark:
-            self.drop(Decision(
+            self.drop(Notice(
                 "work-needs-all-lamps", f"The job was cancelled because the lamp of {', '.join(dark)} is not lit.",
-                "Repair that projector first. Playback continues without it.", "error",
+                "Repair that projector first. Playback continues without it.", Level.ERROR,
             ))  # fmt: skip
             return None
         if all(view.stable_left_s <= 0 for view in views):
@@ -196,7 +197,7 @@ class JobQueue:
         self._jobs.begin(request)
         self._keep()
 
-    def drop(self, why: Decision) -> None:
+    def drop(self, why: Notice) -> None:
         """Drop all waiting jobs."""
         if self._queue:
             self._settle(why.code)
@@ -216,7 +217,7 @@ class JobQueue:
         waiting = [request for request in self._queue if not request.key or request.key in begun]
         keep_work(self._log, (*running, *waiting), self._again)
 
-    def _tell(self, outcome: Decision) -> None:
+    def _tell(self, outcome: Notice) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""
         (self._log.add_failure if outcome.level == "error" else self._log.add)(outcome)
 
@@ -227,17 +228,17 @@ class JobQueue:
         self._queue.clear()
 
 
-_CANCELLED: Final = Decision("work-cancelled", "The waiting jobs were cancelled.")
-_TOO_LATE: Final = Decision(
+_CANCELLED: Final = Notice("work-cancelled", "The waiting jobs were cancelled.")
+_TOO_LATE: Final = Notice(
     "lamps-not-steady", "The job was cancelled because the lamps were not lit and stable in time.",
-    "See the problems of the projectors, or increase power_up_s under [safety].", "error",
+    "See the problems of the projectors, or increase power_up_s under [safety].", Level.ERROR,
 )  # fmt: skip
 
 
-def _expired(task: Task) -> Decision:
-    return Decision(
+def _expired(task: Task) -> Notice:
+    return Notice(
         "task-left-out",
         f"The {task.what} ({task.key}) was not done in its time window.",
         "See the earlier events: the stage was open, without power, or busy.",
-        "warning",
+        Level.WARNING,
     )

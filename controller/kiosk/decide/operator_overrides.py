@@ -11,8 +11,9 @@ from typing import Any, Final
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.interface import Schedule
 from controller.kiosk.schedule import openings, zone_of
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import IN_TURN
+from hal.notices import Notice
 
 KEY: Final = "live-changes"
 
@@ -103,7 +104,7 @@ class OperatorOverrides:
         """Open or closed until the next scheduled change. Without the time: until the first one after it is known."""
         self._set(Override(wanted, plan.open, plan.changes_s) if wanted is not plan.open else None)
         action = "open" if wanted else "close"
-        self._log.add(Decision("asked", f"An operator asked to {action} the stage."))
+        self._log.add(Notice("asked", f"An operator asked to {action} the stage."))
 
     def follow(self, plan: Plan) -> None:
         """Apply the newest plan of the schedule."""
@@ -127,14 +128,14 @@ class OperatorOverrides:
         needless = override.said is None and override.wanted is plan.open
         if needless or missed or override.said not in (None, plan.open):
             self._set(None)
-            self._log.add(Decision("schedule-rules", "The stage follows the schedule again."))
+            self._log.add(Notice("schedule-rules", "The stage follows the schedule again."))
         elif (override.said, override.until_s) != (plan.open, plan.changes_s):
             self._set(replace(override, said=plan.open, until_s=plan.changes_s))
 
     def choose(self, appearance: str, plan: Plan) -> None:
         self._choose(appearance)
         what = "all appearances in turn" if appearance == IN_TURN else f"the appearance {appearance}"
-        self._log.add(Decision("asked", f"An operator chose {what}."))
+        self._log.add(Notice("asked", f"An operator chose {what}."))
 
     def appearance(self, plan: Plan, names: Sequence[str]) -> str:
         """The chosen one if the bundle has it, else the scheduled one, else ``IN_TURN``; empty if there is none."""

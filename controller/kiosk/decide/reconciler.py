@@ -31,9 +31,10 @@ from controller.kiosk.decide.operator_overrides import LiveChanges, LiveChangesK
 from controller.kiosk.decide.planner import Plan, plan
 from controller.kiosk.decide.stage_states import LightNeed, Limits, StageStates
 from controller.kiosk.interface import Schedule
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import IN_TURN
 from controller.run.state_machine import Event, Machine, State
+from hal.notices import Level, Notice
 
 
 class ContentSelector:
@@ -108,9 +109,9 @@ class ContentSelector:
         return found.pop() if len(found) == 1 else None
 
 
-_EMPTY: Final = Decision(
+_EMPTY: Final = Notice(
     "nothing-installed", "The stage should be open, but no bundle is installed.",
-    "Calibrate the stage and compute appearances. The lamps stay off until then.", "error",
+    "Calibrate the stage and compute appearances. The lamps stay off until then.", Level.ERROR,
 )  # fmt: skip
 
 
@@ -326,7 +327,7 @@ class Reconciler:
         finished = self._queue.take_finished()
         if finished is not None and self.machine.state is State.CALIBRATING:
             event = Event.CANCEL if finished.failed else Event.CALIBRATED
-            self._states.go(event, finished.outcome.reason)
+            self._states.go(event, finished.outcome.what)
 
     def _begin_work(self, views: Sequence[ProjectorView]) -> None:
         head = self._queue.head
@@ -372,7 +373,7 @@ def _nothing_plays() -> WorkError:
     )
 
 
-_FAULTY: Final = Decision(
+_FAULTY: Final = Notice(
     "work-impossible", "The job was cancelled because the stage has a fault.",
-    "Correct the fault, then start the job again.", "error",
+    "Correct the fault, then start the job again.", Level.ERROR,
 )  # fmt: skip

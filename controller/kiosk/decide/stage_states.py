@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from controller.kiosk.decide.interfaces import Condition, ProjectorView
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import Event, Machine, State
+from hal.notices import Notice
 
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
 """Between attempts to leave FAULT."""
@@ -44,7 +45,7 @@ class StageStates:
         self._since_s = monotonic()
         self._attempts, self._silent = 0, frozenset[str]()
 
-    def follow(self, views: Sequence[ProjectorView], player: Decision | None, need: LightNeed) -> None:
+    def follow(self, views: Sequence[ProjectorView], player: Notice | None, need: LightNeed) -> None:
         """Change to the next state if the devices or ``need`` ask for it. ``player``: the player's problem."""
         state = self.machine.state
         if state is State.OFF:
@@ -76,12 +77,12 @@ class StageStates:
         elif late or all(view.stable_left_s <= 0 for view in shining if view.condition is Condition.LIT):
             self.go(Event.LAMPS_STABLE, _reasons(views))
 
-    def _keep_playing(self, views: Sequence[ProjectorView], player: Decision | None, need: LightNeed) -> None:
+    def _keep_playing(self, views: Sequence[ProjectorView], player: Notice | None, need: LightNeed) -> None:
         state = self.machine.state
         shining = [view.name for view in views if view.shines]
         reasons = _reasons(views)
         if player is not None:
-            reasons = f"{player.reason} {reasons}".strip()
+            reasons = f"{player.what} {reasons}".strip()
         self.missing = frozenset(view.name for view in views if not view.shines)
         if not shining and not any(view.coming for view in views):
             self.go(Event.FAIL, reasons or "No lamp gives light.")
@@ -145,7 +146,7 @@ class StageStates:
         remedy = "See the devices for what to do." if bad else ""
         text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
         level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
-        self._log.add(Decision("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+        self._log.add(Notice("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
 
 
 def _without_light(names: Collection[str]) -> str:

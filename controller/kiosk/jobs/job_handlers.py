@@ -16,13 +16,13 @@ from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, run_name
 from controller.kiosk.store import settings
 from controller.kiosk.store.bundle_store import BundleStore
-from controller.kiosk.store.event_log import Decision
 from controller.run.progress import Phase, Progress, Reporter
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import BorrowedSession, StageSession
 from hal.deadline import in_seconds
+from hal.notices import Level, Notice
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class JobHandlers:
         stage: Path,
         lend: LendRig,
         *,
-        missing_device: Callable[[], Decision | None],
+        missing_device: Callable[[], Notice | None],
         calibrated: Callable[[], bool],
         open_now: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -136,12 +136,12 @@ class JobHandlers:
             "variants": JobHandler(self._variants, known),
         }
 
-    def _needs_calibration(self, request: Request) -> Decision | None:
+    def _needs_calibration(self, request: Request) -> Notice | None:
         if self.calibrated():
             return None
-        return Decision("not-calibrated", "This stage has no finished calibration.", "Calibrate it first.", "error")
+        return Notice("not-calibrated", "This stage has no finished calibration.", "Calibrate it first.", Level.ERROR)
 
-    def _needs_camera(self, request: Request) -> Decision | None:
+    def _needs_camera(self, request: Request) -> Notice | None:
         return self.missing_device() or self._needs_calibration(request)
 
     # -- jobs that need the lamps
@@ -161,13 +161,12 @@ class JobHandlers:
         reporter.job = replace(reporter.job, run=run_name(result))
         advice = str(result["advice"])
         if advice == "nothing":
-            return Finished(request, Decision("drift-none", "Nothing has moved or dimmed since the calibration."))
+            return Finished(request, Notice("drift-none", "Nothing has moved or dimmed since the calibration."))
         if advice == "look":
-            return Finished(request, Decision("drift-look", "The drift check could not determine what has changed.",
-                                              "Check the stage, then recalibrate.", "warning"))  # fmt: skip
-        changed = Decision(
-            "drift-found", "The stage has changed since its calibration.", "A quick recalibration follows.", "warning"
-        )
+            return Finished(request, Notice("drift-look", "The drift check could not determine what has changed.",
+                                              "Check the stage, then recalibrate.", Level.WARNING))  # fmt: skip
+        changed = Notice.warning("drift-found", "The stage has changed since its calibration.",
+                                 "A quick recalibration follows.")  # fmt: skip
         return Finished(request, changed, then=(replace(QUICK, key=request.key),))
 
     def _aim(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
@@ -186,7 +185,7 @@ class JobHandlers:
         with self.lend() as rig:
             take_test_shots(rig, longest_exposure_s=capture.longest_exposure_s,
                             deadline=in_seconds(AIM_S, cancel), advance=advance)  # fmt: skip
-        return Finished(request, Decision("aimed", "The test shots are done. See the aiming page."))
+        return Finished(request, Notice("aimed", "The test shots are done. See the aiming page."))
 
     def _quick(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         from controller.stage.services.recalibrate import recalibrate
@@ -215,7 +214,7 @@ class JobHandlers:
     def _after_calibration(self, request: Request, reporter: JobReporter, result: object) -> Finished:
         assert isinstance(result, dict)
         reporter.job = replace(reporter.job, run=run_name(result))
-        done = Decision("calibrated", "The stage is recalibrated.")
+        done = Notice("calibrated", "The stage is recalibrated.")
         report = replace(REPORT, arguments=(reporter.job.run,))
         if not (tables := check_stage(self._stage).stage.tables).appearances:
             return Finished(request, done, then=(report,))
@@ -228,8 +227,8 @@ class JobHandlers:
         from controller.stage.services.compare import photograph
 
         if request.key and self._open_now():
-            return Finished(request, Decision("photographs-left-out", "The appearances were not photographed, because"
-                                              " the stage opened in the meantime.", "", "warning"))  # fmt: skip
+            return Finished(request, Notice("photographs-left-out", "The appearances were not photographed, because"
+                                              " the stage opened in the meantime.", "", Level.WARNING))  # fmt: skip
         with self.lend() as rig:
             result = photograph(
                 session=BorrowedSession(self._stage, rig), names=request.arguments, reporter=reporter, cancel=cancel
@@ -239,7 +238,7 @@ class JobHandlers:
         names = ", ".join(row["name"] for row in result["appearances"])
         text = (f"Photographed: {names}. The largest median colour difference of a whole object is"
                 f" {worst['headline']:.2f}, of {worst['name']}.")  # fmt: skip
-        return Finished(request, Decision("photographed", text, "See the results."))
+        return Finished(request, Notice("photographed", text, "See the results."))
 
     # -- jobs that do not
 
@@ -251,10 +250,10 @@ class JobHandlers:
         )
         then = (VARIANTS,) if made.names and self._several() else ()
         if not made.failed:
-            return Finished(request, Decision("published", installed), then=then)
+            return Finished(request, Notice("published", installed), then=then)
         text = f"{made.failures} {self._remove_failed(request, made.failed)}{installed}"
         failed = not made.names or any(name in made.failed for name in request.arguments)
-        return Finished(request, Decision("appearance-failed", text, "", "error"), failed=failed, then=then)
+        return Finished(request, Notice("appearance-failed", text, "", Level.ERROR), failed=failed, then=then)
 
     def _remove_failed(self, request: Request, failed: Mapping[str, str]) -> str:
         """Remove a new appearance that can't be solved from stage.toml: no page of the panel could remove it."""
@@ -271,7 +270,7 @@ class JobHandlers:
 
         (run,) = request.arguments
         calibration_report(self._stage / "runs" / run, check_stage(self._stage))
-        return Finished(request, Decision("reported", f"The report of {run} is written. See the results."))
+        return Finished(request, Notice("reported", f"The report of {run} is written. See the results."))
 
     def _several(self) -> bool:
         return len(check_stage(self._stage).names) > 1
@@ -279,12 +278,12 @@ class JobHandlers:
     def _variants(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         names = check_stage(self._stage).names
         self._solve([(name,) for name in names], reporter, cancel)
-        return Finished(request, Decision("variants-solved", "Frames for the loss of any single projector are ready."))
+        return Finished(request, Notice("variants-solved", "Frames for the loss of any single projector are ready."))
 
     def _takeover(self, request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
         self._solve([request.arguments], reporter, cancel)
         names = ", ".join(request.arguments)
-        return Finished(request, Decision("takeover-solved", f"Frames without {names} are ready."))
+        return Finished(request, Notice("takeover-solved", f"Frames without {names} are ready."))
 
     def _solve(self, sets: Sequence[tuple[str, ...]], reporter: JobReporter, cancel: threading.Event) -> None:
         from controller.kiosk.jobs.failover import solve_without

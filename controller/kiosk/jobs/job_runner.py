@@ -13,12 +13,12 @@ from typing import Final
 from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, JobStep
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.world import Thread, World
 from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
-from hal.notices import Level
+from hal.notices import Level, Notice
 
 TITLES: Final[Mapping[str, str]] = {
     "aim": "Test shots",
@@ -62,7 +62,7 @@ class JobReporter:
         self._changed()
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
-        self._log.add(Decision("work-message", text, "", level.value))
+        self._log.add(Notice("work-message", text, "", level))
         self._changed()
 
 
@@ -75,7 +75,7 @@ class JobHandler:
     """``refusal`` says from memory why the job can't run now, or None."""
 
     do: Do
-    refusal: Callable[[Request], Decision | None] = lambda request: None
+    refusal: Callable[[Request], Notice | None] = lambda request: None
 
 
 class JobRunner:
@@ -126,7 +126,7 @@ class JobRunner:
     def running(self) -> Request | None:
         return self._request
 
-    def refusal(self, request: Request) -> Decision | None:
+    def refusal(self, request: Request) -> Notice | None:
         return self._handlers[request.kind].refusal(request)
 
     def begin(self, request: Request) -> None:
@@ -136,7 +136,7 @@ class JobRunner:
         made = request.arguments[0] if request.kind == "compute" and request.arguments else ""
         job = Job(request.number or self.reserve(), title, appearance=made)
         self._reporter = JobReporter(job, self._log, self._changed)
-        self._log.add(Decision("work-begins", f"Started: {title}."))
+        self._log.add(Notice("work-begins", f"Started: {title}."))
         run = partial(self._run, request, self._reporter, self._cancel)
         thread = self._world.thread(run, f"work-{request.kind}")
         try:
@@ -166,9 +166,9 @@ class JobRunner:
         try:
             finished = self._handlers[request.kind].do(request, reporter, cancel)
         except Cancelled as error:
-            finished = Finished(request, Decision(error.code, error.what, error.remedy), failed=True)
+            finished = Finished(request, Notice(error.code, error.what, error.remedy), failed=True)
         except (VelaturaError, DeviceError) as error:
-            finished = Finished(request, Decision(error.code, error.what, error.remedy, "error"), failed=True)
+            finished = Finished(request, Notice(error.code, error.what, error.remedy, Level.ERROR), failed=True)
         except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk reports it and continues
             finished = _crashed(request, error)
         self._end(finished, reporter)
@@ -187,7 +187,7 @@ class JobRunner:
 
 def _crashed(request: Request, error: BaseException) -> Finished:
     what = f"The job failed with an unexpected error ({type(error).__name__}: {error})."
-    return Finished(request, Decision("crash", what, SEND_DIAGNOSTICS, "error"), failed=True)
+    return Finished(request, Notice("crash", what, SEND_DIAGNOSTICS, Level.ERROR), failed=True)
 
 
 def run_name(result: Mapping[str, object]) -> str:

@@ -464,7 +464,7 @@ def save_settings(kiosk: Kiosk, text: StageText) -> None:
 @operation("POST /doctor", OPERATOR, LOOKS, names=Names(part_of="doctor"))
 def doctor(kiosk: Kiosk) -> Sequence[Finding]:
     """Find problems."""
-    return kiosk.doctor()
+    return [Finding.of(notice) for notice in kiosk.doctor()]
 
 
 @operation("GET /changes", OPERATOR, LOOKS, offline=True)

@@ -16,10 +16,10 @@ from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
 from controller.core.errors import BundleError, UsageError, VelaturaError
 from controller.core.storage import write_atomically
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.values import Turn
 from controller.play.control.protocol import MAX_FADE_S, MAX_SECONDS
 from controller.stage.artefacts.names import safe_name
+from hal.notices import Level, Notice
 
 PREVIEWS: Final = "kiosk/thumbnails"
 OUTPUTS: Final = "kiosk/outputs"
@@ -187,28 +187,28 @@ class BundleStore:
 class BundleWatch:
     """``warning``: what people must know, or None. One thread calls ``step`` about once a second."""
 
-    def __init__(self, bundles: BundleStore, tell: Callable[[Decision], object]) -> None:
+    def __init__(self, bundles: BundleStore, tell: Callable[[Notice], object]) -> None:
         self._bundles, self._tell = bundles, tell
-        self.warning: Decision | None = None
+        self.warning: Notice | None = None
 
     def step(self) -> None:
         before, self.warning = self.warning, self._look()
         if self.warning is not None and self.warning != before:
             self._tell(self.warning)
         elif self.warning is None and before is not None:
-            self._tell(Decision("bundle-newest", "The newest bundle plays again."))
+            self._tell(Notice("bundle-newest", "The newest bundle plays again."))
 
-    def _look(self) -> Decision | None:
+    def _look(self) -> Notice | None:
         bundle = self._bundles.bundle()
         if bundle is not None and self._bundles.index(bundle) is None:
-            return Decision("bundle-bad", "The installed bundle can't be read, so nothing of it is shown.",
-                            "Compute and publish the appearances again.", "error")  # fmt: skip
+            return Notice("bundle-bad", "The installed bundle can't be read, so nothing of it is shown.",
+                            "Compute and publish the appearances again.", Level.ERROR)  # fmt: skip
         if not self._bundles.given_up():
             return None
         index = self._bundles.index(bundle)
         made = "" if index is None else time.strftime(" of %Y-%m-%d %H:%M UTC", time.gmtime(index.created_unix_s))
-        return Decision(
+        return Notice(
             "bundle-older-plays",
             f"The newest bundle showed no picture, so the previous one{made} plays.",
-            "Compute and publish the appearances again.", "warning",
+            "Compute and publish the appearances again.", Level.WARNING,
         )  # fmt: skip

@@ -16,9 +16,10 @@ from typing import Final
 from controller.bundle.format import Index
 from controller.core.storage import sync_folder
 from controller.kiosk.store import archive
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.run.journal import Journal, JournalError
 from controller.stage.artefacts.names import CAPTURES, run_kind
+from hal.notices import Level, Notice
 
 PHOTOGRAPHS_GOING: Final = f"{CAPTURES}.going"
 """The name during the removal, so that a power cut leaves no incomplete folder of photographs."""
@@ -87,10 +88,10 @@ def purge_old_photographs(stage: Path, log: EventLog, clock: Callable[[], float]
     try:
         freed = purge(runs)
     except OSError as error:
-        log.add(Decision("photographs-kept", f"Old photographs could not be deleted: {error.strerror}.",
-                          "Check the disk and the permissions of the stage's folder.", "warning"))  # fmt: skip
+        log.add(Notice("photographs-kept", f"Old photographs could not be deleted: {error.strerror}.",
+                          "Check the disk and the permissions of the stage's folder.", Level.WARNING))  # fmt: skip
         return
-    log.add(Decision("photographs-removed", f"The photographs of {len(runs)} old runs were deleted, "
+    log.add(Notice("photographs-removed", f"The photographs of {len(runs)} old runs were deleted, "
                       f"which freed {freed / 1e6:.0f} MB. Their results are kept."))  # fmt: skip
 
 

@@ -8,31 +8,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from controller.kiosk.interface import EventLevel, EventRow
+from controller.kiosk.interface import EventRow
 from controller.kiosk.store.log_file import MOST_DONE, Content, LogFile
+from hal.notices import Notice
 
 SHOWN: Final = 2_000
 MOST_FAILURES: Final = 20
 _TRIM_EVERY: Final = 200
 _RETRY_S: Final = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """An observation or decision of the kiosk. ``reason`` and ``remedy`` are sentences; the remedy may be empty."""
-
-    code: str
-    reason: str
-    remedy: str = ""
-    level: EventLevel = "info"
-
-    @property
-    def text(self) -> str:
-        return f"{self.reason} {self.remedy}".strip()
 
 
 class EventLog:
@@ -66,11 +53,11 @@ class EventLog:
 
     # -- events
 
-    def add(self, decision: Decision) -> EventRow:
+    def add(self, notice: Notice) -> EventRow:
         """Add one line. A disk error is not raised."""
         with self._lock:
             self._number += 1
-            row = EventRow(self._number, self._wall(), decision.level, decision.text, decision.code)
+            row = EventRow(self._number, self._wall(), notice.level.value, notice.text, notice.code)
             self._recent.append(row)
             self._waiting.append(row)
             self._flush()
@@ -78,10 +65,10 @@ class EventLog:
             self._also(row)
         return row
 
-    def add_failure(self, decision: Decision) -> None:
+    def add_failure(self, notice: Notice) -> None:
         """Add one line, which stays in ``failures`` until it is confirmed."""
         with self._lock:
-            self._failures = (*self._failures, self.add(decision))[-MOST_FAILURES:]
+            self._failures = (*self._failures, self.add(notice))[-MOST_FAILURES:]
             self._keep_failures()
 
     @property

@@ -18,10 +18,10 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.core.files import LARGEST_TEXT, read_bytes
 from controller.core.storage import write_atomically
 from controller.kiosk.schedule import of_table
-from controller.kiosk.store.event_log import Decision
 from controller.stage.artefacts.solved import remove_solved
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import Checked, check_stage
+from hal.notices import Level, Notice
 from hal.registry import Drivers
 
 BEFORE: Final = "stage.toml.before"
@@ -216,7 +216,7 @@ class GoodSettings:
         self._waiting = None
 
 
-def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) -> tuple[Checked, Decision]:
+def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) -> tuple[Checked, Notice]:
     """The settings that the kiosk last ran with, and what people must know. Raises ``error`` if there are none."""
     if error.code == "stage-missing" or not (stage / GOOD).is_file():
         raise error
@@ -225,4 +225,4 @@ def last_good(stage: Path, error: UsageError, drivers: Drivers | None = None) ->
     except VelaturaError:
         raise error from None
     why = f"{error.what} The kiosk runs with the last good settings, and starts no job."
-    return checked, Decision("settings-damaged", why, error.remedy, "error")
+    return checked, Notice("settings-damaged", why, error.remedy, Level.ERROR)

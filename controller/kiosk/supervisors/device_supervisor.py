@@ -9,11 +9,11 @@ from typing import Final
 
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.world import Lock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device
+from hal.notices import Level, Notice
 
 LONGEST_S: Final = 15.0
 """Not longer, because a person who plugs a cable in again waits for the result."""
@@ -43,7 +43,7 @@ class DeviceSupervisor:
 
     def __init__(
         self, name: str, kind: str, driver: str, open_it: Callable[[Deadline], Device], look: Look,
-        tell: Callable[[Decision], object], *, every_s: float = 30.0, monotonic: Callable[[], float] = time.monotonic,
+        tell: Callable[[Notice], object], *, every_s: float = 30.0, monotonic: Callable[[], float] = time.monotonic,
         deadline: Callable[[float], Deadline] = in_seconds, lock: Lock | None = None,
     ) -> None:  # fmt: skip
         self.name, self.kind, self.driver = name, kind, driver
@@ -51,7 +51,7 @@ class DeviceSupervisor:
         self._every_s, self._monotonic = every_s, monotonic
         self._device: Device | None = None
         self._values: tuple[LiveValue, ...] = ()
-        self._problem: Decision | None = None
+        self._problem: Notice | None = None
         self._next_s = 0.0
         self._lost_since_s: float | None = None
         self._closed = False
@@ -64,12 +64,12 @@ class DeviceSupervisor:
         return self._device
 
     @property
-    def problem(self) -> Decision | None:
+    def problem(self) -> Notice | None:
         return self._problem
 
     @property
     def row(self) -> DeviceRow:
-        what, remedy = (None, "") if self._problem is None else (self._problem.reason, self._problem.remedy)
+        what, remedy = (None, "") if self._problem is None else (self._problem.what, self._problem.remedy)
         return DeviceRow(self.name, self.kind, self.driver, self._values, what, remedy)
 
     def step(self) -> None:
@@ -82,7 +82,7 @@ class DeviceSupervisor:
             self._values = self._look(self._device, self._deadline(LOOK_S))
             self._recovered()
         except (DeviceError, VelaturaError) as error:
-            self._lost(Decision(error.code, error.what, error.remedy, "error"))
+            self._lost(Notice(error.code, error.what, error.remedy, Level.ERROR))
         finally:
             if self._closed:
                 # Closed while it was being opened: release it, because the next service needs it.
@@ -100,15 +100,15 @@ class DeviceSupervisor:
             try:
                 device.close()
             except DeviceError as error:
-                self._tell(Decision(error.code, error.what, error.remedy, "warning"))
+                self._tell(Notice(error.code, error.what, error.remedy, Level.WARNING))
 
     def _recovered(self) -> None:
         if self._problem is not None:
-            self._tell(Decision("device-back", f"{self.name} is connected again."))
+            self._tell(Notice("device-back", f"{self.name} is connected again."))
         self._problem = self._lost_since_s = None
         self._next_s = self._monotonic() + self._every_s
 
-    def _lost(self, problem: Decision) -> None:
+    def _lost(self, problem: Notice) -> None:
         self._release()
         self._values = ()
         now_s = self._monotonic()

@@ -14,7 +14,6 @@ from controller.kiosk.changes.devices import camera_facts, projector_facts
 from controller.kiosk.changes.inventory import Fact
 from controller.kiosk.decide.interfaces import DISK_FULL, NOT_YET, Condition, ProjectorView
 from controller.kiosk.interface import DeviceRow, LiveValue
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.light_records import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
@@ -29,8 +28,9 @@ from controller.stage.sessions.open import light_sensor, mains_circuits, open_de
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Camera, Device, Display, LightSensor, WatchedCamera
+from hal.notices import Level, Notice
 
-Tell = Callable[[Decision], object]
+Tell = Callable[[Notice], object]
 
 
 class Devices:
@@ -103,12 +103,12 @@ class Devices:
             if mine:
                 self.camera.lent.release()
 
-    def missing_for_work(self) -> Decision | None:
+    def missing_for_work(self) -> Notice | None:
         """The missing device that photographs need, or None."""
         if self.camera.device is None or self.camera.problem is not None:
-            problem = self.camera.problem or Decision(NOT_YET, "The camera is not connected yet.", "Wait for it.")
-            reason = f"No photographs are possible without the camera. {problem.reason}"
-            return replace(problem, reason=reason, level="error")
+            problem = self.camera.problem or Notice(NOT_YET, "The camera is not connected yet.", "Wait for it.")
+            reason = f"No photographs are possible without the camera. {problem.what}"
+            return replace(problem, what=reason, level=Level.ERROR)
         views = [supervisor.view for supervisor in self.projectors]
         missing = [view.name for view in views if view.condition in (Condition.LOST, Condition.BROKEN)]
         full = next(
@@ -117,8 +117,8 @@ class Devices:
         if full is not None:
             return full
         if missing:
-            return Decision("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
-                            "Repair it first. Playback continues without it.", "error")  # fmt: skip
+            return Notice("projector-missing", f"No photographs are possible without projector {', '.join(missing)}.",
+                            "Repair it first. Playback continues without it.", Level.ERROR)  # fmt: skip
         return None
 
     @contextlib.contextmanager
@@ -147,7 +147,7 @@ class Devices:
                     supervisor.guard is not guard for supervisor, guard in zip(self.projectors, guards, strict=True)
                 )
                 if lost and (missing := self.missing_for_work()) is not None:
-                    raise DeviceGone("device-missing", what=missing.reason, remedy=missing.remedy) from error
+                    raise DeviceGone("device-missing", what=missing.what, remedy=missing.remedy) from error
                 raise
 
     def close(self) -> None:
@@ -184,7 +184,7 @@ class Devices:
                                    deadline=self._world.deadline, maybe_lit=maybe_lit, failed=failed,
                                    keep_forgiven=partial(self._ledger.forgive, table.name))  # fmt: skip
 
-    def _unfed(self, projector: str) -> Decision | None:
+    def _unfed(self, projector: str) -> Notice | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
         return self.mains.problem if self.mains is not None and projector in feeds else None
 
@@ -217,9 +217,9 @@ class Devices:
     def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room
         if room is not None and before is None:
-            self._tell(Decision("room-bright", room, _DARKEN, "warning"))
+            self._tell(Notice("room-bright", room, _DARKEN, Level.WARNING))
         elif room is None and before is not None:
-            self._tell(Decision("room-dark", "The room is dark again."))
+            self._tell(Notice("room-dark", "The room is dark again."))
 
     def _ambient_limit(self) -> AmbientLightLimit | None:
         table = self._checked.stage.tables.light_sensor
@@ -258,7 +258,7 @@ def projector_row(view: ProjectorView, driver: str, output: str = "") -> DeviceR
         values.append(LiveValue.said("Projector's counter", "{0} h", view.counter_hours))
     if view.condition is Condition.LIT and view.stable_left_s > 0:
         values.append(LiveValue.said("Stable in", "{0} s", view.stable_left_s))
-    what, remedy = (None, "") if problem is None or of_disk else (problem.reason, problem.remedy)
+    what, remedy = (None, "") if problem is None or of_disk else (problem.what, problem.remedy)
     return DeviceRow(view.name, "projector", driver, tuple(values), what, remedy, output)
 
 

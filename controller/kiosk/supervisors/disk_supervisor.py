@@ -14,8 +14,9 @@ from controller.kiosk.decide.interfaces import DISK_FULL
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import make_room, runs_of
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.world import World
+from hal.notices import Level, Notice
 
 GB: Final = 1e9
 STEP_BYTES: Final = 10_000_000
@@ -38,11 +39,11 @@ class DiskSupervisor:
         self._world = world or World()
         self._stage, self._table, self._bundles, self._log, self._busy = stage, table, bundles, log, busy
         self.free_bytes = self.total_bytes = 0
-        self.problem: Decision | None = None
+        self.problem: Notice | None = None
         self._again_at_s = 0.0
-        self._suspected: Decision | None = None
+        self._suspected: Notice | None = None
 
-    def suspect(self, problem: Decision) -> None:
+    def suspect(self, problem: Notice) -> None:
         """A device could not write; ``problem`` is reported where the disk is not the reason."""
         self._suspected = problem
 
@@ -58,7 +59,7 @@ class DiskSupervisor:
         """As the panel shows it among the devices."""
         values = (LiveValue.said("Free", "{0} GB of {1} GB", self.free_bytes / GB, self.total_bytes / GB, digits=1),)
         problem = self.problem
-        what, remedy = (None, "") if problem is None else (problem.reason, problem.remedy)
+        what, remedy = (None, "") if problem is None else (problem.what, problem.remedy)
         return DeviceRow("disk", "disk", "", values, what, remedy)
 
     @property
@@ -82,24 +83,24 @@ class DiskSupervisor:
         try:
             removed = make_room(self._stage, enough, keep_runs=self._table().keep_runs, used=runs_of(*indexes))
         except OSError as error:
-            self._log.add(Decision("disk-not-cleared", f"Old runs could not be removed: {error.strerror}.",
-                                    "Check the permissions of the stage's folder.", "warning"))  # fmt: skip
+            self._log.add(Notice("disk-not-cleared", f"Old runs could not be removed: {error.strerror}.",
+                                    "Check the permissions of the stage's folder.", Level.WARNING))  # fmt: skip
             return
         if removed:
             self._look()
             what = ", ".join(removed[:5]) + (f" and {len(removed) - 5} more" if len(removed) > 5 else "")
             freed = max(0, self.free_bytes - before) / GB
             text = f"The disk was filling. Removed: {what}, which freed {freed:.2f} GB."
-            self._log.add(Decision("disk-cleared", text))
+            self._log.add(Notice("disk-cleared", text))
 
     def _judge(self) -> None:
         before, self.problem = self.problem, self._problem()
         if self.problem is not None and (before is None or before.code != self.problem.code):
             self._log.add(self.problem)
         elif self.problem is None and before is not None:
-            self._log.add(Decision("disk-well", f"The disk has {self.free_bytes / GB:.1f} GB of free space again."))
+            self._log.add(Notice("disk-well", f"The disk has {self.free_bytes / GB:.1f} GB of free space again."))
 
-    def _problem(self) -> Decision | None:
+    def _problem(self) -> Notice | None:
         low = self.free_bytes < self._level
         if (low or self._suspected is not None or self._log.problem is not None) and (why := self._refusal()):
             return _full(why)
@@ -109,7 +110,7 @@ class DiskSupervisor:
         if low:
             text = f"Only {self.free_bytes / GB:.1f} GB are free on the disk of the stage."
             remedy = "Remove old runs, or copy them elsewhere. When the disk is full, no lamp is switched on."
-            return Decision("disk-filling", text, remedy, "warning")
+            return Notice("disk-filling", text, remedy, Level.WARNING)
         return None
 
     def _refusal(self) -> str | None:
@@ -124,9 +125,9 @@ class DiskSupervisor:
         return None
 
 
-def _full(why: str) -> Decision:
-    return Decision(
+def _full(why: str) -> Notice:
+    return Notice(
         DISK_FULL,
         f"The disk of the stage {why}. Playback continues. No lamp is switched on, because that could not be recorded.",
-        "Free some space on the disk, and check that it is in order.", "error",
+        "Free some space on the disk, and check that it is in order.", Level.ERROR,
     )  # fmt: skip

@@ -8,10 +8,10 @@ from contextlib import AbstractContextManager
 
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow
-from controller.kiosk.store.event_log import Decision
 from controller.run.state_machine import State
 from hal.errors import DeviceError
 from hal.interfaces import ButtonPanel
+from hal.notices import Level, Notice
 
 
 class KeysSupervisor:
@@ -23,18 +23,18 @@ class KeysSupervisor:
     def __init__(
         self, driver: str, open_panel: Callable[[], AbstractContextManager[ButtonPanel]],
         presses: tuple[Callable[[], None], Callable[[], None], Callable[[], None]], state: Callable[[], State],
-        tell: Callable[[Decision], object],
+        tell: Callable[[Notice], object],
     ) -> None:  # fmt: skip
         self.driver = driver
         self._open, self._presses, self._state, self._tell = open_panel, presses, state, tell
         self._opened: contextlib.ExitStack | None = None
-        self._problem: Decision | None = None
+        self._problem: Notice | None = None
         self._closed = False
 
     @property
     def row(self) -> DeviceRow:
         """The row that the web panel shows."""
-        what, remedy = (None, "") if self._problem is None else (self._problem.reason, self._problem.remedy)
+        what, remedy = (None, "") if self._problem is None else (self._problem.what, self._problem.remedy)
         return DeviceRow("key panel", "keys", self.driver, (), what, remedy)
 
     def step(self) -> None:
@@ -74,8 +74,8 @@ class KeysSupervisor:
     def _trouble(self, error: DeviceError | VelaturaError | None) -> None:
         before, self._problem = self._problem, None
         if error is not None:
-            self._problem = Decision(error.code, error.what, error.remedy, "warning")
+            self._problem = Notice(error.code, error.what, error.remedy, Level.WARNING)
             if before is None or before.code != error.code:
                 self._tell(self._problem)
         elif before is not None:
-            self._tell(Decision("keys-back", "The technician's keys work again."))
+            self._tell(Notice("keys-back", "The technician's keys work again."))

@@ -9,7 +9,6 @@ from functools import partial
 from typing import cast
 
 from controller.kiosk.interface import LiveValue
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Lock
@@ -18,9 +17,10 @@ from controller.stage.rig.power import Circuit
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Device
+from hal.notices import Notice
 from hal.values import DeviceIdentity
 
-Tell = Callable[[Decision], object]
+Tell = Callable[[Notice], object]
 
 
 class Boards:
@@ -80,7 +80,7 @@ class MainsSupervisor(DeviceSupervisor):
 
     def _switch_on(self, circuit: Circuit) -> str:
         if circuit.close(deadline=self._deadline(LOOK_S)):
-            self._tell(Decision("mains-on", f"Mains on: {circuit.name}."))
+            self._tell(Notice("mains-on", f"Mains on: {circuit.name}."))
             self._booted_at_s |= dict.fromkeys(circuit.feeds, self._monotonic() + circuit.boot_s)
         return "on"
 
@@ -106,7 +106,7 @@ class MainsSupervisor(DeviceSupervisor):
     def _is_off(self, circuit: Circuit) -> str:
         if not self._off.issuperset(circuit.feeds):
             self._off |= frozenset(circuit.feeds)
-            self._tell(Decision("mains-off", f"Mains off: {circuit.name}."))
+            self._tell(Notice("mains-off", f"Mains off: {circuit.name}."))
         return "off"
 
     def _all_answer(self, guards: Sequence[LampGuard]) -> bool:

@@ -13,13 +13,13 @@ from typing import Any, Final
 from controller.bundle.install import Starts, before_it, chosen, is_readable
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
 from controller.kiosk.values import Turn
 from controller.kiosk.world import READY_S, Process, launched
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from hal.notices import Level, Notice
 from hal.player import PlayerClient
 
 MOST_MISSES: Final = 2
@@ -92,7 +92,7 @@ class PlayerSupervisor:
         self,
         runtime: Path,
         settings: Callable[[bool], PlayerSettings],
-        tell: Callable[[Decision], object],
+        tell: Callable[[Notice], object],
         *,
         monotonic: Callable[[], float] = time.monotonic,
         attach: Callable[[PlayerSettings], AttachedPlayer] | None = None,
@@ -133,7 +133,7 @@ class PlayerSupervisor:
             if self._process is None:
                 return
         if not self._process.alive:
-            self._restart(Decision("player-died", "The player ended unexpectedly.", "It is started again.", "error"))
+            self._restart(Notice("player-died", "The player ended unexpectedly.", "It is started again.", Level.ERROR))
             return
         try:
             self._follow(self._ask({"op": "status"}))
@@ -142,18 +142,18 @@ class PlayerSupervisor:
                 self._restart(_WITHOUT_BUNDLE)
         except DeviceTimeout:
             if self._ends_for_silence():
-                self._restart(Decision("player-hung", "The player did not answer.", "It is started again.", "error"))
+                self._restart(Notice("player-hung", "The player did not answer.", "It is started again.", Level.ERROR))
         except (DeviceGone, ProtocolError, KeyError):
             self._channel.hang_up()
             if self._ends_for_silence(refused=True):
                 self._restart(
-                    Decision("player-gone", "The player refused the connection.", "It is started again.", "error")
+                    Notice("player-gone", "The player refused the connection.", "It is started again.", Level.ERROR)
                 )
         except DeviceRefused as error:
             self._patience.begins()
             # It says why it can't show that, so it does answer: an end changes nothing.
             self._reached = (self.want,)
-            problem = Decision(error.code, error.what, error.remedy, "error")
+            problem = Notice(error.code, error.what, error.remedy, Level.ERROR)
             if error.code.startswith("bundle-") and self._starts_again():
                 # Only starts are counted, and after three without a picture the player goes back to the bundle before.
                 self._restart(problem)
@@ -190,7 +190,7 @@ class PlayerSupervisor:
             self._starts_without_picture += 1
             self._start_at_s = self._monotonic() + BACK_OFF_S[min(self._failed, len(BACK_OFF_S) - 1)]
             what, remedy = (error.what, error.remedy) if isinstance(error, VelaturaError) else (str(error), "")
-            self._trouble(Decision("player-not-started", what, remedy or "It is tried again.", "error"))
+            self._trouble(Notice("player-not-started", what, remedy or "It is tried again.", Level.ERROR))
             return
         self._patience.begins()
         self._started_at_s, self._reached, self._identified = self._monotonic(), None, False
@@ -202,12 +202,12 @@ class PlayerSupervisor:
         if hello.get("bundle") and installed is not None:
             # The player may have gone back to the bundle before while it started.
             self._identities[str(hello["bundle"])] = chosen(installed.parent) or installed.resolve()
-        self._tell(Decision("player-started", "The player is running."))
+        self._tell(Notice("player-started", "The player is running."))
 
     def _player(self, settings: PlayerSettings) -> Process:
         return self._launch(self._runtime, settings) if self._attach is None else self._attach(settings)
 
-    def _restart(self, why: Decision) -> None:
+    def _restart(self, why: Notice) -> None:
         assert self._process is not None
         self._tell(why)
         self._channel.hang_up()
@@ -263,7 +263,7 @@ class PlayerSupervisor:
             self._failed = 0
         outputs = self._view.outputs
         if outputs is None and self._view.problem is not None:
-            self._tell(Decision("player-well", "The player shows what it should again."))
+            self._tell(Notice("player-well", "The player shows what it should again."))
         self._reached = (want,)
         self._view = replace(self._view, shown=shown, problem=outputs, warning=self._warning(status))
 
@@ -283,11 +283,11 @@ class PlayerSupervisor:
         same = same and shown is not None and shown.brightness == want.brightness
         return running and same and self._turns in (None, want.in_turn)
 
-    def _warning(self, status: dict[str, Any]) -> Decision | None:
+    def _warning(self, status: dict[str, Any]) -> Notice | None:
         reported = status.get("warning")
         if reported is None:
             return None
-        warning = Decision(str(reported["code"]), str(reported["what"]), str(reported["remedy"]), "warning")
+        warning = Notice(str(reported["code"]), str(reported["what"]), str(reported["remedy"]), Level.WARNING)
         if self._view.warning != warning:
             self._tell(warning)
         return warning
@@ -321,7 +321,7 @@ class PlayerSupervisor:
                 self._dark, self._starts_without_picture = False, 0
         self._turns = want.in_turn
         what = f"{len(want.in_turn)} appearances in turn" if want.in_turn else want.appearance
-        self._tell(Decision("playing", f"The player shows {what}."))
+        self._tell(Notice("playing", f"The player shows {what}."))
 
     def _waits_in_vain(self) -> bool:
         """Whether it runs without the installed bundle, which can't be read, and there is another one to go back to.
@@ -356,11 +356,11 @@ class PlayerSupervisor:
         self._looked_back_s = now_s
         return before_it(link.parent, self._installed, Starts.read(link.parent))
 
-    def _trouble(self, problem: Decision) -> None:
+    def _trouble(self, problem: Notice) -> None:
         if self._view.problem is None or self._view.problem.code != problem.code:
             self._tell(problem)
         if (outputs := self._view.outputs) is not None:
-            problem = replace(problem, reason=f"{problem.reason} {outputs.reason}",
+            problem = replace(problem, what=f"{problem.what} {outputs.what}",
                               remedy=f"{problem.remedy} {outputs.remedy}")  # fmt: skip
         self._view = replace(self._view, problem=problem, shown=None)
 
@@ -375,7 +375,7 @@ class PlayerSupervisor:
             raise
 
 
-def _outputs_problem(status: dict[str, Any]) -> Decision | None:
+def _outputs_problem(status: dict[str, Any]) -> Notice | None:
     """That outputs get no picture, although the player shows one."""
     if not (names := status.get("missing_outputs")):
         return None
@@ -384,14 +384,14 @@ def _outputs_problem(status: dict[str, Any]) -> Decision | None:
     else:
         what = f"The outputs {', '.join(names)} of this computer are off, or have another size."
     remedy = "Check the video cable, and that the projector is on. The picture comes back by itself."
-    return Decision(OUTPUT_GONE, what, remedy, "error")
+    return Notice(OUTPUT_GONE, what, remedy, Level.ERROR)
 
 
-_WITHOUT_BUNDLE: Final = Decision(
+_WITHOUT_BUNDLE: Final = Notice(
     "bundle-tried-again", "The installed bundle can't be read, and the player runs without it.",
-    "It is started again, and goes back to the bundle before.", "warning",
+    "It is started again, and goes back to the bundle before.", Level.WARNING,
 )  # fmt: skip
-_SKIPPED: Final = Decision(
+_SKIPPED: Final = Notice(
     "appearance-skipped", "An appearance could not be read from the bundle, and was left out.",
-    "Publish the appearances again.", "error",
+    "Publish the appearances again.", Level.ERROR,
 )  # fmt: skip

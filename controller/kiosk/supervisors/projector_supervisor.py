@@ -9,13 +9,13 @@ from typing import Final
 
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import pause_s
 from controller.optics.capture.acquire import DISK_CODES
 from controller.stage.rig.lamp_guard import LampGuard, fatal_faults, faulty
 from controller.stage.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceError, DeviceRefused
+from hal.notices import Level, Notice
 from hal.values import Power, ProjectorStatus
 
 ANSWER_S: Final = 5.0
@@ -53,11 +53,11 @@ class ProjectorSupervisor:
         self,
         name: str,
         open_guard: Callable[[Deadline], LampGuard],
-        tell: Callable[[Decision], object],
+        tell: Callable[[Notice], object],
         *,
         clock: Clock | None = None,
         asleep: Callable[[], bool] | None = None,
-        unfed: Callable[[], Decision | None] | None = None,
+        unfed: Callable[[], Notice | None] | None = None,
         deadline: Callable[[float], Deadline] = in_seconds,
         maybe_lit: bool = False,
         failed: int = 0,
@@ -141,7 +141,7 @@ class ProjectorSupervisor:
                 return
             status = guard.status(deadline=self._deadline(ANSWER_S))
             for notice in guard.notices():
-                self._tell(Decision(notice.code, notice.text, "", "warning"))
+                self._tell(Notice(notice.code, notice.text, "", Level.WARNING))
         except (DeviceError, VelaturaError) as error:
             self._silent(error)
             return
@@ -159,7 +159,7 @@ class ProjectorSupervisor:
                 self._darken(guard, status)
         except (DeviceError, VelaturaError) as error:
             self._answers_since_s = None
-            self._see(self._view.condition, status, _decision(error))
+            self._see(self._view.condition, status, Notice.of(error, level=Level.ERROR))
         self._keep_failed(guard)
 
     def _keep_failed(self, guard: LampGuard) -> None:
@@ -188,7 +188,7 @@ class ProjectorSupervisor:
         try:
             guard.close()
         except DeviceError as error:
-            self._tell(replace(_decision(error), level="warning"))
+            self._tell(replace(Notice.of(error, level=Level.ERROR), level=Level.WARNING))
 
     def _silent(self, error: DeviceError | VelaturaError) -> None:
         now_s = self._clock.now_s()
@@ -219,9 +219,9 @@ class ProjectorSupervisor:
         now_s = self._clock.now_s()
         self._reopen_at_s = now_s + pause_s(now_s - self._silent_since_s)
         self._struck_at_s = None
-        problem, unfed = _decision(error), self._unfed()
+        problem, unfed = Notice.of(error, level=Level.ERROR), self._unfed()
         if unfed is not None:
-            problem = replace(problem, reason=f"{problem.reason} {unfed.reason}", remedy=unfed.remedy)
+            problem = replace(problem, what=f"{problem.what} {unfed.what}", remedy=unfed.remedy)
         self._show(replace(self._view, condition=Condition.LOST, power=Power.UNKNOWN, maybe_lit=maybe_lit, looked=True,
                            problem=problem))  # fmt: skip
 
@@ -235,7 +235,7 @@ class ProjectorSupervisor:
             if status.power in (Power.ON, Power.WARMING):
                 guard.switch_off(deadline=self._deadline(guard.switch_s))
             self._struck_at_s = None
-            self._see(Condition.BROKEN, status, _decision(faulty(self.name, status)))
+            self._see(Condition.BROKEN, status, Notice.of(faulty(self.name, status), level=Level.ERROR))
             self._reopen_after_fault(guard)
         elif status.power is Power.ON or not guard.capabilities.power:
             self._struck_at_s, self._burning, self._faulty_since_s = None, True, None
@@ -270,7 +270,7 @@ class ProjectorSupervisor:
         self._see(Condition.LIGHTING, status, self._awaited)
 
     @property
-    def _awaited(self) -> Decision | None:
+    def _awaited(self) -> Notice | None:
         """The problem of a lamp that was switched on: what prevented it is over, what was wrong with it perhaps not."""
         problem = self._view.problem
         return None if problem is not None and problem.code == DISK_FULL else problem
@@ -290,7 +290,7 @@ class ProjectorSupervisor:
         except DeviceRefused as error:
             if error.code in ("lamp-cooling", "lamp-resting"):
                 return self._see(Condition.COOLING, status, self._view.problem)
-            return self._see(Condition.BROKEN, status, _decision(error))
+            return self._see(Condition.BROKEN, status, Notice.of(error, level=Level.ERROR))
         except DeviceError:
             # The projector may have received the command: without its answer, too, this is an attempt.
             if guard.use().strikes > strikes:
@@ -300,7 +300,7 @@ class ProjectorSupervisor:
             # The lamp counter can't be saved, so the lamp was not switched on.
             return self._see(Condition.BROKEN, status, _unrecorded(error))
         self._struck_at_s, self._warms, self._unanswered = now_s, False, False
-        self._tell(Decision("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
+        self._tell(Notice("lamp-struck", f"The lamp of projector {self.name} is being switched on."))
         return self._see(Condition.LIGHTING, status, self._awaited)
 
     def _one_more(self) -> bool:
@@ -312,18 +312,18 @@ class ProjectorSupervisor:
         if self._burning:
             self._burning = False
             self._failed_strikes += 1
-            self._tell(Decision(
+            self._tell(Notice(
                 "lamp-went-off", f"The lamp of projector {self.name} went off by itself (power: {status.power.value}).",
-                "It is switched on again when it has cooled. If this happens again, replace the lamp.", "warning",
+                "It is switched on again when it has cooled. If this happens again, replace the lamp.", Level.WARNING,
             ))  # fmt: skip
 
     def _strike_failed(self) -> None:
         self._struck_at_s = None
         self._failed_strikes += 1
         retried = self._failed_strikes < MOST_STRIKES
-        self._tell(Decision(
+        self._tell(Notice(
             "lamp-not-lit", f"The lamp of projector {self.name} was switched on, but gave no light.",
-            "It is tried again after its minimum off time." if retried else "It stays off now.", "warning",
+            "It is tried again after its minimum off time." if retried else "It stays off now.", Level.WARNING,
         ))  # fmt: skip
 
     def _light_limit_s(self, guard: LampGuard) -> float:
@@ -334,7 +334,7 @@ class ProjectorSupervisor:
     def _darken(self, guard: LampGuard, status: ProjectorStatus) -> None:
         self._struck_at_s, self._burning = None, False
         faults = status.power is Power.FAULT or bool(fatal_faults(status))
-        problem = _decision(faulty(self.name, status)) if faults else None
+        problem = Notice.of(faulty(self.name, status), level=Level.ERROR) if faults else None
         if not guard.capabilities.power:
             self._see(Condition.DARK, status, None)
         elif status.power in (Power.OFF, Power.COOLING):
@@ -351,7 +351,7 @@ class ProjectorSupervisor:
 
     # -- the view
 
-    def _see(self, condition: Condition, status: ProjectorStatus, problem: Decision | None) -> None:
+    def _see(self, condition: Condition, status: ProjectorStatus, problem: Notice | None) -> None:
         guard = self._guard
         assert guard is not None
         use = guard.use()
@@ -364,32 +364,28 @@ class ProjectorSupervisor:
         before, self._view = self._view, view
         code_before = before.problem.code if before.problem else ""
         if view.problem is not None and view.problem.code != code_before:
-            self._tell(replace(view.problem, level="error"))
+            self._tell(replace(view.problem, level=Level.ERROR))
         elif view.problem is None and before.problem is not None and code_before != DISK_FULL:
             # The disk itself says when it has room again.
-            self._tell(Decision("projector-back", f"Projector {self.name} works again ({view.condition.value})."))
+            self._tell(Notice("projector-back", f"Projector {self.name} works again ({view.condition.value})."))
 
 
-def _decision(error: DeviceError | VelaturaError) -> Decision:
-    return Decision(error.code, error.what, error.remedy, "error")
-
-
-def _same_code(one: Decision, other: Decision | None) -> bool:
+def _same_code(one: Notice, other: Notice | None) -> bool:
     return other is not None and one.code == other.code
 
 
-def _unrecorded(error: VelaturaError) -> Decision:
+def _unrecorded(error: VelaturaError) -> Notice:
     """The same for all projectors, because it is one problem, of the disk."""
     if error.code not in DISK_CODES:
-        return _decision(error)
+        return Notice.of(error, level=Level.ERROR)
     reason = "No lamp is switched on, because the disk of the stage is full or can't be written to."
-    return Decision(DISK_FULL, reason, "Free some space on the disk, and check that it is in order.", "error")
+    return Notice(DISK_FULL, reason, "Free some space on the disk, and check that it is in order.", Level.ERROR)
 
 
-def _unlit(name: str) -> Decision:
-    return Decision(
+def _unlit(name: str) -> Notice:
+    return Notice(
         "lamp-given-up",
         f"The lamp of projector {name} gave no light in {MOST_STRIKES} attempts and stays off.",
         "Replace the lamp, then press Open. Otherwise it is tried once more at the next opening or work.",
-        "error",
+        Level.ERROR,
     )

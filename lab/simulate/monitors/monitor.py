@@ -288,7 +288,7 @@ class KioskMonitor:
         player = service.player.view.problem
         if state is State.DEGRADED and player is not None:
             # What was wrong first may be over: people would look for it in the wrong place.
-            return player.reason in snapshot.reason
+            return player.what in snapshot.reason
         if state in (State.FAULT, State.DEGRADED) and snapshot.reason:
             return True
         if state is State.POWERING and self._world.scheduler.now_s - self.log.unlit_s < DARK_S:

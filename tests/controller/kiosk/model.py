@@ -11,7 +11,7 @@ from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Requ
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import Schedule
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.values import Turn
 from controller.run.state_machine import State
@@ -19,6 +19,7 @@ from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampRecord
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
+from hal.notices import Level, Notice
 from hal.values import Power, ProjectorStatus
 from tests.controller.stage.rig.lamp_model import RULES, Lamp, Shelf, World
 
@@ -57,7 +58,7 @@ class ModelPlayer:
     want: Showing | None = BLACK
     hung_at_s: float | None = None
     broken: bool = False
-    problem: Decision | None = None
+    problem: Notice | None = None
     shown: Showing | None = None
 
     @property
@@ -65,7 +66,7 @@ class ModelPlayer:
         if self.hung_at_s is not None and self.world.time_s - self.hung_at_s > 5.0:
             self.hung_at_s = None
         if self.broken or self.hung_at_s is not None:
-            return PlayerView(None, Decision("player-hung", "The player did not answer.", "It is started again."))
+            return PlayerView(None, Notice("player-hung", "The player did not answer.", "It is started again."))
         if self.want is not None:
             self.shown = self.want
         return PlayerView(self.shown, self.problem)
@@ -84,9 +85,9 @@ class ModelJobs:
     _ends_s: float = 0.0
     cancelled: bool = False
 
-    def refusal(self, request: Request) -> Decision | None:
+    def refusal(self, request: Request) -> Notice | None:
         if request.light and not self.camera:
-            return Decision("camera-missing", "There is no camera.", "Plug it in.", "error")
+            return Notice("camera-missing", "There is no camera.", "Plug it in.", Level.ERROR)
         return None
 
     def begin(self, request: Request) -> None:
@@ -108,13 +109,13 @@ class ModelJobs:
         how = "failed" if fails else "cancelled" if self.cancelled else "done"
         self.done.append((self.world.time_s, request.kind, how))
         if how != "done":
-            told = Decision(f"work-{how}", f"It was {how}.", "Try again.", "error")
+            told = Notice(f"work-{how}", f"It was {how}.", "Try again.", Level.ERROR)
             return Finished(request, told, failed=True)
         then: tuple[Request, ...] = ()
         if request.kind == "drift" and self.drifted:
             self.drifted = False
             then = (Request("quick", light=True, key=request.key),)
-        return Finished(request, Decision("work-done", "Done."), then=then)
+        return Finished(request, Notice("work-done", "Done."), then=then)
 
     def cancel(self) -> None:
         self.cancelled = True

@@ -23,9 +23,10 @@ from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.schedule import WEEKDAYS
 from controller.kiosk.service import Service
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.stage.doctor.values import Examination
 from controller.stage.sessions.check import check_stage
+from hal.notices import Notice
 from tests.controller.kiosk import contract
 from tests.controller.kiosk.contract import OTHER, PLAYING, RUN, Contract
 from tests.controller.kiosk.vase import graded_run, vase
@@ -72,7 +73,7 @@ def is_wanted(service: Service, name: str) -> bool:
 
 def endless(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
     cancel.wait(60)
-    return Finished(request, Decision("cancelled", "It was cancelled."), failed=True)
+    return Finished(request, Notice("cancelled", "It was cancelled."), failed=True)
 
 
 class TestStageKiosk(Contract):
@@ -85,7 +86,7 @@ class TestStageKiosk(Contract):
         (stage / "runs" / RUN / "geometry.json").write_text('{"camera": {"size_px": [240, 160]}}')
         install_two(stage)
         log = EventLog(stage / EventLog.FILE, durable=False)
-        log.add(Decision("first", "It begins."))
+        log.add(Notice("first", "It begins."))
         service = Service(check_stage(stage), log)
         # Work that only devices can do waits for its end instead; whether it may begin is the kiosk's own to say.
         runner = vars(service.jobs)

@@ -16,13 +16,16 @@ from controller.kiosk.interface import Job
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobReporter
 from controller.kiosk.store import runs
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.stage.services import compare as comparison_services
 from controller.stage.services import recalibrate as drift_services
+from hal.notices import Level, Notice
 from tests.controller.kiosk.vase import graded_run, vase
 
 ROWS = [{"name": "marble", "headline": 1.5}, {"name": "glass", "headline": 2.25}]
-CAMERA = Decision("camera-gone", "No photographs are possible without the camera. It is gone.", "Plug it in.", "error")
+CAMERA = Notice(
+    "camera-gone", "No photographs are possible without the camera. It is gone.", "Plug it in.", Level.ERROR
+)
 
 
 class Stage:
@@ -32,7 +35,7 @@ class Stage:
         self.folder = vase(folder)
         toml = folder / "stage.toml"
         toml.write_text(f"{toml.read_text()}\n{settings}")
-        self.missing: Decision | None = None
+        self.missing: Notice | None = None
         self.open = False
         self.log = EventLog(folder / EventLog.FILE)
         self.handlers = JobHandlers(
@@ -74,7 +77,7 @@ def kinds_after(stage: Stage, request: Request) -> list[str]:
 def test_what_was_asked_for_is_photographed_and_the_worst_is_told(tmp_path: Path, asked: list[tuple[str, ...]]) -> None:
     finished = Stage(tmp_path).do(Request("compare", light=True, arguments=("marble",)))
     assert asked == [("marble",)]
-    assert "The largest median colour difference of a whole object is 2.25, of glass" in finished.outcome.reason
+    assert "The largest median colour difference of a whole object is 2.25, of glass" in finished.outcome.what
 
 
 @pytest.mark.usefixtures("asked")

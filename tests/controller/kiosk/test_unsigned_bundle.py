@@ -9,9 +9,9 @@ from nacl.signing import SigningKey
 
 from controller.bundle.signing import write_public_key
 from controller.core.storage import runtime_folder
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.notices import Notice
 from tests.controller.play.conftest import OUTPUTS, write_noise
 
 
@@ -23,7 +23,7 @@ def test_the_keeper_tells_it_once_and_shows_it_as_long_as_it_plays(tmp_path: Pat
     settings = PlayerSettings(
         OUTPUTS, tmp_path / "f", bundle=bundle, trusted=[tmp_path / "ours.pub"], allow_unsigned=True
     )
-    told: list[Decision] = []
+    told: list[Notice] = []
     supervisor = PlayerSupervisor(runtime_folder(tmp_path), lambda plays: settings, told.append)
     try:
         for _ in range(5):

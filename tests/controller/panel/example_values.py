@@ -15,7 +15,6 @@ from controller.kiosk.interface import (
     Change,
     Changes,
     DeviceRow,
-    Finding,
     FoundDevice,
     KioskState,
     Lamp,
@@ -26,6 +25,7 @@ from controller.kiosk.interface import (
     ProjectorAim,
     Sharpness,
 )
+from hal.notices import Level, Notice
 from tests.controller.kiosk.vase import TEXT
 
 BORN = 1_767_600_000.0
@@ -87,10 +87,10 @@ def lamp_history() -> Sequence[LampDay]:
     return [*left, LampDay("right", days[0], 3120.0, 203)]
 
 
-def findings() -> Sequence[Finding]:
+def findings() -> Sequence[Notice]:
     return [
-        Finding("error", "Projector right", "It does not answer.", "Check its mains plug."),
-        Finding("warning", "Disk", "It is 91 % full.", "Remove old runs."),
+        Notice("", "It does not answer.", "Check its mains plug.", Level.ERROR, "Projector right"),
+        Notice.warning("", "It is 91 % full.", "Remove old runs.", about="Disk"),
     ]
 
 

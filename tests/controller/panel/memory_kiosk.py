@@ -24,7 +24,6 @@ from controller.kiosk.interface import (
     Computed,
     DriftCheck,
     EventLevel,
-    Finding,
     Fit,
     FoundDevice,
     Grade,
@@ -41,6 +40,7 @@ from controller.kiosk.interface import (
 from controller.kiosk.schedule import check
 from controller.kiosk.store import settings, targets
 from controller.stage.blender.job import BUILTIN
+from hal.notices import Notice
 from tests.controller.kiosk.vase import TEXT
 from tests.controller.panel import example_values as examples
 from tests.controller.panel.example_values import BORN, OUTPUTS
@@ -264,7 +264,7 @@ class MemoryKiosk(MemoryWork):
     def seen(self, number: int | None = None) -> None:
         self.change(failures=tuple(row for row in self._state.failures if number is not None and row.number > number))
 
-    def doctor(self) -> Sequence[Finding]:
+    def doctor(self) -> Sequence[Notice]:
         return examples.findings()
 
     def backup(self) -> Path:

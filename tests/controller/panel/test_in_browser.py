@@ -13,9 +13,10 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from controller.kiosk.interface import BundleIdentity, Finding, Grade
+from controller.kiosk.interface import BundleIdentity, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.pages.routes import NAVIGATION
+from hal.notices import Notice
 from tests.controller.panel.browser import SHELL, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import TOML, MemoryKiosk
 from tests.controller.panel.served import QUICK_HASH, Served, served
@@ -171,7 +172,7 @@ def test_hours_are_typed_saved_and_stand_in_the_calendar(fresh: Served, browser:
 class SlowDoctor(MemoryKiosk):
     """It examines for longer than a person waits before a white page."""
 
-    def doctor(self) -> Sequence[Finding]:
+    def doctor(self) -> Sequence[Notice]:
         time.sleep(3)
         return super().doctor()
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from controller.core.errors import WorkError
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.attached import AttachedPlayer
 from controller.play.control.launch import PlayerSettings, hello
+from hal.notices import Notice
 from tests.controller.play.conftest import OUTPUTS
 from tests.controller.play.wire import Wire
 from tests.waiting import wait_for
@@ -92,7 +92,7 @@ def test_other_settings_are_written_and_the_player_starts_with_them(starter: Sta
 
 
 def test_its_end_is_noticed_and_the_keeper_goes_on_with_the_next_one(starter: Starter, tmp_path: Path) -> None:
-    told: list[Decision] = []
+    told: list[Notice] = []
     wanted = settings(tmp_path)
 
     def attach(chosen: PlayerSettings) -> AttachedPlayer:

@@ -16,11 +16,12 @@ from controller.config.models import AlertsTable
 from controller.config.problems import KeyLines, Place
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.alerts import AGAIN_S, GATHER_S, PAUSE_S, Alerts
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 from tests.controller.kiosk.alerts.servers import MailServer, WebServer
 
 MAIL: dict[str, Any] = {"mail_to": ("care@example.org",), "mail_from": "kiosk@example.org", "mail_host": "127.0.0.1"}
-BROKEN = Decision("lamp-given-up", "The lamp of projector left stays off.", "Replace it.", "error")
+BROKEN = Notice("lamp-given-up", "The lamp of projector left stays off.", "Replace it.", Level.ERROR)
 
 
 class Hands:
@@ -51,10 +52,10 @@ class Alerting:
 def test_events_of_the_level_are_gathered_into_one_message_for_each_and_sent_once(tmp_path: Path) -> None:
     with MailServer() as mail, WebServer() as web:
         one = Alerting(tmp_path, **MAIL, mail_port=mail.port, mail_security="none", webhook=web.address)
-        one.log.add(Decision("state", "The stage is playing."))
+        one.log.add(Notice("state", "The stage is playing."))
         one.log.add(BROKEN)
         one.alerts.step()
-        one.log.add(Decision("camera-missing", "The camera is gone.", "Plug it in.", "error"))
+        one.log.add(Notice("camera-missing", "The camera is gone.", "Plug it in.", Level.ERROR))
         assert (mail.mails, web.posts) == ([], [])
         one.after(GATHER_S)
         one.after(GATHER_S)

@@ -27,8 +27,9 @@ from controller.kiosk.api.offline_dispatch import (
     status_text,
 )
 from controller.kiosk.interface import Aiming, DeviceRow, Job, JobStep, KioskState, LiveValue, ProjectorAim, Schedule
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.stage.sessions.run import stage_lock
+from hal.notices import Level, Notice
 from tests.controller.kiosk.vase import graded_run, vase
 
 HOSTILE = "left\x1b[2J\x1b]0;pwned\x07\r\u202e"
@@ -42,8 +43,8 @@ def test_a_stage_that_nobody_serves_answers_from_its_folder(tmp_path: Path) -> N
     stage = vase(tmp_path)
     run = graded_run(stage, "20260101-100000-calibrate", {"left": 0.0123})
     log = EventLog(stage / EventLog.FILE)
-    log.add(Decision("first", "One."))
-    log.add(Decision("second", "Two.", "Look.", "warning"))
+    log.add(Notice("first", "One."))
+    log.add(Notice("second", "Two.", "Look.", Level.WARNING))
     log.close()
     assert [row["code"] for row in call(stage, "events", after=1)] == ["second"]
     assert call(stage, "runs") == [run.name]

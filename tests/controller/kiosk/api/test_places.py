@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from controller.kiosk.api.finding import Examinations
 from controller.kiosk.api.snapshot import places
-from controller.kiosk.interface import Finding
+from hal.notices import Notice
 from tests.controller.kiosk.vase import graded_run, vase
 
 OBJECT_M = np.array([0.02, -0.03, 1.3])
@@ -95,9 +95,9 @@ def test_what_can_not_be_read_is_no_place(tmp_path: Path, text: str) -> None:
 
 def test_who_asks_while_the_doctor_searches_gets_the_same_answer_and_takes_no_port() -> None:
     inside, most, searches = 0, 0, 0
-    found = Finding("warning", "disk", "Full.", "Clean.")
+    found = Notice.warning("", "Full.", "Clean.", about="disk")
 
-    def search() -> list[Finding]:
+    def search() -> list[Notice]:
         nonlocal inside, most, searches
         inside, searches = inside + 1, searches + 1
         most = max(most, inside)

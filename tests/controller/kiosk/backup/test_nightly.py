@@ -13,7 +13,8 @@ from controller.config.models import BackupTable
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.backup import AGAIN_S, NightlyBackup, copied, places
 from controller.kiosk.store import archive
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Notice
 from tests.controller.kiosk.vase import TEXT, vase
 
 NIGHT_S = datetime(2026, 5, 4, 4, 31, tzinfo=UTC).timestamp()
@@ -91,11 +92,11 @@ class Elsewhere:
         self.stored: list[str] = []
         self.works = False
 
-    def store(self, source: Path, day: str, keep: int) -> Decision:
+    def store(self, source: Path, day: str, keep: int) -> Notice:
         if not self.works:
             raise WorkError("backup-unreachable", what="The server is off.", remedy="Switch it on.")
         self.stored.append(day)
-        return Decision("backup-made", "It was sent.")
+        return Notice("backup-made", "It was sent.")
 
 
 def test_a_place_that_fails_holds_up_no_other_and_is_tried_again(tmp_path: Path) -> None:

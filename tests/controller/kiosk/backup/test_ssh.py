@@ -43,7 +43,7 @@ def test_it_is_sent_and_read_back_the_oldest_go_and_another_machine_restores_it(
         for day in ("20260504", "20260505", "20260505", "20260506"):
             told = place.store(source, day, 2)
     assert told.code == "backup-made"
-    assert "sent to 127.0.0.1 and read back" in told.reason
+    assert "sent to 127.0.0.1 and read back" in told.what
     assert server.names() == ["holiday.tar.gz", "velatura-20260505.tar.gz", "velatura-20260506.tar.gz"]
     assert [path.name for path in source.parent.iterdir()] == [source.name], "what was read back is gone"
     blank = tmp_path / "blank"

@@ -53,7 +53,7 @@ def test_it_is_found_wherever_it_is_mounted(tmp_path: Path, label: str) -> None:
     assert caught.value.code == "backup-stick-not-mounted"
     computer.mount()
     told = place.store(source, "20260504", 2)
-    assert f"on the USB stick {label}" in told.reason
+    assert f"on the USB stick {label}" in told.what
     assert [path.name for path in computer.stick.iterdir()] == ["velatura-20260504.tar.gz"]
     archive.check_backup(computer.stick / "velatura-20260504.tar.gz")
 

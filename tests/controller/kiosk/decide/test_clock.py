@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.decide.clock import TrustedClock, beginning, synchronised
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Notice
 
 MAY = 1_778_000_000.0
 HOUR_S = 3600.0
@@ -133,7 +134,7 @@ def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
     cut = clocks.log.add(beginning(clocks.log))
     assert cut.level == "warning"
     assert "ended unexpectedly after 2026-05-05 17:03 UTC" in cut.text
-    clocks.log.add(Decision("service-ended", "The kiosk has stopped."))
+    clocks.log.add(Notice("service-ended", "The kiosk has stopped."))
     clocks.reboot(without_s=5 * HOUR_S)
     assert clocks.log.add(beginning(clocks.log)).text == "The kiosk is starting."
 

@@ -12,7 +12,8 @@ from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, ProjectorView, Request
 from controller.kiosk.decide.job_queue import JobQueue
 from controller.kiosk.decide.planner import Plan, Task
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 DRIFT = Task("drift-check 2026-05-05", "drift check", 0.0, 3600.0)
 LIT = ProjectorView("left", Condition.LIT, stable_left_s=0.0, looked=True)
@@ -31,13 +32,13 @@ PATIENCE_S = 100.0
 class Jobs:
     """Ends when it is told to."""
 
-    refused: Decision | None = None
+    refused: Notice | None = None
     running: Request | None = None
     done: list[Request] = field(default_factory=list)
     cancelled: int = 0
     result: Finished | None = None
 
-    def refusal(self, request: Request) -> Decision | None:
+    def refusal(self, request: Request) -> Notice | None:
         return self.refused
 
     def begin(self, request: Request) -> None:
@@ -47,7 +48,7 @@ class Jobs:
 
     def end(self, *then: Request, failed: bool = False) -> None:
         assert self.running is not None
-        self.result = Finished(self.running, Decision("ended", "It ended."), failed, then)
+        self.result = Finished(self.running, Notice("ended", "It ended."), failed, then)
 
     def finished(self) -> Finished | None:
         found, self.result = self.result, None
@@ -157,7 +158,7 @@ def test_kept_work_that_is_refused_now_is_told_and_not_begun(desk: Desk) -> None
     desk.queue.submit(PUBLISH)
     desk.begin()
     desk.begin_anew()
-    desk.jobs.refused = Decision("no-calibration", "There is no calibration.")
+    desk.jobs.refused = Notice("no-calibration", "There is no calibration.")
     assert desk.queue.go_on() == [(PUBLISH, False)]
     assert desk.begin() is None
 
@@ -186,7 +187,7 @@ def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(de
         desk.begin(LIT)
     desk.jobs.end()
     desk.queue.take_finished()
-    desk.jobs.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
+    desk.jobs.refused = Notice("camera-gone", "No camera.", "Plug it in.", Level.ERROR)
     with pytest.raises(WorkError) as caught:
         desk.queue.submit(QUICK)
     assert (caught.value.code, desk.told[-1]) == ("camera-gone", "camera-gone")
@@ -205,10 +206,10 @@ def test_only_what_failed_stays_in_sight(desk: Desk) -> None:
     assert not desk.log.failures
     desk.queue.submit(QUICK)
     desk.begin(LIT)
-    desk.jobs.result = Finished(QUICK, Decision("lost", "The camera is gone.", "Plug it in.", "error"), True)
+    desk.jobs.result = Finished(QUICK, Notice("lost", "The camera is gone.", "Plug it in.", Level.ERROR), True)
     desk.queue.take_finished()
     desk.queue.submit(QUICK)
-    desk.queue.drop(Decision("dark", "A lamp is not lit.", "", "error"))
+    desk.queue.drop(Notice("dark", "A lamp is not lit.", "", Level.ERROR))
     assert [row.code for row in desk.log.failures] == ["lost", "dark"]
 
 
@@ -260,7 +261,7 @@ def test_a_task_is_not_due_while_the_stage_plays_and_is_left_out_when_its_time_i
 
 
 def test_a_task_that_is_due_when_the_kiosk_starts_waits_for_the_camera(desk: Desk) -> None:
-    desk.jobs.refused = Decision(NOT_YET, "The camera is not connected yet.", "Wait for it.")
+    desk.jobs.refused = Notice(NOT_YET, "The camera is not connected yet.", "Wait for it.")
     desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     assert (desk.log.done(), desk.told) == (frozenset(), [])
     desk.jobs.refused = None
@@ -269,7 +270,7 @@ def test_a_task_that_is_due_when_the_kiosk_starts_waits_for_the_camera(desk: Des
 
 
 def test_a_task_that_can_not_be_done_is_left_out_with_the_reason(desk: Desk) -> None:
-    desk.jobs.refused = Decision("camera-gone", "No camera.", "Plug it in.", "error")
+    desk.jobs.refused = Notice("camera-gone", "No camera.", "Plug it in.", Level.ERROR)
     desk.queue.take_due(Plan(False, due=(DRIFT,)), playing=False)
     assert desk.log.done() == {DRIFT.key}
     (row,) = desk.log.after(0)

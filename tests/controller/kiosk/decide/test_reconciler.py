@@ -6,8 +6,8 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import BLACK, Request, Showing
-from controller.kiosk.store.event_log import Decision
 from controller.run.state_machine import State
+from hal.notices import Level, Notice
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import BUNDLE, NAMES, RULES, STEP_S, Kiosk
 
@@ -93,9 +93,9 @@ def test_a_dead_lamp_degrades_and_the_others_take_over_with_their_own_frames(kio
 
 def test_a_degraded_stage_says_what_is_wrong_now_not_what_was_wrong_first(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
-    kiosk.player.problem = Decision("player-not-started", "No X server answers.", "", "error")
+    kiosk.player.problem = Notice("player-not-started", "No X server answers.", "", Level.ERROR)
     kiosk.run_until(State.DEGRADED)
-    kiosk.player.problem = Decision("bundle-damaged", "The bundle is damaged.", "", "error")
+    kiosk.player.problem = Notice("bundle-damaged", "The bundle is damaged.", "", Level.ERROR)
     kiosk.run(2)
     assert kiosk.reconciler.machine.reason == "The bundle is damaged."
     kiosk.player.problem = None

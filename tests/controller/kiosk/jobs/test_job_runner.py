@@ -12,15 +12,15 @@ from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, JobRunner, run_name
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled
 from hal.errors import DeviceGone
-from hal.notices import Level
+from hal.notices import Level, Notice
 
 
 def well(request: Request, reporter: JobReporter, cancel: threading.Event) -> Finished:
-    return Finished(request, Decision("done", "It is done."))
+    return Finished(request, Notice("done", "It is done."))
 
 
 def raising(error: BaseException) -> JobHandler:

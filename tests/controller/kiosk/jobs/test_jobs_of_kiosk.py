@@ -24,10 +24,11 @@ from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
 from controller.kiosk.store import archive
 from controller.kiosk.store.accounts import Accounts, Role
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.run.progress import Silent
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Cancelled
+from hal.notices import Notice
 from tests.controller.kiosk.vase import graded_run, vase
 
 PNG = b"\x89PNG, as far as anybody looks"
@@ -150,7 +151,7 @@ def test_an_event_that_is_told_while_the_panel_is_brought_up_to_date_reaches_it(
     for _ in range(2):
         service.changed()
     found.subscribe(lambda: heard.append(found.events()[-1].number))
-    log.meanwhile = lambda: log.add(Decision("lamp-went-off", "The lamp went off."))
+    log.meanwhile = lambda: log.add(Notice("lamp-went-off", "The lamp went off."))
     for _ in range(2):
         service.changed()
     assert heard[-1:] == [log.number]

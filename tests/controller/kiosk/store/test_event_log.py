@@ -6,8 +6,9 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from controller.kiosk.store.event_log import MOST_FAILURES, Decision, EventLog
+from controller.kiosk.store.event_log import MOST_FAILURES, EventLog
 from controller.kiosk.store.log_file import MOST_DONE, MOST_EVENTS
+from hal.notices import Level, Notice
 from tests.controller.kiosk.store.full_disk import without_space
 
 
@@ -15,7 +16,7 @@ def test_what_failed_is_kept_until_it_was_seen_over_starts_and_nonsense(tmp_path
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for number in range(MOST_FAILURES + 2):
-        log.add_failure(Decision(f"failed-{number}", "It failed.", "Look.", "error"))
+        log.add_failure(Notice(f"failed-{number}", "It failed.", "Look.", Level.ERROR))
     assert len(log.failures) == MOST_FAILURES
     log.close()
     again = EventLog(path, durable=False)
@@ -32,13 +33,13 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
 ) -> None:
     path, is_full = tmp_path / EventLog.FILE, [True]
     log = EventLog(path, durable=False)
-    log.add(Decision("first", "One."))
+    log.add(Notice("first", "One."))
     log.keep("chosen", "glass")
     log.close()
 
     says = "disk I/O error", sqlite3.SQLITE_IOERR_SHMSIZE  # what SQLite says on a file system without space
     log = EventLog(path, durable=False, connect=without_space(is_full, path, says))
-    log.add(Decision("second", "Two."))
+    log.add(Notice("second", "Two."))
     log.mark_done("drift-check 2026-01-01", "drift-none")
     assert log.problem == "disk I/O error"
     assert ([row.code for row in log.after(0)], log.value("chosen")) == (["first", "second"], "glass")
@@ -55,7 +56,7 @@ def test_a_start_on_a_full_disk_forgets_nothing_and_what_it_is_told_is_written_w
 
 def test_a_start_on_a_full_disk_after_a_kill_knows_the_newest_events_too(tmp_path: Path) -> None:
     killed, left = EventLog(tmp_path / "before" / "events.sqlite"), tmp_path / "left" / "events.sqlite"
-    killed.add(Decision("last", "It was the last."))
+    killed.add(Notice("last", "It was the last."))
     killed.keep("override", "[true, false]")
     left.parent.mkdir()
     for end in ("", "-wal"):
@@ -85,7 +86,7 @@ def test_the_oldest_events_and_finished_tasks_are_deleted_and_no_more_than_that(
     file.close()
     log = EventLog(path, durable=False)
     for number in range(200):
-        log.add(Decision(f"after-{number}", "It went on."))
+        log.add(Notice(f"after-{number}", "It went on."))
     for done in (log.done(), _reopened(log).done()):
         assert (len(done), "every-night" in done, "drift-check 49" in done) == (MOST_DONE, True, False)
     with sqlite3.connect(path) as file:

@@ -14,7 +14,8 @@ import pytest
 
 from controller.kiosk.interface import EventRow
 from controller.kiosk.serving import journal_of
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Level, Notice
 
 DAEMON = Path("/lib/systemd/systemd-journald")
 TEXT = "The projector »left« is missing.\nPRIORITY=7"
@@ -38,9 +39,9 @@ kill $daemon
 
 def tell() -> None:
     log = EventLog(Path(sys.argv[1]) / "events.sqlite", also=journal_of("Head of a boy", os.environ))
-    log.add(Decision("opened", "The stage opens."))
-    log.add(Decision("sensor-dark", "The sensor sees nothing.", "Uncover it.", "warning"))
-    log.add_failure(Decision("projector-missing", TEXT, level="error"))
+    log.add(Notice("opened", "The stage opens."))
+    log.add(Notice("sensor-dark", "The sensor sees nothing.", "Uncover it.", Level.WARNING))
+    log.add_failure(Notice("projector-missing", TEXT, level=Level.ERROR))
     log.close()
 
 

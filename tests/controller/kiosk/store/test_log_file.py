@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
+from hal.notices import Notice
 from tests.controller.kiosk.store.full_disk import without_space
 
 
@@ -26,7 +27,7 @@ def written(path: Path, *codes: str, **kept: str) -> None:
     """A log of one event of each code, in this order, and with these values kept."""
     log = EventLog(path, durable=False)
     for code in codes:
-        log.add(Decision(code, "One. " * 50))
+        log.add(Notice(code, "One. " * 50))
     for name, value in kept.items():
         log.keep(name, value)
     log.close()
@@ -50,11 +51,11 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     monkeypatch.setattr(Path, "replace", replace)
     now_s = [0.0]
     log = EventLog(path, durable=False, connect=without_space(is_full, path), monotonic=lambda: now_s[0])
-    log.add(Decision("full", "Two."))
+    log.add(Notice("full", "Two."))
     is_full.clear()
     for _ in range(4):
         now_s[0] += 31.0
-        log.add(Decision("after", "Three."))
+        log.add(Notice("after", "Three."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -73,10 +74,10 @@ def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk
     log = EventLog(path, durable=False, connect=without_space(is_full), monotonic=lambda: now_s[0])
     newest = [row for row in log.after(0) if row.code == "before"]
     assert newest
-    log.add(Decision("full", "Two."))
+    log.add(Notice("full", "Two."))
     is_full.clear()
     now_s[0] += 31.0
-    log.add(Decision("after", "Three."))
+    log.add(Notice("after", "Three."))
     assert log.problem is None
     log.close()
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
@@ -90,12 +91,12 @@ def test_a_log_with_a_row_that_is_no_text_keeps_the_others_in_another_file(tmp_p
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for text in ("One.", "Two, the one that is damaged.", "Three."):
-        log.add(Decision("before", text))
+        log.add(Notice("before", text))
     log.close()
     at = path.read_bytes().index(b"the one that")
     damage(path, at, at + 12)
     log = EventLog(path, durable=False)
-    log.add(Decision("after", "Four."))
+    log.add(Notice("after", "Four."))
     log.close()
     assert len(list(path.parent.glob("*.damaged-*"))) == 1
     log = EventLog(path, durable=False)
@@ -109,7 +110,7 @@ def test_a_damaged_log_is_put_aside_and_another_is_begun(tmp_path: Path, length:
     written(path, *["before"] * 100)
     path.write_bytes(path.read_bytes()[:length])
     log = EventLog(path, durable=False)
-    log.add(Decision("after", "Two."))
+    log.add(Notice("after", "Two."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -125,7 +126,7 @@ def test_a_log_that_opens_but_takes_nothing_is_replaced_at_once(tmp_path: Path) 
     damage(path, 8 * 4096)
     log = EventLog(path, durable=False)
     for _ in range(3):
-        log.add(Decision("after", "Two."))
+        log.add(Notice("after", "Two."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -142,7 +143,7 @@ def test_a_log_that_is_damaged_in_its_middle_keeps_what_came_after(tmp_path: Pat
     content, middle = path.read_bytes(), 4096 * (path.stat().st_size // 8192)
     path.write_bytes(content[:middle] + b"\xa5" * 4096 + content[middle + 4096 :])
     log = EventLog(path, durable=False)
-    log.add(Decision("after", "Two."))
+    log.add(Notice("after", "Two."))
     log.close()
     log = EventLog(path, durable=False)
     codes = [row.code for row in log.after(0)]
@@ -158,7 +159,7 @@ def test_a_log_that_is_a_device_is_not_read_without_an_end(tmp_path: Path) -> No
     path.symlink_to("/dev/zero")
     log = EventLog(path)
     assert log.problem is not None
-    row = log.add(Decision("begins", "It begins."))
+    row = log.add(Notice("begins", "It begins."))
     assert [one.text for one in log.after(0)] == [row.text]
     log.close()
     assert path.is_symlink()
@@ -183,7 +184,7 @@ def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_f
     _torn_log(path)
     log = EventLog(path, durable=False)
     assert [row.code for row in log.after(0)] == ["second"]
-    log.add(Decision("third", "Three."))
+    log.add(Notice("third", "Three."))
     assert log.problem is None
     log.close()
     log = EventLog(path, durable=False)
@@ -199,7 +200,7 @@ def test_what_a_damaged_log_had_stays_however_many_events_follow_and_whatever_th
     # Numbers go on from the clock's; the oldest events are deleted when a number can be divided by 200.
     log = EventLog(path, durable=False, wall=lambda: 1_795_000_000.0)
     for number in range(450):
-        log.add(Decision(f"after-{number}", "It went on."))
+        log.add(Notice(f"after-{number}", "It went on."))
     log.close()
     log = EventLog(path, durable=False)
     assert [row.code for row in log.after(0)] == ["second", *(f"after-{number}" for number in range(450))]
@@ -210,7 +211,7 @@ def test_numbers_go_on_above_the_newest_event_where_only_the_number_is_gone(tmp_
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
     for number in range(3):
-        log.add(Decision(f"before-{number}", "One."))
+        log.add(Notice(f"before-{number}", "One."))
     log.close()
     with sqlite3.connect(path) as file:
         # As SQLite reads zeros in the page of the numbers.
@@ -218,7 +219,7 @@ def test_numbers_go_on_above_the_newest_event_where_only_the_number_is_gone(tmp_
     file.close()
     # The clock was lost, too.
     log = EventLog(path, durable=False, wall=lambda: 0.0)
-    log.add(Decision("after", "Two."))
+    log.add(Notice("after", "Two."))
     log.close()
     log = EventLog(path, durable=False)
     assert [row.code for row in log.after(0)] == ["before-0", "before-1", "before-2", "after"]
@@ -235,7 +236,7 @@ def test_a_kill_at_any_moment_of_replacing_a_damaged_log_loses_nothing_of_it(
     known = [f"before-{number}" for number in range(20)]
     log = EventLog(tmp_path / "sound" / "events.sqlite", durable=False)
     for code in known:
-        log.add(Decision(code, "One. " * 50))
+        log.add(Notice(code, "One. " * 50))
     log.mark_done("drift-check 2026-01-01", "drift-none")
     log.keep("override", "open")
     log.close()
@@ -283,7 +284,7 @@ def test_a_kill_at_any_moment_of_replacing_a_damaged_log_loses_nothing_of_it(
             moments += 1
         left[0] = 0
         again = EventLog(path, durable=False)
-        again.add(Decision("after", "Two."))
+        again.add(Notice("after", "Two."))
         again.close()
         again = EventLog(path, durable=False)
         assert [row.code for row in again.after(0)] == [*known, "after"], moment
@@ -298,7 +299,7 @@ def test_a_kill_at_any_moment_of_replacing_a_damaged_log_loses_nothing_of_it(
 def test_a_new_file_that_was_written_in_part_does_not_take_the_place_of_a_sound_log(tmp_path: Path) -> None:
     path = tmp_path / EventLog.FILE
     log = EventLog(path, durable=False)
-    log.add(Decision("before", "One."))
+    log.add(Notice("before", "One."))
     log.close()
     path.with_suffix(".new").write_bytes(b"\xa5" * 5000)
     log = EventLog(path, durable=False)

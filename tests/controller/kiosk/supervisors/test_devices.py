@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.service import Service
-from controller.kiosk.store.event_log import Decision, EventLog
+from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors import projector_supervisor
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
@@ -21,6 +21,7 @@ from controller.stage.rig.lamp_ledger import LampFile, LampRecord
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
+from hal.notices import Notice
 from hal.registry import Driver, Drivers
 from hal.values import ProjectorCapabilities, ProjectorStatus
 from tests.controller.stage.sessions.run_models import Models, QuickLamp
@@ -33,7 +34,7 @@ def models(tmp_path: Path) -> Models:
 
 @pytest.fixture
 def devices(models: Models, tmp_path: Path) -> Iterator[Devices]:
-    told: list[Decision] = []
+    told: list[Notice] = []
     found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, told.append)
     found.camera.step()
     for supervisor in found.projectors:
@@ -103,7 +104,7 @@ def test_a_device_that_opens_after_its_keeper_was_closed_is_let_go_of() -> None:
 def test_devices_that_fail_to_close_or_raise_anything_are_told_and_the_others_go_on(
     models: Models, tmp_path: Path
 ) -> None:
-    told: list[Decision] = []
+    told: list[Notice] = []
     models.unclosable = {"A"}
     models.odd_in = "The lamp hours of projector left stay unknown."
     found = Devices(check_stage(models.folder, drivers=models.drivers), tmp_path, told.append)
@@ -117,9 +118,9 @@ def test_devices_that_fail_to_close_or_raise_anything_are_told_and_the_others_go
     assert right.looked
     found.close()
     assert not models.lamps["B"].open
-    assert [one.reason for one in told if one.code == "projector-answer-odd"] == [models.odd_in]
+    assert [one.what for one in told if one.code == "projector-answer-odd"] == [models.odd_in]
     faults = [decision for decision in told if decision.code == "driver-fault"]
-    assert any("projector left raised OSError" in fault.reason for fault in faults)
+    assert any("projector left raised OSError" in fault.what for fault in faults)
 
 
 def test_an_opening_before_a_projector_was_reached_counts_on_from_the_file_of_the_lamps(

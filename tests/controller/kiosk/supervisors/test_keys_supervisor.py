@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.keys_supervisor import KeysSupervisor
 from controller.run.state_machine import State
 from controller.stage.rig.key_panel import KeyService
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
+from hal.notices import Notice
 from hal.values import DeviceIdentity, PanelCapabilities
 
 
@@ -51,7 +51,7 @@ class Panel:
 
 class Kept:
     def __init__(self) -> None:
-        self.panel, self.told, self.done = Panel(), list[Decision](), queue.SimpleQueue[str]()
+        self.panel, self.told, self.done = Panel(), list[Notice](), queue.SimpleQueue[str]()
         self.meanwhile: Callable[[], None] = lambda: None
         presses = tuple(self._press(name) for name in ("play", "stop", "recalibrate"))
         self.supervisor = KeysSupervisor("model", self._opened, presses, lambda: State.PLAYING, self.told.append)  # type: ignore[arg-type]

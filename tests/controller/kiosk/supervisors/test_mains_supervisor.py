@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import pytest
 
 from controller.kiosk.interface import LiveValue
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
@@ -18,6 +17,7 @@ from controller.stage.rig.power import Circuit
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Device
+from hal.notices import Notice
 from hal.values import DeviceIdentity
 from tests.controller.stage.rig.lamp_model import Lamp, Shelf, World
 
@@ -58,7 +58,7 @@ class Mains:
     """Two projectors, each on the relay of a board of its own, in virtual time."""
 
     world: World = field(default_factory=World)
-    told: list[Decision] = field(default_factory=list)
+    told: list[Notice] = field(default_factory=list)
     shelf: Shelf = field(default_factory=Shelf)
 
     def __post_init__(self) -> None:
@@ -270,7 +270,7 @@ class Sensor:
 
 
 def test_a_device_is_opened_again_less_and_less_often_and_told_of_once_a_trouble() -> None:
-    world, sensor, told = World(), Sensor(opens=False), list[Decision]()
+    world, sensor, told = World(), Sensor(opens=False), list[Notice]()
 
     def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
         return (LiveValue("Model", device.identity(deadline=deadline).model),)

@@ -11,12 +11,12 @@ import numpy as np
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.interfaces import BLACK
 from controller.kiosk.store.accounts import Accounts
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.on_screen_text import notice
 from controller.kiosk.supervisors.player_supervisor import NOTICE_TURN_S, PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 from controller.play.frames import FrameSet, OutputSize
 from controller.run.state_machine import State
+from hal.notices import Notice
 from tests.controller.kiosk.model import NAMES, Kiosk
 from tests.controller.panel.served import QUICK_HASH
 
@@ -38,7 +38,7 @@ def shown(frames: Path) -> FrameSet:
 
 
 def test_the_player_shows_the_lines_on_one_output_after_the_other_and_black_when_they_are_gone(tmp_path: Path) -> None:
-    told: list[Decision] = []
+    told: list[Notice] = []
     frames, now_s = tmp_path / "outputs.frame", 0.0
     settings = PlayerSettings([(one.name, one.width_px, one.height_px) for one in OUTPUTS], frames)
     supervisor = PlayerSupervisor(

@@ -16,9 +16,9 @@ from controller.bundle.signing import Trust, write_public_key
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.interfaces import Showing
 from controller.kiosk.store.bundle_store import BundleStore, BundleWatch
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.notices import Notice
 from tests.controller.play.conftest import OUTPUTS, write_noise
 from tests.waiting import wait_for
 
@@ -46,7 +46,7 @@ def test_a_player_that_dies_soon_after_its_start_on_a_damaged_bundle_comes_back_
         install(write_noise(tmp_path / "b.vel", key=key, revision=revision), slots, trusted=[public])
     newest = current(slots)
     assert newest is not None
-    store, told = BundleStore(tmp_path, Trust((public,))), list[Decision]()
+    store, told = BundleStore(tmp_path, Trust((public,))), list[Notice]()
     watch = BundleWatch(store, told.append)
 
     def settings(with_bundle: bool) -> PlayerSettings:
@@ -84,7 +84,7 @@ def test_a_player_that_dies_soon_after_its_start_on_a_damaged_bundle_comes_back_
 
 def test_an_only_bundle_that_can_not_be_read_is_a_problem_as_long_as_it_is_so(tmp_path: Path) -> None:
     key = SigningKey(bytes(range(32)))
-    public, slots, told = bytes(key.verify_key), tmp_path / "bundles", list[Decision]()
+    public, slots, told = bytes(key.verify_key), tmp_path / "bundles", list[Notice]()
     install(write_noise(tmp_path / "b.vel", key=key, revision=1), slots, trusted=[public])
     only = current(slots)
     assert only is not None

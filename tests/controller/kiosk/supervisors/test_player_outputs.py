@@ -8,9 +8,9 @@ import numpy as np
 
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.interfaces import Showing
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.notices import Notice
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import noise
@@ -22,7 +22,7 @@ WHERE = dict(zip(("P1", "P2", "P3"), CONNECTORS, strict=True))
 
 def test_an_output_that_is_away_is_told_once_and_the_others_play_until_it_is_back(tmp_path: Path) -> None:
     bundle = write_noise(tmp_path / "b.vel", outputs=SIZES)
-    told: list[Decision] = []
+    told: list[Notice] = []
     settings = PlayerSettings(SIZES, None, bundle=bundle, allow_unsigned=True, where=WHERE)
     with running_server(tmp_path) as server:
         supervisor = PlayerSupervisor(runtime_folder(tmp_path), lambda _: settings, told.append)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from controller.kiosk.decide.interfaces import BLACK, Showing
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.notices import Notice
 from hal.player import PlayerClient
 
 MARBLE = Showing(Path("b.vel"), "marble")
@@ -23,7 +23,7 @@ class Computer:
 
     def __init__(self, loses: Callable[[int], bool]) -> None:
         self.loses, self.now_s = loses, 0.0
-        self.told: list[Decision] = []
+        self.told: list[Notice] = []
         self.ended_s: list[float] = []
         self.process = Player(self)
         self.supervisor = PlayerSupervisor(

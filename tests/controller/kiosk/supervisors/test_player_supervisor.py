@@ -9,10 +9,10 @@ from typing import Any, cast
 import pytest
 
 from controller.kiosk.decide.interfaces import Showing
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors import player_supervisor as player_keeper
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
+from hal.notices import Notice
 from hal.player import PlayerClient
 
 
@@ -82,7 +82,7 @@ class ReadyProcess(ModelProcess):
 
 
 def test_an_output_without_a_picture_is_told_beside_a_damaged_bundle(tmp_path: Path) -> None:
-    wire, told, now_s = Refusing(), list[Decision](), [0.0]
+    wire, told, now_s = Refusing(), list[Notice](), [0.0]
     supervisor = PlayerSupervisor(
         tmp_path, lambda _: PlayerSettings([("P1", 8, 8), ("P2", 8, 8)], tmp_path / "outputs.frame"), told.append,
         monotonic=lambda: now_s[0], launch=lambda runtime, settings: cast("Any", ReadyProcess(runtime, settings)),
@@ -102,12 +102,12 @@ def test_an_output_without_a_picture_is_told_beside_a_damaged_bundle(tmp_path: P
     assert problem is not None
     assert outputs is not None
     assert problem.code == "bundle-damaged"
-    assert "The bundle is damaged." in problem.reason
-    assert "P2" in problem.reason
+    assert "The bundle is damaged." in problem.what
+    assert "P2" in problem.what
     assert "cable" in problem.remedy
     supervisor.step()
     assert [one.code for one in told].count("output-gone") == 1
     wire.missing = []
     supervisor.step()
     assert supervisor.view.problem is not None
-    assert supervisor.view.problem.reason == "The bundle is damaged."
+    assert supervisor.view.problem.what == "The bundle is damaged."

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from controller.kiosk.decide.interfaces import DISK_FULL, Condition
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.projector_supervisor import (
     LIGHT_MARGIN_S,
     MOST_STRIKES,
@@ -18,6 +17,7 @@ from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile, LampLedger, LampRecord
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceTimeout, ProtocolError
+from hal.notices import Level, Notice
 from hal.values import Power, ProjectorStatus
 from tests.controller.kiosk.model import FragileLamp
 from tests.controller.stage.rig.lamp_model import RULES, Shelf, World
@@ -107,7 +107,7 @@ class Kept:
         self.world = World()
         self.lamp = kind(self.world)
         self.there = True
-        self.told: list[Decision] = []
+        self.told: list[Notice] = []
         self.file, self.shelf = file, Shelf()
         self.begin_anew()
 
@@ -424,8 +424,8 @@ def test_without_mains_it_counts_as_dark_and_nobody_asks_it() -> None:
 
 def test_a_projector_behind_a_relay_board_that_is_away_says_so(kept: Kept) -> None:
     kept.there = False
-    board = Decision("hid-unplugged", "No relay board is plugged in.", "Check its hub.", "error")
-    fed: list[Decision] = []
+    board = Notice("hid-unplugged", "No relay board is plugged in.", "Check its hub.", Level.ERROR)
+    fed: list[Notice] = []
     supervisor = ProjectorSupervisor(
         "left", kept._opened, kept.told.append, clock=kept.world, unfed=lambda: fed[0] if fed else None
     )

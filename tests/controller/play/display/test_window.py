@@ -18,9 +18,9 @@ import numpy.typing as npt
 import pytest
 
 from controller.kiosk.decide.interfaces import Showing
-from controller.kiosk.store.event_log import Decision
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerProcess, PlayerSettings
+from hal.notices import Notice
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
 from tests.waiting import meanwhile, wait_for
 
@@ -208,7 +208,7 @@ def test_a_second_player_on_the_same_server_is_refused_and_may_come_when_the_fir
 ) -> None:
     second = tmp_path / "second"
     second.mkdir()
-    told: list[Decision] = []
+    told: list[Notice] = []
     settings = PlayerSettings(outputs, None, bundle=bundle, allow_unsigned=True)
     supervisor = PlayerSupervisor(second, lambda _: settings, told.append)
     supervisor.want = Showing(bundle, "3")
@@ -219,7 +219,7 @@ def test_a_second_player_on_the_same_server_is_refused_and_may_come_when_the_fir
             supervisor.step()
             problem = supervisor.view.problem
             assert problem is not None
-            assert f"Another player (process {first.pid}) already shows its pictures on this X server" in problem.reason
+            assert f"Another player (process {first.pid}) already shows its pictures on this X server" in problem.what
             np.testing.assert_array_equal(framebuffer.picture(), spanned(noise(outputs, 2), outputs))
             first.kill()
 
