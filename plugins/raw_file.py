@@ -13,15 +13,18 @@ import numpy as np
 from hal.errors import DeviceRefused, PluginError
 from hal.registry import setting
 
-_SHORT, _LONG, _SRATIONAL, _ASCII, _BYTE = 3, 4, 10, 2, 1
-_CODES: Final = {_SHORT: "H", _LONG: "I", _SRATIONAL: "i"}
-_HEADER: Final = 8
+BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+"""Types of TIFF 6.0."""
+_CODES: Final = {SHORT: "H", LONG: "I", RATIONAL: "I", SRATIONAL: "i"}
+HEADER: Final = 8
+"""Bytes before the first directory."""
 _D65: Final = 21
 _PATTERNS: Final = {"RG": (0, 1, 1, 2), "GR": (1, 0, 2, 1), "GB": (1, 2, 0, 1), "BG": (2, 1, 1, 0)}
 _NAMES: Final = re.compile(
     r"(?:Bayer(?P<bayer>RG|GR|GB|BG)|(?P<mono>Mono)|(?P<rgb>RGB))(?P<bits>8|10|12|14|16)", re.ASCII
 )
 Entry = tuple[int, bytes | Sequence[int]]
+"""Type and values of a tag; numerator and denominator of each rational number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,61 +119,73 @@ def encoded(
             65535 / max(1, full - levels.black_level)
         )
         samples = np.minimum(np.rint(scaled), 65535).astype("<u2")
-        entries = {262: (_SHORT, [2 if pixels.channels == 3 else 1])}
-    return _file(entries, samples.tobytes(), columns, rows, pixels.channels)
+        entries = {262: (SHORT, [2 if pixels.channels == 3 else 1])}
+    return tiff_file(entries, samples.tobytes(), columns, rows, pixels.channels)
 
 
 def _mosaic(pixels: PixelFormat, names: tuple[str, str], levels: Levels) -> dict[int, Entry]:
     maker, name = (text.encode("ascii", "replace") + b"\0" for text in names)
     entries: dict[int, Entry] = {
-        262: (_SHORT, [32803]),  # colour filter array
-        271: (_ASCII, maker),
-        272: (_ASCII, name),
-        33421: (_SHORT, [2, 2]),
-        33422: (_BYTE, bytes(pixels.bayer)),
-        50706: (_BYTE, bytes((1, 4, 0, 0))),
-        50708: (_ASCII, name),
-        50714: (_LONG, [levels.black_level]),
-        50717: (_LONG, [(1 << pixels.bits) - 1]),
+        262: (SHORT, [32803]),  # colour filter array
+        271: (ASCII, maker),
+        272: (ASCII, name),
+        33421: (SHORT, [2, 2]),
+        33422: (BYTE, bytes(pixels.bayer)),
+        50706: (BYTE, bytes((1, 4, 0, 0))),
+        50708: (ASCII, name),
+        50714: (LONG, [levels.black_level]),
+        50717: (LONG, [(1 << pixels.bits) - 1]),
     }
     if levels.matrix:
         entries[50721] = (
-            _SRATIONAL,
+            SRATIONAL,
             [part for value in levels.matrix for part in (round(value * 1_000_000), 1_000_000)],
         )
-        entries[50778] = (_SHORT, [_D65])
+        entries[50778] = (SHORT, [_D65])
     return entries
 
 
-def _file(special: Mapping[int, Entry], strip: bytes, columns: int, rows: int, channels: int) -> bytes:
-    def entries(strip_at: int) -> dict[int, Entry]:
+def tiff_file(
+    special: Mapping[int, Entry],
+    strip: bytes,
+    columns: int,
+    rows: int,
+    channels: int,
+    exif: Mapping[int, Entry] | None = None,
+) -> bytes:
+    """A TIFF with one strip of samples of 16 bits; ``special``: tags besides those of its layout; ``exif``: Exif's."""
+
+    def entries(strip_at: int, exif_at: int) -> dict[int, Entry]:
         return {
-            254: (_LONG, [0]),
-            256: (_LONG, [columns]),
-            257: (_LONG, [rows]),
-            258: (_SHORT, [16] * channels),
-            259: (_SHORT, [1]),
-            273: (_LONG, [strip_at]),
-            274: (_SHORT, [1]),
-            277: (_SHORT, [channels]),
-            278: (_LONG, [rows]),
-            279: (_LONG, [len(strip)]),
+            254: (LONG, [0]),
+            256: (LONG, [columns]),
+            257: (LONG, [rows]),
+            258: (SHORT, [16] * channels),
+            259: (SHORT, [1]),
+            273: (LONG, [strip_at]),
+            274: (SHORT, [1]),
+            277: (SHORT, [channels]),
+            278: (LONG, [rows]),
+            279: (LONG, [len(strip)]),
+            **({} if exif is None else {34665: (LONG, [exif_at])}),
             **special,
         }
 
-    strip_at = (_HEADER + len(_folder(entries(0))) + 15) // 16 * 16
-    head = struct.pack("<2sHI", b"II", 42, _HEADER) + _folder(entries(strip_at))
+    exif_at = HEADER + len(tiff_directory(entries(0, 0), HEADER))
+    behind = b"" if exif is None else tiff_directory(exif, exif_at)
+    strip_at = (exif_at + len(behind) + 15) // 16 * 16
+    head = struct.pack("<2sHI", b"II", 42, HEADER) + tiff_directory(entries(strip_at, exif_at), HEADER) + behind
     return head.ljust(strip_at, b"\0") + strip
 
 
-def _folder(entries: Mapping[int, Entry]) -> bytes:
-    """A TIFF directory, with its longer values behind it."""
-    values_at = _HEADER + 2 + 12 * len(entries) + 4
+def tiff_directory(entries: Mapping[int, Entry], at: int) -> bytes:
+    """A TIFF directory that begins at offset ``at``, with its longer values behind it."""
+    values_at = at + 2 + 12 * len(entries) + 4
     fixed, values = struct.pack("<H", len(entries)), b""
     for tag in sorted(entries):
         kind, content = entries[tag]
         packed = content if isinstance(content, bytes) else struct.pack(f"<{len(content)}{_CODES[kind]}", *content)
-        count = len(content) // (2 if kind == _SRATIONAL else 1)
+        count = len(content) // (2 if kind in (RATIONAL, SRATIONAL) else 1)
         field = packed.ljust(4, b"\0")
         if len(packed) > 4:
             field = struct.pack("<I", values_at + len(values))

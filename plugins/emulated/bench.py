@@ -258,9 +258,7 @@ def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
     # The world spends the exposure time itself, since it must know what is visible meanwhile.
     return EmulatedPtpCamera(
         world.expose,
-        host=HOST,
-        command_port=truth.command_port,
-        event_port=truth.event_port,
+        ports=(truth.command_port, truth.event_port),
         names=CameraNames(serial=truth.serial_number),
         time_scale=0.0,
         raw=truth.raw,

@@ -26,8 +26,8 @@ from typing import Final, Generic, TypeVar
 from hal.serial_link import PtyLink
 from hal.tape import Track
 from hal.transcript import Direction, Entry
-from plugins.emulated.cameras.body import CameraFaults, CameraNames, EmulatedBody
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.cameras.body import CameraNames, EmulatedBody
+from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome
 from plugins.emulated.core.servers import BackgroundDevice, TcpServer
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
@@ -219,8 +219,7 @@ class TapeBody(EmulatedBody):
     """See ``EmulatedBody``. ``unknown``: operations that the tape does not have, refused as not supported."""
 
     def __init__(self, track: Track) -> None:
-        super().__init__(no_files, names=CameraNames("", "Camera of a tape", ""), time_scale=0.0, card_bytes=0,
-                         faults=CameraFaults())  # fmt: skip
+        super().__init__(no_files, names=CameraNames("", "Camera of a tape", ""))
         done = _operations(track.entries)
         self.unknown: list[int] = []
         self._replay = Replay([Exchange((one.code, one.parameters, one.sent), one) for one in done], acts=_acts)
@@ -308,7 +307,7 @@ def serve_tape(
     count = 0
     for track in merged(tracks):
         if track.kind == "ptp":
-            camera = stack.enter_context(EmulatedPtpCamera(no_files, body=TapeBody(track)))
+            camera = stack.enter_context(PtpIpCamera(TapeBody(track)))
             served(track.address, "camera", camera.address)
         elif track.kind == "serial":
             port = folder / (re.sub(r"[^A-Za-z0-9.-]+", "-", track.address) or "port")

@@ -108,7 +108,7 @@ class NetworkBench:
         self.camera = EmulatedPtpCamera(self._expose, flavour=flavour, time_scale=0.0)  # type: ignore[arg-type]
 
     def _expose(self, shot: ShotSettings) -> ShotFiles:
-        return numbered_files(self.camera.exposures, SIZE, shot)
+        return numbered_files(self.camera.body.exposures, SIZE, shot)
 
     def connect(self) -> Callable[[Any], PtpLink]:
         address = PtpIpAddress.parse(self.camera.address)
@@ -121,7 +121,7 @@ class NetworkBench:
         return float(getattr(self.camera.faults, name))
 
     def exposures(self) -> int:
-        return self.camera.exposures
+        return self.camera.body.exposures
 
 
 class UsbBench:
@@ -142,7 +142,7 @@ class UsbBench:
         return float(self._bus.get("camera", f"camera_faults.{name}"))
 
     def exposures(self) -> int:
-        return int(self._bus.get("camera", "exposures"))
+        return int(self._bus.get("camera", "body.exposures"))
 
 
 @contextmanager

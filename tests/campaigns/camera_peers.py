@@ -92,11 +92,11 @@ def network_peer(flavour: Flavour) -> Iterator[Peer]:
     made: list[EmulatedPtpCamera] = []
 
     def expose(shot: ShotSettings) -> ShotFiles:
-        return numbered_files(made[0].exposures, SIZE, shot)
+        return numbered_files(made[0].body.exposures, SIZE, shot)
 
     made.append(EmulatedPtpCamera(expose, flavour=flavour, time_scale=_TIME_SCALE))
     with _folder() as folder, made[0] as camera:
-        yield Peer(camera.address, folder, lambda: camera.exposures, {})
+        yield Peer(camera.address, folder, lambda: camera.body.exposures, {})
 
 
 @contextmanager
@@ -104,7 +104,7 @@ def usb_peer(flavour: Flavour) -> Iterator[Peer]:
     """The camera on the emulated USB bus, which gphoto2's own libusb finds."""
     with _folder() as folder, _folder() as bus_folder, UsbBusProcess(bus_folder) as bus:
         bus.add("camera", "camera", flavour=flavour, size=SIZE, time_scale=_TIME_SCALE)
-        yield Peer("usb:", folder, lambda: int(bus.get("camera", "exposures")), environment(bus_folder))
+        yield Peer("usb:", folder, lambda: int(bus.get("camera", "body.exposures")), environment(bus_folder))
 
 
 @contextmanager

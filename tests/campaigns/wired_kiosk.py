@@ -132,7 +132,7 @@ class WiredKiosk:
         self.well: dict[str, dict[str, Any]] = {}
         self._damages = 0
         self.camera = EmulatedPtpCamera(
-            self._world.expose, command_port=truth.camera.command_port, event_port=truth.camera.event_port,
+            self._world.expose, ports=(truth.camera.command_port, truth.camera.event_port),
             names=CameraNames(serial=truth.camera.serial_number), time_scale=0.0, raw=truth.camera.raw,
         )  # fmt: skip
         self._camera = truth.camera

@@ -17,8 +17,8 @@ from controller.optics.capture.raw import develop
 from plugins.emulated.core.truth import FOLDER, BenchTruth, read_truth
 from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
-from plugins.emulated.optics.indirect.transfers import Indirect
-from plugins.emulated.optics.light_cache import kept_folder
+from plugins.emulated.optics.indirect.transfers import IndirectTransfers
+from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import SIGMA_STEP_PX, Samples, directions, samples_of
 from plugins.emulated.optics.render import Renderer, response
@@ -40,9 +40,9 @@ class Truth:
         set_up = read_truth(stage)
         self.bench: BenchTruth = bumped(set_up, read_bumps(stage / BUMPS, set_up)) if bumps else set_up
         self.stage_object: StageObject = object_of(stage, self.bench.object)
-        kept = kept_folder(stage / FOLDER)
+        kept = light_folder(stage / FOLDER)
         self.samples = samples_of(set_up, self.stage_object, kept, lambda share: None)
-        indirect = Indirect(self.stage_object, kept)
+        indirect = IndirectTransfers(self.stage_object, kept)
         transfer = indirect.transfer(set_up, self.samples.pixels, lambda share: None, keep=True)
         self._renderer = Renderer(self.bench, self.samples, transfer)
         self._direct = Renderer(*_direct_alone(self.bench, self.samples))

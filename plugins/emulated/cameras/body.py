@@ -27,6 +27,7 @@ from plugins.emulated.cameras.wire import (
     u16s,
     u32s,
 )
+from plugins.emulated.core.faults import FaultCounts
 from plugins.emulated.core.shot import Expose, ShotSettings
 
 STORAGE: Final = 0x0001_0001
@@ -57,7 +58,7 @@ class Stored:
 class Card:
     """DCIM/100VELA and what was photographed since; ``waiting`` holds what the computer has not fetched yet."""
 
-    capacity: int
+    capacity: int = 4 << 30
     objects: dict[int, Stored] = field(default_factory=dict)
     waiting: dict[int, Stored] = field(default_factory=dict)
     _handles: count[int] = field(default_factory=lambda: count(1))
@@ -116,7 +117,7 @@ class CameraNames:
 
 
 @dataclass(slots=True)
-class CameraFaults:
+class CameraFaults(FaultCounts):
     """Knobs, turned at any time. Counts go down as they are used; switches stay until they are turned back.
 
     ``busy``: that many requests to set or release are answered with busy; ``drop_before_exposure``,
@@ -145,13 +146,6 @@ class CameraFaults:
     space_refused: bool = False
     late_events_s: float = 0.0
 
-    def take(self, name: str) -> bool:
-        """Use up one of a count; False when none is left."""
-        left: int = getattr(self, name)
-        if left > 0:
-            setattr(self, name, left - 1)
-        return left > 0
-
 
 @dataclass(slots=True)
 class ExposedPicture:
@@ -163,8 +157,18 @@ class ExposedPicture:
 
 
 class EmulatedBody:
-    """Answers operations; families override ``vendor`` and the hooks. All of it under ``self.lock``."""
+    """Answers operations; families override ``vendor`` and the hooks. All of it under ``self.lock``.
 
+    Parameters
+    ----------
+    expose : makes the files of an exposure; called from the shutter's own thread
+    names : identity; ``usual_names`` unless given
+    time_scale : real seconds for each second of exposure
+    raw : False for a camera that makes JPEG files only
+    faults : knobs that may be turned while it runs
+    """
+
+    usual_names = CameraNames()
     operations: tuple[int, ...] = ()
     with_data: tuple[int, ...] = (0x1016, 0x9110)
     """Operations whose data come from the computer."""
@@ -177,13 +181,21 @@ class EmulatedBody:
     _common = (0x1001, 0x1002, 0x1003, 0x1004, 0x1005, 0x1006, 0x1007, 0x1008, 0x1009, 0x100A, 0x100B, 0x1014, 0x1015)
 
     def __init__(
-        self, expose: Expose, *, names: CameraNames, time_scale: float, card_bytes: int, faults: CameraFaults
+        self,
+        expose: Expose,
+        *,
+        names: CameraNames | None = None,
+        time_scale: float = 1.0,
+        raw: bool = True,
+        faults: CameraFaults | None = None,
     ) -> None:
         self.lock = threading.RLock()
-        self.faults = faults
-        self.names = names
+        self.faults = faults or CameraFaults()
+        self.names = names or self.usual_names
         self.time_scale = time_scale
-        self.card = Card(card_bytes)
+        self.card = Card()
+        if not raw:
+            self.capture_formats = (JPEG,)
         self.battery_percent = 90
         self.exposures = 0
         self.last_exposure_s = 0.0
@@ -197,8 +209,15 @@ class EmulatedBody:
         self._picture = 0
         self._held: tuple[ExposedPicture, float] | None = None
 
+        self.power_on()
+
     def power_on(self) -> None:
         """Settings as after the battery was put in."""
+
+    @property
+    def pictures_on_card(self) -> int:
+        """How many files the card holds."""
+        return sum(bool(stored.data) for stored in self.card.objects.values())
 
     def disconnected(self) -> None:
         """The connection ended without goodbye."""
@@ -218,8 +237,8 @@ class EmulatedBody:
             if not self._open and code not in (0x1001, 0x1002):
                 return PtpOutcome(NOT_OPEN)
             asked = parameters + (0,) * (5 - len(parameters))
-            found = self.standard(code, asked) if code in self._common else None
-            return found if found is not None else self.vendor(code, asked, data)
+            outcome = self.standard(code, asked) if code in self._common else None
+            return outcome if outcome is not None else self.vendor(code, asked, data)
 
     def standard(self, code: int, asked: tuple[int, ...]) -> PtpOutcome | None:  # noqa: PLR0911
         """Operations of the standard that every family has; None for those that differ."""

@@ -12,7 +12,7 @@ import uuid
 from typing import Final, Literal, Self
 
 from hal.errors import DeviceError
-from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
+from plugins.emulated.cameras.body import CameraFaults, CameraNames, EmulatedBody
 from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
 from plugins.emulated.cameras.generic import EmulatedGenericBody, EmulatedNikonBody
 from plugins.emulated.cameras.sony import EmulatedSonyBody
@@ -35,7 +35,7 @@ from plugins.emulated.cameras.wire import (
     send,
     send_data,
 )
-from plugins.emulated.core.servers import Switchable
+from plugins.emulated.core.servers import HOST, Switchable
 from plugins.emulated.core.shot import Expose
 
 Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
@@ -46,64 +46,22 @@ BODIES: Final = {
     "nikon": EmulatedNikonBody,
     "sony": EmulatedSonyBody,
 }
-NAMES: Final = {
-    "generic": CameraNames(),
-    "eos-new": CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0"),
-    "eos-old": CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1"),
-    "nikon": CameraNames("Nikon Corporation", "D7100", "0003200103", "V1.04"),
-    "sony": CameraNames("Sony Corporation", "ILCE-7M2", "0003200104", "1.0"),
-}
 _TAKEOVER_S: Final = 0.5
 
 
-class EmulatedPtpCamera(Switchable):
-    """Serves one camera from ``start`` to ``stop``; also a context.
+class PtpIpCamera(Switchable):
+    """Serves ``body`` from ``start`` to ``stop``; also a context.
 
-    Parameters
-    ----------
-    expose : makes the files of an exposure; called from the camera's shutter thread
-    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D),
-        "nikon" (9207 and 90C7), "sony" (protocol 3)
-    command_port, event_port : 0 takes a free one; both the same non-zero number: one port for both, as real ones do
-    names : identity; by default one that fits the flavour
-    time_scale : real seconds for each second of exposure
-    card_bytes : size of the memory card
-    raw : False for a camera that makes JPEG files only
-    faults : knobs that may be turned while it runs
-    body : another body than the flavour's, for example of a tape
+    ``ports``: for commands and events; 0 takes a free one; both the same non-zero number: one port for both, as real
+    cameras do
     """
 
-    def __init__(
-        self,
-        expose: Expose,
-        *,
-        flavour: Flavour = "generic",
-        host: str = "127.0.0.1",
-        command_port: int = 0,
-        event_port: int = 0,
-        names: CameraNames | None = None,
-        time_scale: float = 1.0,
-        card_bytes: int = 4 << 30,
-        raw: bool = True,
-        faults: CameraFaults | None = None,
-        body: EmulatedBody | None = None,
-    ) -> None:
-        self.faults = faults or CameraFaults()
-        self.names = names or (NAMES[flavour] if body is None else body.names)
-        self._body: EmulatedBody = body or BODIES[flavour](
-            expose,
-            names=self.names,
-            time_scale=time_scale,
-            card_bytes=card_bytes,
-            faults=self.faults,
-        )
-        if not raw:
-            self._body.capture_formats = (JPEG,)
-        self._body.power_on()
-        self._body.on_event = self._send_event
-        self._body.on_drop = self.drop_connection
-        self._host = host
-        self._ports = (command_port, event_port)
+    def __init__(self, body: EmulatedBody, ports: tuple[int, int] = (0, 0)) -> None:
+        self.body = body
+        self.faults = body.faults
+        body.on_event = self._send_event
+        body.on_drop = self.drop_connection
+        self._ports = ports
         self._listeners: list[socket.socket] = []
         self._lock = threading.Lock()
         self._command: socket.socket | None = None
@@ -113,29 +71,7 @@ class EmulatedPtpCamera(Switchable):
     @property
     def address(self) -> str:
         """``ptpip:HOST:COMMANDPORT:EVENTPORT``, once started."""
-        return f"ptpip:{self._host}:{self._ports[0]}:{self._ports[1]}"
-
-    @property
-    def body(self) -> EmulatedBody:
-        """What is behind the connection: card, battery, settings."""
-        return self._body
-
-    @property
-    def exposures(self) -> int:
-        """How often the shutter has opened."""
-        return self._body.exposures
-
-    @property
-    def pictures_on_card(self) -> int:
-        return sum(bool(stored.data) for stored in self._body.card.objects.values())
-
-    @property
-    def battery_percent(self) -> int:
-        return self._body.battery_percent
-
-    @battery_percent.setter
-    def battery_percent(self, percent: int) -> None:
-        self._body.battery_percent = percent
+        return f"ptpip:{HOST}:{self._ports[0]}:{self._ports[1]}"
 
     def start(self) -> Self:
         """Listen. Raises DeviceError("port-in-use")."""
@@ -146,14 +82,14 @@ class EmulatedPtpCamera(Switchable):
         else:
             late = self.faults.late_events_s > 0
             self._ports = (port, self._listen(self._ports[1], late=late).getsockname()[1])
-        self._body.stopped.clear()
+        self.body.stopped.clear()
         for listener in self._listeners:
             threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
         return self
 
     def stop(self) -> None:
         """Switch off: refuse connections and end the open one. ``start`` switches on again, with the same card."""
-        self._body.stopped.set()
+        self.body.stopped.set()
         for listener in self._listeners:
             _end(listener)
         self._listeners.clear()
@@ -172,7 +108,7 @@ class EmulatedPtpCamera(Switchable):
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((self._host, port))
+            listener.bind((HOST, port))
             if not late:
                 listener.listen()
         except OSError as error:
@@ -180,20 +116,20 @@ class EmulatedPtpCamera(Switchable):
             self.stop()
             raise DeviceError(
                 "port-in-use",
-                what=f"The emulated camera can't use port {port} on {self._host}: {error.strerror}.",
+                what=f"The emulated camera can't use port {port} on {HOST}: {error.strerror}.",
                 remedy="End the program that uses it, or give the camera another port (0 chooses a free one).",
             ) from error
         self._listeners.append(listener)
         return listener
 
     def _open_late(self) -> None:
-        if not self._body.stopped.wait(self.faults.late_events_s):
+        if not self.body.stopped.wait(self.faults.late_events_s):
             with contextlib.suppress(OSError, IndexError):
                 self._listeners[1].listen()
 
     def _accept(self, listener: socket.socket) -> None:
         while not listener.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-            if self._body.stopped.wait(0.01):
+            if self.body.stopped.wait(0.01):
                 return
         while True:
             try:
@@ -221,15 +157,15 @@ class EmulatedPtpCamera(Switchable):
         if self.faults.late_events_s > 0:
             threading.Thread(target=self._open_late, daemon=True).start()
         try:
-            guid = uuid.uuid5(uuid.NAMESPACE_OID, self._body.names.serial).bytes
-            name = (self._body.names.model + "\0").encode("utf-16-le")
+            guid = uuid.uuid5(uuid.NAMESPACE_OID, self.body.names.serial).bytes
+            name = (self.body.names.model + "\0").encode("utf-16-le")
             send(connection, INIT_COMMAND_ACK, struct.pack("<I", self._connection) + guid + name + b"\0\0\1\0")
             while True:
                 self._serve_request(connection)
         finally:
             with self._lock:
                 events, self._command, self._events = self._events, None, None
-            self._body.disconnected()
+            self.body.disconnected()
             if events is not None:
                 _end(events)
 
@@ -269,13 +205,13 @@ class EmulatedPtpCamera(Switchable):
         if self.faults.take("garbage"):
             connection.sendall(os.urandom(64))
             return
-        self._reply(connection, transaction, self._body.answer(code, parameters, data))
+        self._reply(connection, transaction, self.body.answer(code, parameters, data))
 
     def _hold_back(self) -> None:
         """Slow and silent cameras; a silent one goes on once it may speak again."""
         if self.faults.slow_s:
-            self._body.stopped.wait(self.faults.slow_s)
-        while self.faults.silent and not self._body.stopped.is_set():
+            self.body.stopped.wait(self.faults.slow_s)
+        while self.faults.silent and not self.body.stopped.is_set():
             time.sleep(0.01)
 
     def _reply(self, connection: socket.socket, transaction: int, outcome: PtpOutcome) -> None:
@@ -296,6 +232,32 @@ class EmulatedPtpCamera(Switchable):
         if events is not None:
             with contextlib.suppress(Gone):
                 send(events, EVENT, struct.pack(f"<HI{len(parameters)}I", code, 0, *parameters))
+
+
+class EmulatedPtpCamera(PtpIpCamera):
+    """A camera of a ``flavour`` on PTP/IP.
+
+    Parameters
+    ----------
+    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D),
+        "nikon" (9207 and 90C7), "sony" (protocol 3)
+    ports : see ``PtpIpCamera``
+    expose, names, time_scale, raw, faults : see ``EmulatedBody``
+    """
+
+    def __init__(
+        self,
+        expose: Expose,
+        *,
+        flavour: Flavour = "generic",
+        ports: tuple[int, int] = (0, 0),
+        names: CameraNames | None = None,
+        time_scale: float = 1.0,
+        raw: bool = True,
+        faults: CameraFaults | None = None,
+    ) -> None:
+        body = BODIES[flavour](expose, names=names, time_scale=time_scale, raw=raw, faults=faults)
+        super().__init__(body, ports)
 
 
 def _end(connection: socket.socket) -> None:

@@ -11,7 +11,7 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from plugins.emulated.cameras.body import JPEG, STORAGE, EmulatedBody, ExposedPicture, Stored
+from plugins.emulated.cameras.body import JPEG, STORAGE, CameraNames, EmulatedBody, ExposedPicture, Stored
 from plugins.emulated.cameras.wire import (
     BUSY,
     GENERAL_ERROR,
@@ -93,6 +93,7 @@ _FULL_REASON: Final = 7
 class EmulatedEosBody(EmulatedBody):
     """See ``EmulatedBody``."""
 
+    usual_names = CameraNames("Canon Inc.", "Canon EOS 1300D", "0320010001", "3-1.1.0")
     vendor_extension = 0x0000_000B
     raw_format = 0xB103
     capture_formats = (JPEG, 0xB103)
@@ -318,6 +319,7 @@ class EmulatedEosBody(EmulatedBody):
 class EmulatedOldEosBody(EmulatedEosBody):
     """The operations of the EOS 400D: one release, no buttons, whole stops of ISO."""
 
+    usual_names = CameraNames("Canon Inc.", "Canon EOS 400D DIGITAL", "0320010002", "3-1.1.1")
     isos = OLD_ISOS
     operations = (
         *(0x101B, 0x9101, 0x9102, 0x9107, 0x910F, 0x9110, 0x9114, 0x9115, 0x9116, 0x9117),

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from plugins.emulated.cameras.body import JPEG, EmulatedBody, ExposedPicture
+from plugins.emulated.cameras.body import JPEG, CameraNames, EmulatedBody, ExposedPicture
 from plugins.emulated.cameras.wire import (
     BUSY,
     NO_SUCH_PROPERTY,
@@ -41,6 +41,13 @@ class Setting:
         parts = [struct.pack("<HHB", code, self.kind, 1), struct.pack(one, self.values[0])]
         parts += [struct.pack(one, self.current), struct.pack("<BH", 2, len(self.values))]
         return b"".join(parts) + b"".join(struct.pack(one, value) for value in self.values)
+
+    def read(self, data: bytes) -> int | None:
+        """The value that ``data`` sets; None if it is not one of ``values``."""
+        if len(data) != struct.calcsize("<" + self.pack):
+            return None
+        value = struct.unpack("<" + self.pack, data)[0]
+        return value if value in self.values else None
 
 
 class EmulatedGenericBody(EmulatedBody):
@@ -81,10 +88,7 @@ class EmulatedGenericBody(EmulatedBody):
     def _set(self, setting: Setting, data: bytes) -> PtpOutcome:
         if self.faults.take("busy") or self.exposing:
             return PtpOutcome(BUSY)
-        if len(data) != struct.calcsize("<" + setting.pack):
-            return PtpOutcome(WRONG_VALUE)
-        value = struct.unpack("<" + setting.pack, data)[0]
-        if value not in setting.values:
+        if (value := setting.read(data)) is None:
             return PtpOutcome(WRONG_VALUE)
         setting.current = value
         return PtpOutcome()
@@ -121,6 +125,7 @@ _WITH_JPEG: Final = (0, 1, 2, 5, 6, 7)
 class EmulatedNikonBody(EmulatedGenericBody):
     """See ``EmulatedBody``. It has live view, answers busy while it exposes, and keeps its events for who asks."""
 
+    usual_names = CameraNames("Nikon Corporation", "D7100", "0003200103", "V1.04")
     vendor_extension = 0x0000_000A
     operations = (
         *(0x100E, 0x1016, 0x101B, 0x90C2, 0x90C7, 0x90C8, 0x90CA),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from plugins.emulated.cameras.body import JPEG, EmulatedBody, ExposedPicture, Stored
+from plugins.emulated.cameras.body import JPEG, CameraNames, EmulatedBody, ExposedPicture, Stored
 from plugins.emulated.cameras.generic import Setting
 from plugins.emulated.cameras.wire import BUSY, GENERAL_ERROR, NO_SUCH_HANDLE, OK, WRONG_VALUE, PtpOutcome, u16s
 from plugins.emulated.core.shot import ShotSettings
@@ -31,6 +31,7 @@ _TIMES: Final = (*((1, below) for below in _BELOW), *((above, 10) for above in _
 class EmulatedSonyBody(EmulatedBody):
     """See ``EmulatedBody``. Format 1 is RAW, 3 a JPEG; its connection has three phases."""
 
+    usual_names = CameraNames("Sony Corporation", "ILCE-7M2", "0003200104", "1.0")
     vendor_extension = 0x0000_0011
     operations = (0x101B, 0x9201, 0x9202, 0x9205, 0x9207, 0x9209)
     with_data = (0x1016, 0x9205, 0x9207)
@@ -110,10 +111,7 @@ class EmulatedSonyBody(EmulatedBody):
         setting = self.settings.get(code)
         if code == _SHUTTER and self._version < _VERSION:
             return PtpOutcome()  # the older protocol knows steps only, and ignores this
-        if setting is None or len(data) != struct.calcsize("<" + setting.pack):
-            return PtpOutcome(WRONG_VALUE)
-        value = struct.unpack("<" + setting.pack, data)[0]
-        if value not in setting.values:
+        if setting is None or (value := setting.read(data)) is None:
             return PtpOutcome(WRONG_VALUE)
         if code not in self.faults.unconfirmed:
             setting.current = value

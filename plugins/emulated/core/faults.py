@@ -25,6 +25,18 @@ from hal.runtime.files import read_text
 from plugins.emulated.core.tables import Between, load
 
 
+@dataclass(slots=True)
+class FaultCounts:
+    """Knobs of which some are counts, which go down as they are used."""
+
+    def take(self, name: str) -> bool:
+        """Use up one of a count; False when none is left."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left > 0
+
+
 @dataclass(frozen=True, slots=True)
 class WireFaults:
     """How the wire misbehaves now.

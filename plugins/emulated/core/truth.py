@@ -67,6 +67,12 @@ ENGINES: Final = ("direct", "radiosity", "mitsuba")
 """Of light between surfaces."""
 
 
+def three(values: npt.NDArray[np.float64]) -> Three:
+    """The numbers of an array (3,)."""
+    a, b, c = (float(value) for value in values)
+    return (a, b, c)
+
+
 def matrix_of(rotation_vector: Three | npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """(3, 3) rotation by a Rodrigues vector (3,) in radians."""
     from scipy.spatial.transform import Rotation  # many that start the emulated devices turn nothing

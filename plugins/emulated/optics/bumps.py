@@ -47,6 +47,7 @@ from plugins.emulated.core.truth import (
     Two,
     matrix_of,
     rotation_vector_of,
+    three,
 )
 from plugins.emulated.optics.rays import directions
 
@@ -153,7 +154,7 @@ def bumped(truth: BenchTruth, bumps: Bumps) -> BenchTruth:
 
 def _bumped(truth: BenchTruth, bump: Bump) -> BenchTruth:
     if bump.what == "ambient":
-        ambient = _three(bump.factor * np.asarray(truth.ambient))
+        ambient = three(bump.factor * np.asarray(truth.ambient))
         return dataclasses.replace(truth, ambient=ambient, indirect=truth.indirect + bump.indirect)
     if bump.what == "camera":
         camera = truth.camera
@@ -171,12 +172,12 @@ def _bumped(truth: BenchTruth, bump: Bump) -> BenchTruth:
 def _projector(projector: ProjectorTruth, bump: Bump) -> ProjectorTruth:
     light = projector.light
     mixing = np.asarray(light.mixing) * (1.0 - np.asarray(bump.dim_channels))
-    rows: Matrix = (_three(mixing[0]), _three(mixing[1]), _three(mixing[2]))
+    rows: Matrix = (three(mixing[0]), three(mixing[1]), three(mixing[2]))
     light = dataclasses.replace(
         light,
         brightness=light.brightness * (1.0 - bump.dim),
         mixing=rows,
-        gamma=_three(bump.gamma * np.asarray(light.gamma)),
+        gamma=three(bump.gamma * np.asarray(light.gamma)),
         white_segment=light.white_segment + bump.white_segment,
         shadow=max(light.shadow, bump.shadow),
     )
@@ -207,7 +208,7 @@ def _device(pose: Pose, lens: Lens, bump: Bump) -> Pose:
         turn = _shortest_turn(here, there) @ turn
     rotation = pose.rotation
     position = np.asarray(pose.position_m) + rotation.T @ (1e-3 * np.asarray(bump.move_mm))
-    return Pose(_three(position), _three(rotation_vector_of(turn @ rotation)))
+    return Pose(three(position), three(rotation_vector_of(turn @ rotation)))
 
 
 def _shortest_turn(here: Floats, there: Floats) -> Floats:
@@ -225,11 +226,11 @@ def _object_moved(truth: BenchTruth, bump: Bump) -> BenchTruth:
 
     def other_way(pose: Pose) -> Pose:
         position = turn.T @ (np.asarray(pose.position_m) - move)
-        return Pose(_three(position), _three(rotation_vector_of(pose.rotation @ turn)))
+        return Pose(three(position), three(rotation_vector_of(pose.rotation @ turn)))
 
     def surface(one: SurfaceTruth) -> SurfaceTruth:
-        across, along = (_three(turn.T @ np.asarray(side)) for side in (one.across_m, one.along_m))
-        corner = _three(turn.T @ (np.asarray(one.corner_m) - move))
+        across, along = (three(turn.T @ np.asarray(side)) for side in (one.across_m, one.along_m))
+        corner = three(turn.T @ (np.asarray(one.corner_m) - move))
         return dataclasses.replace(one, corner_m=corner, across_m=across, along_m=along)
 
     return dataclasses.replace(
@@ -238,8 +239,3 @@ def _object_moved(truth: BenchTruth, bump: Bump) -> BenchTruth:
         projectors=tuple(dataclasses.replace(one, pose=other_way(one.pose)) for one in truth.projectors),
         surfaces=tuple(surface(one) for one in truth.surfaces),
     )
-
-
-def _three(values: Floats) -> Three:
-    a, b, c = (float(value) for value in values)
-    return (a, b, c)

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+
+from plugins.raw_file import (
+    ASCII,
+    BYTE,
+    HEADER,
+    LONG,
+    RATIONAL,
+    SHORT,
+    SRATIONAL,
+    UNDEFINED,
+    Entry,
+    tiff_directory,
+    tiff_file,
+)
 
 MAKER: Final = "Velatura"
 MODEL: Final = "Emulated Camera"
@@ -19,12 +32,6 @@ XYZ_TO_LINEAR_SRGB: Final = (
     (0.0556434, -0.2040259, 1.0572252),
 )
 """ColorMatrix1 of a camera whose own colours are those of linear sRGB (D65)."""
-
-_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
-_FORMAT: Final = {_BYTE: "B", _SHORT: "H", _LONG: "I", _RATIONAL: "II", _SRATIONAL: "ii"}
-_HEADER: Final = 8
-Entry: TypeAlias = tuple[int, Sequence[float] | bytes]
-Entries: TypeAlias = Mapping[int, Entry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,76 +53,51 @@ class PictureFacts:
 def dng(mosaic: npt.NDArray[np.uint16], *, black_level: int, white_level: int, facts: PictureFacts) -> bytes:
     """A DNG of a Bayer mosaic (rows, columns), red first (RGGB), uncompressed in 16 bits."""
     rows, columns = mosaic.shape
-    matrix = [float(value) for value in np.asarray(facts.xyz_to_camera).ravel()]
-    size = rows * columns * 2
-
-    def entries(strip: int, exif: int) -> Entries:
-        return {
-            254: (_LONG, [0]),
-            256: (_LONG, [columns]),
-            257: (_LONG, [rows]),
-            258: (_SHORT, [16]),
-            259: (_SHORT, [1]),
-            262: (_SHORT, [32803]),  # colour filter array
-            271: (_ASCII, _text(MAKER)),
-            272: (_ASCII, _text(MODEL)),
-            273: (_LONG, [strip]),
-            274: (_SHORT, [1]),
-            277: (_SHORT, [1]),
-            278: (_LONG, [rows]),
-            279: (_LONG, [size]),
-            284: (_SHORT, [1]),
-            306: (_ASCII, _text(facts.taken)),
-            33421: (_SHORT, [2, 2]),
-            33422: (_BYTE, [0, 1, 1, 2]),
-            34665: (_LONG, [exif]),
-            50706: (_BYTE, [1, 4, 0, 0]),
-            50707: (_BYTE, [1, 1, 0, 0]),
-            50708: (_ASCII, _text(f"{MAKER} {MODEL}")),
-            50710: (_BYTE, [0, 1, 2]),
-            50711: (_SHORT, [1]),
-            50714: (_SHORT, [black_level]),
-            50717: (_SHORT, [white_level]),
-            50721: (_SRATIONAL, matrix),
-            50728: (_RATIONAL, [1.0, 1.0, 1.0]),
-            50778: (_SHORT, [21]),  # D65
-        }
-
-    exif_at = _HEADER + len(_folder(entries(0, 0), _HEADER))
-    exif = _folder(_exif(facts), exif_at)
-    strip_at = -(-(exif_at + len(exif)) // 16) * 16
-    first = _folder(entries(strip_at, exif_at), _HEADER)
-    head = struct.pack("<2sHI", b"II", 42, _HEADER) + first + exif
-    return head.ljust(strip_at, b"\0") + mosaic.astype("<u2").tobytes()
+    entries: dict[int, Entry] = {
+        262: (SHORT, [32803]),  # colour filter array
+        **_names(facts),
+        284: (SHORT, [1]),
+        33421: (SHORT, [2, 2]),
+        33422: (BYTE, bytes([0, 1, 1, 2])),
+        50706: (BYTE, bytes([1, 4, 0, 0])),
+        50707: (BYTE, bytes([1, 1, 0, 0])),
+        50708: (ASCII, _text(f"{MAKER} {MODEL}")),
+        50710: (BYTE, bytes([0, 1, 2])),
+        50711: (SHORT, [1]),
+        50714: (SHORT, [black_level]),
+        50717: (SHORT, [white_level]),
+        50721: (SRATIONAL, _rationals(*np.asarray(facts.xyz_to_camera).ravel())),
+        50728: (RATIONAL, _rationals(1.0, 1.0, 1.0)),
+        50778: (SHORT, [21]),  # D65
+    }
+    return tiff_file(entries, mosaic.astype("<u2").tobytes(), columns, rows, 1, exif=_exif(facts))
 
 
 def with_exif(jpeg: bytes, facts: PictureFacts) -> bytes:
     """A JPEG file with an Exif segment put right after its start marker."""
 
-    def entries(exif: int) -> Entries:
-        return {
-            271: (_ASCII, _text(MAKER)),
-            272: (_ASCII, _text(MODEL)),
-            274: (_SHORT, [1]),
-            306: (_ASCII, _text(facts.taken)),
-            34665: (_LONG, [exif]),
-        }
+    def entries(exif_at: int) -> dict[int, Entry]:
+        return {274: (SHORT, [1]), 34665: (LONG, [exif_at]), **_names(facts)}
 
-    exif_at = _HEADER + len(_folder(entries(0), _HEADER))
-    tiff = struct.pack("<2sHI", b"II", 42, _HEADER) + _folder(entries(exif_at), _HEADER)
-    payload = b"Exif\0\0" + tiff + _folder(_exif(facts), exif_at)
+    exif_at = HEADER + len(tiff_directory(entries(0), HEADER))
+    tiff = struct.pack("<2sHI", b"II", 42, HEADER) + tiff_directory(entries(exif_at), HEADER)
+    payload = b"Exif\0\0" + tiff + tiff_directory(_exif(facts), exif_at)
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + jpeg[2:]
 
 
-def _exif(facts: PictureFacts) -> Entries:
+def _names(facts: PictureFacts) -> dict[int, Entry]:
+    return {271: (ASCII, _text(MAKER)), 272: (ASCII, _text(MODEL)), 306: (ASCII, _text(facts.taken))}
+
+
+def _exif(facts: PictureFacts) -> dict[int, Entry]:
     return {
-        33434: (_RATIONAL, [facts.exposure_s]),
-        33437: (_RATIONAL, [facts.aperture_f]),
-        34855: (_SHORT, [facts.iso]),
-        36864: (_UNDEFINED, b"0231"),
-        36867: (_ASCII, _text(facts.taken)),
-        37386: (_RATIONAL, [facts.focal_length_mm]),
-        42033: (_ASCII, _text(facts.serial_number)),
+        33434: (RATIONAL, _rationals(facts.exposure_s)),
+        33437: (RATIONAL, _rationals(facts.aperture_f)),
+        34855: (SHORT, [facts.iso]),
+        36864: (UNDEFINED, b"0231"),
+        36867: (ASCII, _text(facts.taken)),
+        37386: (RATIONAL, _rationals(facts.focal_length_mm)),
+        42033: (ASCII, _text(facts.serial_number)),
     }
 
 
@@ -123,27 +105,7 @@ def _text(value: str) -> bytes:
     return value.encode("ascii", "replace") + b"\0"
 
 
-def _folder(entries: Entries, at: int) -> bytes:
-    """A TIFF image file directory that starts at offset ``at``, with its values right behind it."""
-    values_at = at + 2 + 12 * len(entries) + 4
-    fixed, values = struct.pack("<H", len(entries)), b""
-    for tag in sorted(entries):
-        kind, content = entries[tag]
-        packed = _packed(kind, content)
-        count = len(packed) if isinstance(content, bytes) else len(content)
-        if len(packed) <= 4:
-            field = packed.ljust(4, b"\0")
-        else:
-            field = struct.pack("<I", values_at + len(values))
-            values += packed + b"\0" * (len(packed) % 2)
-        fixed += struct.pack("<HHI", tag, kind, count) + field
-    return fixed + struct.pack("<I", 0) + values
-
-
-def _packed(kind: int, content: Sequence[float] | bytes) -> bytes:
-    if isinstance(content, bytes):
-        return content
-    if kind not in (_RATIONAL, _SRATIONAL):
-        return struct.pack(f"<{len(content)}{_FORMAT[kind]}", *(int(value) for value in content))
-    fractions = [Fraction(value).limit_denominator(10_000_000) for value in content]
-    return b"".join(struct.pack(f"<{_FORMAT[kind]}", f.numerator, f.denominator) for f in fractions)
+def _rationals(*values: float) -> list[int]:
+    """Numerator and denominator of each value."""
+    fractions = [Fraction(float(value)).limit_denominator(10_000_000) for value in values]
+    return [part for fraction in fractions for part in (fraction.numerator, fraction.denominator)]

@@ -25,7 +25,7 @@ UNFINISHED_S: Final = 3600.0
 """A file that was not finished for longer than this is of a bench that was killed."""
 
 
-def kept_folder(otherwise: Path) -> Path:
+def light_folder(otherwise: Path) -> Path:
     """The user's folder for it, or ``otherwise`` where that can't be written."""
     return users_folder() or otherwise
 
@@ -40,7 +40,7 @@ def users_folder() -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
-def read_kept(folder: Path, kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
+def read_arrays(folder: Path, kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
     """The arrays that were written with this key; None if there are none, or the file is damaged."""
     path = _path(folder, kind, key)
     try:
@@ -56,9 +56,10 @@ def read_kept(folder: Path, kind: str, key: str) -> dict[str, npt.NDArray[Any]] 
     return arrays
 
 
-def write_kept(folder: Path, kind: str, key: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write ``arrays`` for ``read_kept``, and remove the files that were not used for longest. A disk error is ignored:
-    they are worked out again then.
+def write_arrays(folder: Path, kind: str, key: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write ``arrays`` for ``read_arrays``, and remove the files that were not used for longest.
+
+    A disk error is ignored: they are worked out again then.
     """
     path = _path(folder, kind, key)
     temporary = path.with_suffix(f".{os.getpid()}.part")

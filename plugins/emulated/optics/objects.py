@@ -18,7 +18,7 @@ from hal.errors import DeviceError
 from hal.runtime.compute import digest_of
 from hal.runtime.files import LARGEST_MESH, require_regular
 from plugins.emulated.core.truth import SurfaceTruth
-from plugins.emulated.optics.light_cache import read_kept, users_folder, write_kept
+from plugins.emulated.optics.light_cache import read_arrays, users_folder, write_arrays
 from plugins.emulated.optics.shapes import Floats, Rgb, bust, dot, length, paint_bust, paint_solid, paint_vase, vase
 
 KIND: Final = "object"
@@ -52,7 +52,7 @@ class StageObject:
 
     @property
     def object_faces(self) -> int:
-        """All of them (``furnished.Scene``)."""
+        """All of them (``scene_of.Scene``)."""
         return len(self.faces)
 
     def fingerprint(self) -> list[npt.NDArray[Any]]:
@@ -109,13 +109,13 @@ def default_object() -> StageObject:
     Shaping them takes seconds, so they are kept in the user's cache folder until their source changes.
     """
     folder, key = users_folder(), digest_of(Path(__file__))
-    arrays = None if folder is None else read_kept(folder, KIND, key)
+    arrays = None if folder is None else read_arrays(folder, KIND, key)
     if arrays is not None and {*arrays, "paint"} == set(StageObject.__slots__):
         return StageObject(paint=VASE_AND_BUST, **arrays)
     made = _vase_and_bust()
     if folder is not None:
         names = set(StageObject.__slots__) - {"paint"}
-        write_kept(folder, KIND, key, {name: getattr(made, name) for name in names})
+        write_arrays(folder, KIND, key, {name: getattr(made, name) for name in names})
     return made
 
 
@@ -285,7 +285,7 @@ class Scene(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Furnished:
+class ObjectInRoom:
     """An object among surfaces."""
 
     thing: StageObject
@@ -311,7 +311,7 @@ class Furnished:
         return [*self.thing.fingerprint(), self.vertices[len(self.thing.vertices) :], self.colours]
 
 
-def furnished(thing: StageObject, surfaces: tuple[SurfaceTruth, ...]) -> Scene:
+def scene_of(thing: StageObject, surfaces: tuple[SurfaceTruth, ...]) -> Scene:
     """The scene of an object; the object itself where there is no surface.
 
     Raises DeviceError ``surface-no-area``.
@@ -331,7 +331,7 @@ def furnished(thing: StageObject, surfaces: tuple[SurfaceTruth, ...]) -> Scene:
         )
     flat /= area
     normals = np.broadcast_to(flat[:, None, None, :], (len(surfaces), 2, 3, 3)).reshape(-1, 3, 3)
-    return Furnished(
+    return ObjectInRoom(
         thing=thing,
         vertices=np.concatenate([thing.vertices, corners.reshape(-1, 3).astype(np.float32)]),
         faces=np.concatenate([thing.faces, faces.astype(np.int32)]),

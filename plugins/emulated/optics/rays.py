@@ -23,8 +23,8 @@ from hal.runtime.compute import usable_cpus
 from plugins.emulated.core.tables import dump
 from plugins.emulated.core.truth import BenchTruth, Lens, Pose, ProjectorTruth
 from plugins.emulated.optics.effects import reflected
-from plugins.emulated.optics.light_cache import read_kept, write_kept
-from plugins.emulated.optics.objects import Scene, StageObject, furnished
+from plugins.emulated.optics.light_cache import read_arrays, write_arrays
+from plugins.emulated.optics.objects import Scene, StageObject, scene_of
 from plugins.emulated.optics.shapes import dot, length
 
 KIND: Final = "rays"
@@ -72,20 +72,20 @@ def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None,
     ``progress`` is called with the share that is done, 0..1.
     """
     key = key_of(truth, stage_object)
-    arrays = None if cache is None else read_kept(cache, KIND, key)
+    arrays = None if cache is None else read_arrays(cache, KIND, key)
     if arrays is not None and set(arrays) == {field.name for field in fields(Samples)}:
         found = Samples(**arrays)
     else:
         found = cast(truth, stage_object, progress)
         if cache is not None:
-            write_kept(cache, KIND, key, {field.name: getattr(found, field.name) for field in fields(Samples)})
+            write_arrays(cache, KIND, key, {field.name: getattr(found, field.name) for field in fields(Samples)})
     progress(1.0)
     return found
 
 
 def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Samples:
     """Cast every ray of the stage."""
-    things = furnished(stage_object, truth.surfaces)
+    things = scene_of(stage_object, truth.surfaces)
     scene = rtcore_scene.EmbreeScene(robust=True)
     TriangleMesh(scene, things.vertices, things.faces)
     width, height = truth.camera.lens.size_px
@@ -262,7 +262,7 @@ def _in_shadow(lens: Floats, scene: Any, points: Floats, distance: Floats) -> np
 
 def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
     """A text that differs where the rays of stages do."""
-    scene = furnished(stage_object, truth.surfaces)
+    scene = scene_of(stage_object, truth.surfaces)
     digest = hashlib.sha256(f"{VERSION}\n".encode())
     projectors = [part for p in truth.projectors for part in (p.pose, p.lens, p.focus, p.light)]
     for part in (truth.camera.pose, truth.camera.lens, *projectors):

@@ -107,7 +107,7 @@ def panel_places(projector: ProjectorTruth, at_px: FloatImage) -> list[FloatImag
     ]
 
 
-class Returning(Protocol):
+class IndirectLight(Protocol):
     """What engines for light between surfaces have in common."""
 
     def light(self, sent: Sequence[FloatImage | None]) -> FloatImage:
@@ -117,7 +117,7 @@ class Returning(Protocol):
 class Renderer:
     """Keeps the last layers of each projector, since most frames are shown more than once and by one projector."""
 
-    def __init__(self, truth: BenchTruth, samples: Samples, transfer: Returning | None = None) -> None:
+    def __init__(self, truth: BenchTruth, samples: Samples, transfer: IndirectLight | None = None) -> None:
         self._truth = truth
         self._transfer = transfer
         self._samples = samples
@@ -169,7 +169,7 @@ class Renderer:
         dithered = any(projector.dithering.levels > 1 for projector in self._truth.projectors)
         return (shutter,) if dithered or self._truth.camera.focus_m > 0.0 else ()
 
-    def _returned(self, transfer: Returning, index: int, each: FloatImage) -> FloatImage:
+    def _returned(self, transfer: IndirectLight, index: int, each: FloatImage) -> FloatImage:
         """Light (P, 3) of a frame's channels that object and surfaces throw back."""
         sent: list[FloatImage | None] = [None] * len(self._truth.projectors)
         sent[index] = veiled(each @ self._on_white[index].T, self._truth.projectors[index].light.glare)

@@ -25,6 +25,7 @@ from plugins.emulated.core.truth import (
     Sensor,
     Three,
     rotation_vector_of,
+    three,
 )
 from plugins.emulated.optics.layout import DEFAULT, Stands
 from plugins.emulated.optics.objects import StageObject
@@ -95,7 +96,7 @@ def random_truth(
     return BenchTruth(
         size=size,
         frames=FRAMES,
-        ambient=_three(rng.uniform(0.0012, 0.0022, 3)),
+        ambient=three(rng.uniform(0.0012, 0.0022, 3)),
         latency_s=2.0 / 60.0,
         time_scale=0.25,
         seed=seed,
@@ -231,8 +232,8 @@ def _projector(
             black_level=float(rng.uniform(0.9, 1.1)) / 1500.0,
             vignetting=float(rng.uniform(0.12, 0.25)),
             fill_factor=0.9,
-            gamma=_three(rng.uniform(2.1, 2.4, 3)),
-            s_curve=_three(rng.uniform(0.08, 0.25, 3)),
+            gamma=three(rng.uniform(2.1, 2.4, 3)),
+            s_curve=three(rng.uniform(0.08, 0.25, 3)),
             mixing=_mixing(rng),
         ),
         lamp=FAST_LAMP,
@@ -245,15 +246,13 @@ def _mixing(rng: np.random.Generator) -> Matrix:
     np.fill_diagonal(mixing, 0.0)
     mixing += np.diag(1.0 - mixing.sum(axis=1))
     mixing *= rng.uniform((0.86, 0.96, 0.82), (0.98, 1.0, 0.95))[:, None]
-    return (_three(mixing[0]), _three(mixing[1]), _three(mixing[2]))
+    return (three(mixing[0]), three(mixing[1]), three(mixing[2]))
 
 
 def _place(right_degrees: float, above_degrees: float, distance_m: float) -> Three:
     """World position at two angles, as seen from the object towards the audience."""
     right, above = np.deg2rad(right_degrees), np.deg2rad(above_degrees)
-    return _three(
-        distance_m * np.array([np.sin(right) * np.cos(above), -np.sin(above), -np.cos(right) * np.cos(above)])
-    )
+    return three(distance_m * np.array([np.sin(right) * np.cos(above), -np.sin(above), -np.cos(right) * np.cos(above)]))
 
 
 def _aimed(
@@ -287,9 +286,4 @@ def _looking(position: Floats, target: Floats, roll: float) -> Three:
     right = np.cross((0.0, 1.0, 0.0), forward)
     right /= np.linalg.norm(right)
     matrix = np.stack((right, np.cross(forward, right), forward))
-    return _three(rotation_vector_of(Rotation.from_euler("z", roll).as_matrix() @ matrix))
-
-
-def _three(values: Floats) -> Three:
-    a, b, c = (float(value) for value in values)
-    return (a, b, c)
+    return three(rotation_vector_of(Rotation.from_euler("z", roll).as_matrix() @ matrix))

@@ -18,8 +18,8 @@ from plugins.emulated.optics.bumps import FILE as BUMPS
 from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
 from plugins.emulated.optics.effects import exposed_s, flickering, sensor_flaws
-from plugins.emulated.optics.indirect.transfers import Indirect
-from plugins.emulated.optics.light_cache import kept_folder
+from plugins.emulated.optics.indirect.transfers import IndirectTransfers
+from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject, default_object
 from plugins.emulated.optics.outputs import VisibleFrames, VisibleFrameSet
 from plugins.emulated.optics.rays import Progress, samples_of
@@ -49,9 +49,9 @@ class World:
         self._stage, self._set_up, self._truth = stage, truth, truth
         self._lamps = tuple(lamps)
         thing = object_of(stage, truth.object)
-        kept = kept_folder(stage / FOLDER)
+        kept = light_folder(stage / FOLDER)
         self._samples = samples_of(truth, thing, kept, progress)
-        self._indirect = Indirect(thing, kept)
+        self._indirect = IndirectTransfers(thing, kept)
         transfer = self._indirect.transfer(truth, self._samples.pixels, progress, keep=True)
         self._renderer = Renderer(truth, self._samples, transfer)
         self._bumps_seen: tuple[int, int] | None = None

@@ -57,12 +57,13 @@ class EmulatedLamp:
         self._lit_since: float | None = None
         self._off_since: float | None = None
         self._hours = hours
-        self._strikes = 0
-        self._shutter_closed = False
-        self._failed = False
-        self._hot = False
         self._mains = True
-        self._damages = 0
+        self.strikes = 0
+        self.shutter_closed = False
+        self.failed = False
+        self.too_hot = False
+        self.damages = 0
+        """How often its mains were cut before it had cooled: the fans stop, and the heat stays in the lamp."""
         self.passing: Callable[[], float] = lambda: 1.0
         """The share of its light that what stands before the lens lets through: a douser's."""
 
@@ -74,10 +75,10 @@ class EmulatedLamp:
         with self._lock:
             if self.burning:
                 return True
-            if self.phase is LampPhase.COOLING or self._hot or not self._mains:
+            if self.phase is LampPhase.COOLING or self.too_hot or not self._mains:
                 return False
-            self._strikes += 1
-            if not self._failed:
+            self.strikes += 1
+            if not self.failed:
                 self._lit_since = self._clock()
             return True
 
@@ -108,14 +109,14 @@ class EmulatedLamp:
     def faulty(self) -> bool:
         """Whether its projector reports an error: it should burn, and the lamp failed or is too hot."""
         with self._lock:
-            return not self.burning and (self._hot or (self._failed and self._strikes > 0))
+            return not self.burning and (self.too_hot or (self.failed and self.strikes > 0))
 
     def light_level(self) -> float:
         """Share of the projector's full light: 0 when dark or behind shutter or douser, rising while it warms; then
         drifting towards 1.
         """
         with self._lock:
-            if self._lit_since is None or self._shutter_closed:
+            if self._lit_since is None or self.shutter_closed:
                 return 0.0
             burning_s = self._clock() - self._lit_since
             drift = 1.0 + self._timing.drift * math.exp(-burning_s / self._timing.drift_s)
@@ -131,53 +132,22 @@ class EmulatedLamp:
             burning = 0.0 if self._lit_since is None else (self._clock() - self._lit_since) / 3600
             return int(self._hours + burning)
 
-    @property
-    def strikes(self) -> int:
-        with self._lock:
-            return self._strikes
-
-    @property
-    def shutter_closed(self) -> bool:
-        with self._lock:
-            return self._shutter_closed
-
-    @shutter_closed.setter
-    def shutter_closed(self, closed: bool) -> None:
-        with self._lock:
-            self._shutter_closed = closed
-
-    @property
-    def failed(self) -> bool:
-        with self._lock:
-            return self._failed
-
-    @property
-    def too_hot(self) -> bool:
-        with self._lock:
-            return self._hot
-
     def fail(self) -> None:
         """The lamp bursts: dark from now, and at every later strike until ``repair``."""
         with self._lock:
-            self._failed = True
+            self.failed = True
             self.extinguish()
 
     def overheat(self) -> None:
         """The thermal switch puts the lamp out and refuses strikes until ``repair``."""
         with self._lock:
-            self._hot = True
+            self.too_hot = True
             self.extinguish()
 
     def repair(self) -> None:
         """A new lamp is in, or the housing has cooled."""
         with self._lock:
-            self._failed = self._hot = False
-
-    @property
-    def damages(self) -> int:
-        """How often its mains were cut before it had cooled: the fans stop, and the heat stays in the lamp."""
-        with self._lock:
-            return self._damages
+            self.failed = self.too_hot = False
 
     def cut_mains(self) -> None:
         """The lamp goes dark at once. One that burned or cooled is damaged, and is as hot when the mains come back."""
@@ -185,7 +155,7 @@ class EmulatedLamp:
             if not self._mains:
                 return
             hot = self.phase is not LampPhase.STANDBY
-            self._damages += hot
+            self.damages += hot
             self.extinguish()
             self._off_since = self._clock() if hot else None
             self._mains = False
@@ -196,7 +166,7 @@ class EmulatedLamp:
             if not self._mains and self._off_since is not None:
                 self._off_since = self._clock()
             self._mains = True
-            self._shutter_closed = False
+            self.shutter_closed = False
 
     def warm_now(self) -> None:
         """Skip the waiting, for a bench that starts with a burning projector: lit and fully warm."""

@@ -21,9 +21,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection, Listener
 from typing import Any, Final, Self
 
-from plugins.emulated.cameras.body import JPEG, CameraFaults, CameraNames, EmulatedBody
-from plugins.emulated.cameras.camera import BODIES, NAMES, Flavour
+from plugins.emulated.cameras.body import CameraNames, EmulatedBody
+from plugins.emulated.cameras.camera import BODIES, Flavour
 from plugins.emulated.cameras.wire import BUSY, OK, Gone, PtpOutcome
+from plugins.emulated.core.faults import FaultCounts
 from plugins.emulated.core.shot import Expose, ShotFiles, ShotSettings
 from plugins.emulated.core.truth import CameraTruth
 from plugins.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
@@ -45,7 +46,7 @@ _VENDORS: Final = {
 
 
 @dataclass(slots=True)
-class UsbCameraFaults:
+class UsbCameraFaults(FaultCounts):
     """Knobs of the pipes, besides ``CameraFaults``. Counts go down as they are used.
 
     ``stall_in``, ``stall_out``: that many transfers end with a halted pipe; ``split_headers``: the header of data
@@ -62,13 +63,6 @@ class UsbCameraFaults:
     lost_interrupts: int = 0
     unready: bool = False
     away_s: float = 0.05
-
-    def take(self, name: str) -> bool:
-        """Use up one of a count; False when none is left."""
-        left: int = getattr(self, name)
-        if left > 0:
-            setattr(self, name, left - 1)
-        return left > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,17 +93,14 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         flavour: Flavour = "generic",
         names: CameraNames | None = None,
         time_scale: float = 1.0,
-        card_bytes: int = 4 << 30,
+        raw: bool = True,
         usb_serial: bool = True,
     ) -> None:
-        says = names or NAMES[flavour]
+        says = names or BODIES[flavour].usual_names
         super().__init__(UsbNames(*_VENDORS[flavour], says.maker, says.model, says.serial if usb_serial else ""))
-        self.camera_faults = CameraFaults()
+        self.body: EmulatedBody = BODIES[flavour](expose, names=names, time_scale=time_scale, raw=raw)
+        self.camera_faults = self.body.faults
         self.pipe_faults = UsbCameraFaults()
-        self.body: EmulatedBody = BODIES[flavour](
-            expose, names=says, time_scale=time_scale, card_bytes=card_bytes, faults=self.camera_faults
-        )
-        self.body.power_on()
         self.body.on_event = self._event
         self.body.on_drop = self.drop
         self._work: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
@@ -119,15 +110,6 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         self._asked: tuple[int, int, tuple[int, ...]] | None = None
         self._received = bytearray()
         threading.Thread(target=self._serve, daemon=True).start()
-
-    @property
-    def exposures(self) -> int:
-        """How often the shutter has opened."""
-        return self.body.exposures
-
-    @property
-    def pictures_on_card(self) -> int:
-        return sum(bool(stored.data) for stored in self.body.card.objects.values())
 
     def last_exposure_s(self) -> float:
         """How long the shutter was open for the last picture."""
@@ -272,11 +254,11 @@ def numbered_camera(size: int = 300_000, serial: str = "", **settings: object) -
     made: list[EmulatedUsbCamera] = []
 
     def expose(shot: ShotSettings) -> ShotFiles:
-        return numbered_files(made[0].exposures, size, shot)
+        return numbered_files(made[0].body.exposures, size, shot)
 
     flavour = settings.get("flavour", "generic")
     if serial:
-        shown = NAMES[flavour]  # type: ignore[index]
+        shown = BODIES[flavour].usual_names  # type: ignore[index]
         settings["names"] = CameraNames(shown.maker, shown.model, serial, shown.firmware)
     made.append(EmulatedUsbCamera(expose, **settings))  # type: ignore[arg-type]
     return made[0]
@@ -344,7 +326,4 @@ def stage_camera(exposures: str, serial: str, *, raw: bool = True) -> EmulatedUs
         return ShotFiles(raw=found or None, jpeg=shown or None)
 
     # The world behind it spends the exposure time itself, since it must know what is visible meanwhile.
-    camera = EmulatedUsbCamera(expose, names=CameraNames(serial=serial), time_scale=0.0)
-    if not raw:
-        camera.body.capture_formats = (JPEG,)
-    return camera
+    return EmulatedUsbCamera(expose, names=CameraNames(serial=serial), time_scale=0.0, raw=raw)

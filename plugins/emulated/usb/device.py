@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from plugins.emulated.core.faults import FaultCounts
+
 BULK, INTERRUPT = 2, 3
 _DEVICE, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT, _HID, _REPORT = 1, 2, 3, 4, 5, 0x21, 0x22
 _LANGUAGES: Final = 0
@@ -55,7 +57,7 @@ class UsbNames:
 
 
 @dataclass(slots=True)
-class UsbFaults:
+class UsbFaults(FaultCounts):
     """Knobs, turned at any time; counts go down as they are used.
 
     ``silent``: nothing completes; ``slow_s`` before every transfer completes; ``stalls``, ``drop``, ``cut``,
@@ -72,13 +74,6 @@ class UsbFaults:
     garble: int = 0
     stuck: bool = False
     lingers_s: float = 0.0
-
-    def take(self, name: str) -> bool:
-        """Use up one of a count; False when none is left."""
-        left: int = getattr(self, name)
-        if left > 0:
-            setattr(self, name, left - 1)
-        return left > 0
 
     def bent(self, answer: bytes) -> bytes:
         """An answer as it comes through."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import errno
 import struct
 import time
@@ -9,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from plugins.emulated.usb.device import INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall
+from plugins.emulated.usb.device import INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 from plugins.emulated.usb.umockdev_server import CallFailed, Memory
 
 INPUT, OUTPUT, FEATURE = 1, 2, 3
@@ -29,9 +30,12 @@ class EmulatedHidDevice(EmulatedUsbDevice):
     numbered = False
     """Whether its reports begin with their report number."""
 
-    def __init_subclass__(cls) -> None:
-        if not cls.endpoints:
-            cls.endpoints = (Endpoint(0x81, INTERRUPT, 64),)
+    endpoints: tuple[Endpoint, ...] = (Endpoint(0x81, INTERRUPT, 64),)
+
+    def __init__(self, names: UsbNames) -> None:
+        super().__init__(names)
+        self.listeners: list[Callable[[bytes], None]] = []
+        """Called with every input report, under the device's lock or not."""
 
     def get_report(self, kind: int, number: int) -> bytes:
         """Hook: what the device answers to GET_REPORT. Raises Stall."""
@@ -46,19 +50,10 @@ class EmulatedHidDevice(EmulatedUsbDevice):
         self.set_report(OUTPUT, data[0] if self.numbered and data else 0, data)
 
     def input(self, report: bytes) -> None:
-        """Send an input report to whoever listens."""
+        """Send an input report to every listener."""
         self.send(0x81, report)
-        for listener in tuple(self._listeners):
+        for listener in tuple(self.listeners):
             listener(report)
-
-    def listen(self, listener: Callable[[bytes], None]) -> Callable[[], None]:
-        """Have ``listener`` called with every input report, until the function that is returned is called."""
-        self._listeners.append(listener)
-        return lambda: self._listeners.remove(listener)
-
-    @property
-    def _listeners(self) -> list[Callable[[bytes], None]]:
-        return self.__dict__.setdefault("_all_listeners", [])  # type: ignore[no-any-return]
 
     def class_request(self, setup: SetupPacket, data: bytes) -> bytes:
         # Both the interface and the device are accepted as recipient: real relay boards are asked either way.
@@ -74,6 +69,20 @@ class EmulatedHidDevice(EmulatedUsbDevice):
         return b""
 
 
+class _Call(enum.IntEnum):
+    """Numbers of hidraw's calls, within the letter "H"."""
+
+    DESCRIPTOR_SIZE = 1
+    DESCRIPTOR = 2
+    INFO = 3
+    NAME = 4
+    SET_FEATURE = 6
+    GET_FEATURE = 7
+    SERIAL = 8
+    GET_INPUT = 10
+    SET_OUTPUT = 11
+
+
 class HidrawFile:
     """One program's open hidraw file (``umockdev_server.OpenFile``)."""
 
@@ -81,8 +90,8 @@ class HidrawFile:
         self._device = device
         self._show = show_readable
         self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
-        self._forget = device.listen(self._heard)
         self.gone = False
+        device.listeners.append(self._queue)
 
     def read(self, address: int, count: int, memory: Memory) -> int:
         with self._device.lock:
@@ -95,54 +104,55 @@ class HidrawFile:
             return len(report)
 
     def write(self, address: int, count: int, memory: Memory) -> int:
-        data = memory.peek(address, count)
-        self._set(OUTPUT, data)
-        return count
+        return self._set(OUTPUT, memory.peek(address, count))
 
     def ioctl(self, request: int, argument: int, memory: Memory) -> int:
+        """Do one call; ``request`` holds its number, the letter "H" and the length of ``argument``'s buffer."""
         number, length = request & 0xFF, request >> 16 & 0x3FFF
         if request >> 8 & 0xFF != ord("H"):
             raise CallFailed(errno.ENOTTY)
         self._check()
         names = self._device.names
         match number:
-            case 1:
+            case _Call.DESCRIPTOR_SIZE:
                 memory.poke(argument, struct.pack("<I", len(self._device.hid_descriptor)))
-            case 2:
+            case _Call.DESCRIPTOR:
                 size = min(struct.unpack("<I", memory.peek(argument, 4))[0], _DESCRIPTOR_ROOM)
                 memory.poke(argument + 4, self._device.hid_descriptor[:size])
-            case 3:
+            case _Call.INFO:
                 memory.poke(argument, struct.pack("<IHH", _BUS_USB, names.vendor, names.product))
-            case 4 | 8:
-                text = (f"{names.maker} {names.model}" if number == 4 else names.serial).encode()[: length - 1] + b"\0"
-                memory.poke(argument, text)
-                return len(text)
-            case 6 | 11:
-                self._set(FEATURE if number == 6 else OUTPUT, memory.peek(argument, length))
-                return length
-            case 7 | 10:
-                return self._get(FEATURE if number == 7 else INPUT, argument, length, memory)
+            case _Call.NAME | _Call.SERIAL:
+                text = f"{names.maker} {names.model}" if number == _Call.NAME else names.serial
+                data = text.encode()[: length - 1] + b"\0"
+                memory.poke(argument, data)
+                return len(data)
+            case _Call.SET_FEATURE | _Call.SET_OUTPUT:
+                kind = FEATURE if number == _Call.SET_FEATURE else OUTPUT
+                return self._set(kind, memory.peek(argument, length))
+            case _Call.GET_FEATURE | _Call.GET_INPUT:
+                return self._get(FEATURE if number == _Call.GET_FEATURE else INPUT, argument, length, memory)
             case _:
                 raise CallFailed(errno.ENOTTY)
         return 0
 
     def closed(self) -> None:
         with self._device.lock:
-            self._forget()
+            self._device.listeners.remove(self._queue)
 
     def _check(self) -> None:
         if self.gone:
             raise CallFailed(errno.ENODEV)
 
-    def _heard(self, report: bytes) -> None:
+    def _queue(self, report: bytes) -> None:
         with self._device.lock:
             self._waiting.append(report)
             self._show(True)
 
-    def _set(self, kind: int, data: bytes) -> None:
-        """Report number 0 means: this device has no numbers, and the byte is not sent."""
+    def _set(self, kind: int, data: bytes) -> int:
+        """Report number 0 means: this device has no numbers, and the byte is not sent. Returns the bytes taken."""
         self._check()
         self._transfer(SetupPacket(0x21, _SET_REPORT, kind << 8 | data[0], 0, len(data)), data if data[0] else data[1:])
+        return len(data)
 
     def _get(self, kind: int, argument: int, length: int, memory: Memory) -> int:
         number = memory.peek(argument, 1)[0]

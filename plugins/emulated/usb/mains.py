@@ -7,11 +7,12 @@ their mains or boot, and a lamp that was cut hot counts the damage.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from hal.errors import DeviceError
 from plugins.emulated.core.servers import BackgroundDevice
 from plugins.emulated.core.truth import FILE_NAME, MainsTruth, ProjectorTruth
+from plugins.emulated.projectors.projector import BoardProjector
 from plugins.emulated.usb.bench import FILE, UsbDeviceTruth
 
 _TICK_S: Final = 0.02
@@ -19,24 +20,6 @@ Moves = Callable[[str, int], Sequence[tuple[int, bool]]]
 """Every (channel, closed) of the named board, after the given number of them."""
 MainsListener = Callable[[str, bool, int], None]
 """A projector has lost its mains (False) or got them back (True), and how often its lamp was damaged so far."""
-
-
-class DamageCounter(Protocol):
-    """What counts the damage."""
-
-    @property
-    def damages(self) -> int: ...
-
-
-class MainsConsumer(Protocol):
-    """A projector, as far as its mains go."""
-
-    @property
-    def lamp(self) -> DamageCounter: ...
-
-    def cut_mains(self) -> None: ...
-
-    def restore_mains(self) -> None: ...
 
 
 class Mains(BackgroundDevice):
@@ -48,7 +31,7 @@ class Mains(BackgroundDevice):
     def __init__(
         self,
         circuits: Sequence[MainsTruth],
-        projectors: Mapping[str, MainsConsumer],
+        projectors: Mapping[str, BoardProjector],
         moves: Moves,
         tell: MainsListener = lambda projector, on, damages: None,
     ) -> None:

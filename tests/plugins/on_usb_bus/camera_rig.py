@@ -52,7 +52,7 @@ class Rig:
         return files[0].path.read_bytes()
 
     def exposures(self) -> int:
-        return int(self.bus.get("camera", "exposures"))
+        return int(self.bus.get("camera", "body.exposures"))
 
     def latest(self) -> bytes:
         """The bytes of the last JPEG that was exposed."""

@@ -45,7 +45,7 @@ def test_a_camera_is_found_by_its_serial_number_and_nothing_is_sent_to_it(bus: U
     # This machine's desktop may run a program that takes cameras.
     assert {problem.code for problem in found.problems} <= {"camera-may-be-taken"}
     assert found.settings["address"].startswith("usb:")
-    assert bus.get("camera", "exposures") == 0
+    assert bus.get("camera", "body.exposures") == 0
 
 
 def test_a_program_that_takes_cameras_is_named(bus: UsbBusProcess, tmp_path: Path) -> None:

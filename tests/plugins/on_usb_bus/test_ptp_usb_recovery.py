@@ -78,7 +78,7 @@ def test_another_camera_that_came_meanwhile_is_not_taken_for_it(bus: UsbBusProce
             rig.driver.status(deadline=in_seconds(2))
         bus.plug("camera")
         assert rig.capture(tmp_path) == rig.latest()
-        assert bus.get("other", "exposures") == 0
+        assert bus.get("other", "body.exposures") == 0
 
 
 def test_a_body_without_a_usb_serial_number_is_found_again_too(bus: UsbBusProcess, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_picture_has_the_bytes_of_the_camera_and_the_settings_that_were_confir
 def test_a_raw_picture_comes_alone_and_with_its_own_suffix(rig: Rig, tmp_path: Path) -> None:
     rig.driver.configure(ExposureSettings(0.125, 200, raw=True), deadline=in_seconds(20))
     files = rig.driver.capture(tmp_path / "shot", deadline=in_seconds(20))
-    suffix = {"Nikon Corporation": ".nef", "Sony Corporation": ".arw"}.get(rig.emulator.names.maker, ".dng")
+    suffix = {"Nikon Corporation": ".nef", "Sony Corporation": ".arw"}.get(rig.emulator.body.names.maker, ".dng")
     assert [(file.path.name, file.kind) for file in files] == [(f"shot{suffix}", FileKind.RAW)]
     assert files[0].path.read_bytes().startswith(b"II*\0")
 
@@ -75,20 +75,20 @@ def test_a_raw_picture_comes_alone_and_with_its_own_suffix(rig: Rig, tmp_path: P
 def test_pictures_do_not_pile_up_in_the_camera(rig: Rig, tmp_path: Path) -> None:
     for number in range(5):
         assert rig.capture(tmp_path, f"shot{number}") == rig.latest()
-    assert rig.emulator.pictures_on_card == 0
-    assert rig.emulator.exposures == 5
+    assert rig.emulator.body.pictures_on_card == 0
+    assert rig.emulator.body.exposures == 5
 
 
 def test_an_eos_can_shoot_to_its_card(card_rig: Rig, tmp_path: Path) -> None:
     assert card_rig.capture(tmp_path) == card_rig.latest()
-    assert card_rig.emulator.pictures_on_card == 0
+    assert card_rig.emulator.body.pictures_on_card == 0
 
 
 def test_pictures_stay_on_the_card_where_that_is_wanted(tmp_path: Path) -> None:
     with running("generic", keep_on_card=True) as rig:
         rig.capture(tmp_path, "one")
         assert rig.capture(tmp_path, "two") == rig.latest()
-        assert rig.emulator.pictures_on_card == 2
+        assert rig.emulator.body.pictures_on_card == 2
 
 
 def test_an_unwritable_folder_is_named_and_the_picture_stays_in_the_camera(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_an_unwritable_folder_is_named_and_the_picture_stays_in_the_camera(tmp_p
         with pytest.raises(DeviceError) as caught:
             rig.capture(tmp_path / "file")
         assert caught.value.code == "cannot-write"
-        assert rig.emulator.pictures_on_card == 1
+        assert rig.emulator.body.pictures_on_card == 1
 
 
 @pytest.mark.parametrize(

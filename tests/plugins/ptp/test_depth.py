@@ -55,7 +55,7 @@ def test_a_cancelled_bulb_exposure_closes_the_shutter(tmp_path: Path) -> None:
         short_shutter(rig.emulator)
         rig.driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
         stop = threading.Event()
-        when(lambda: rig.emulator.exposures == 1, stop.set)
+        when(lambda: rig.emulator.body.exposures == 1, stop.set)
         with pytest.raises(Cancelled):
             rig.driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
         rig.driver.configure(ExposureSettings(0.125, 200, raw=False), deadline=in_seconds(20))
@@ -67,7 +67,7 @@ def test_a_bulb_exposure_whose_connection_is_lost_is_told_and_not_kept(tmp_path:
     with running("eos-new", time_scale=1.0) as rig:
         short_shutter(rig.emulator)
         rig.driver.configure(ExposureSettings(BULB_S, 200, raw=False), deadline=in_seconds(20))
-        when(lambda: rig.emulator.exposures == 1, rig.emulator.drop_connection)
+        when(lambda: rig.emulator.body.exposures == 1, rig.emulator.drop_connection)
         with pytest.raises(DeviceGone):
             rig.capture(tmp_path)
         assert rig.capture(tmp_path, "again") == rig.latest()
@@ -96,7 +96,7 @@ def test_a_stop_before_the_body_has_answered_that_its_shutter_is_open_closes_it(
             driver.configure(ExposureSettings(60.0, 200, raw=False), deadline=in_seconds(20))
             with pytest.raises(Cancelled):
                 driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
-            wait_for(lambda: emulator.exposures == 1)
+            wait_for(lambda: emulator.body.exposures == 1)
             assert emulator.body.close_shutter().code == GENERAL_ERROR  # it is closed
         finally:
             driver.close()
@@ -112,7 +112,7 @@ def test_a_shutter_that_a_killed_program_left_open_is_closed_by_the_next(tmp_pat
             rig.emulator.drop_connection()
             stop.set()
 
-        when(lambda: rig.emulator.exposures == 1, kill)
+        when(lambda: rig.emulator.body.exposures == 1, kill)
         with pytest.raises(DeviceError):
             rig.driver.capture(tmp_path / "shot", deadline=in_seconds(200, stop))
         rig.driver.close()
@@ -143,7 +143,7 @@ def test_live_view_gives_frames_and_is_off_for_a_picture(tmp_path: Path) -> None
             frame = rig.driver.live_view(deadline=in_seconds(20))
             assert frame.startswith(b"\xff\xd8")
             assert frame.endswith(b"\xff\xd9")
-        assert rig.emulator.exposures == 0
+        assert rig.emulator.body.exposures == 0
         assert rig.capture(tmp_path) == rig.latest()
         assert rig.driver.live_view(deadline=in_seconds(20)).startswith(b"\xff\xd8")
         rig.driver.end_live_view(deadline=in_seconds(20))
@@ -158,7 +158,7 @@ def test_the_status_tells_battery_card_and_what_to_look_after(flavour: str) -> N
         assert (status.battery_percent or 0) >= 75
         assert status.free_bytes == 4 << 30
         assert status.warnings == ()
-        rig.emulator.battery_percent = 12
+        rig.emulator.body.battery_percent = 12
         rig.emulator.body.card.capacity = 1 << 20
         status = rig.driver.status(deadline=in_seconds(20))
         assert set(status.warnings) == {"battery-low", "card-nearly-full"}
@@ -170,8 +170,8 @@ def test_a_target_that_flips_silently_loses_no_picture_and_is_set_again(flavour:
         rig.emulator.faults.target_flips = 1
         for number in range(3):
             assert rig.capture(tmp_path, f"shot{number}") == rig.latest()
-            assert rig.emulator.exposures == number + 1
-        assert rig.emulator.pictures_on_card == 0
+            assert rig.emulator.body.exposures == number + 1
+        assert rig.emulator.body.pictures_on_card == 0
         assert rig.driver.status(deadline=in_seconds(20)).warnings == ("target-changed",)
         assert "camera-target-changed" in [notice.code for notice in rig.driver.notices()]
 
@@ -183,7 +183,7 @@ def test_autofocus_that_fails_is_told_and_leaves_no_button_down(flavour: str, tm
         with pytest.raises(DeviceRefused) as caught:
             rig.capture(tmp_path)
         assert caught.value.code == "camera-autofocus"
-        assert rig.emulator.exposures == 0
+        assert rig.emulator.body.exposures == 0
         assert rig.capture(tmp_path) == rig.latest()
 
 

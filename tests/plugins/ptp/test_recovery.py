@@ -51,7 +51,7 @@ def hasty_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 def test_a_busy_camera_is_asked_again_until_it_is_ready_and_fires_once(rig: Rig, tmp_path: Path) -> None:
     rig.emulator.faults.busy = 4
     assert rig.capture(tmp_path) == rig.latest()
-    assert rig.emulator.exposures == 1
+    assert rig.emulator.body.exposures == 1
 
 
 def test_a_camera_that_stays_busy_is_given_up_in_time_and_works_again_later(hasty_rig: Rig, tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_camera_that_stays_busy_is_given_up_in_time_and_works_again_later(hast
     assert left_behind(tmp_path) == []
     hasty_rig.emulator.faults.busy = 0
     assert hasty_rig.capture(tmp_path) == hasty_rig.latest()
-    assert hasty_rig.emulator.exposures == 1
+    assert hasty_rig.emulator.body.exposures == 1
 
 
 def test_settings_are_set_even_when_the_camera_is_busy_at_first(rig: Rig) -> None:
@@ -75,9 +75,9 @@ def test_settings_are_set_even_when_the_camera_is_busy_at_first(rig: Rig) -> Non
 def test_a_connection_lost_after_the_exposure_loses_no_picture_and_takes_none_twice(rig: Rig, tmp_path: Path) -> None:
     rig.emulator.faults.drop_after_exposure = 1
     assert rig.capture(tmp_path) == rig.latest()
-    assert rig.emulator.exposures == 1
+    assert rig.emulator.body.exposures == 1
     assert rig.capture(tmp_path, "next") == rig.latest()
-    assert rig.emulator.exposures == 2
+    assert rig.emulator.body.exposures == 2
 
 
 def test_a_connection_lost_at_the_release_is_told_and_nothing_is_taken_twice(hasty_rig: Rig, tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_connection_lost_at_the_release_is_told_and_nothing_is_taken_twice(has
     with pytest.raises(DeviceGone) as caught:
         hasty_rig.capture(tmp_path)
     assert caught.value.code == "camera-shot-lost"
-    assert hasty_rig.emulator.exposures == 0
+    assert hasty_rig.emulator.body.exposures == 0
     assert left_behind(tmp_path) == []
     assert hasty_rig.capture(tmp_path) == hasty_rig.latest()
     assert hasty_rig.studio.shots[-1].iso == SHORT.iso
@@ -94,14 +94,14 @@ def test_a_connection_lost_at_the_release_is_told_and_nothing_is_taken_twice(has
 def test_a_connection_lost_in_the_download_is_made_good(rig: Rig, tmp_path: Path) -> None:
     rig.emulator.faults.drop_in_transfer = 1
     assert rig.capture(tmp_path) == rig.latest()
-    assert rig.emulator.exposures == 1
+    assert rig.emulator.body.exposures == 1
     assert left_behind(tmp_path) == ["shot.jpg"]
 
 
 def test_a_download_of_the_wrong_length_is_never_kept(rig: Rig, tmp_path: Path) -> None:
     rig.emulator.faults.wrong_lengths = 1
     assert rig.capture(tmp_path) == rig.latest()
-    assert rig.emulator.exposures == 1
+    assert rig.emulator.body.exposures == 1
     rig.emulator.faults.wrong_lengths = 1000
     with pytest.raises(ProtocolError):
         rig.capture(tmp_path, "bad")
@@ -112,7 +112,7 @@ def test_a_picture_whose_event_was_lost_is_found(rig: Rig, tmp_path: Path) -> No
     rig.emulator.faults.lost_events = 1
     assert rig.capture(tmp_path) == rig.latest()
     assert rig.capture(tmp_path, "next") == rig.latest()
-    assert rig.emulator.exposures == 2
+    assert rig.emulator.body.exposures == 2
 
 
 def test_a_lost_event_on_the_card_of_an_eos_is_made_good(card_rig: Rig, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_a_slow_camera_is_waited_for(rig: Rig, tmp_path: Path) -> None:
 def test_work_stops_as_soon_as_it_is_cancelled_and_the_camera_is_usable_afterwards(rig: Rig, tmp_path: Path) -> None:
     rig.driver.configure(ExposureSettings(6.0, 200, raw=False), deadline=in_seconds(20))
     stop = threading.Event()
-    when(lambda: rig.emulator.exposures == 1, stop.set)
+    when(lambda: rig.emulator.body.exposures == 1, stop.set)
     started = time.monotonic()
     with pytest.raises(Cancelled):
         rig.driver.capture(tmp_path / "shot", deadline=in_seconds(60, stop))
@@ -162,7 +162,7 @@ def test_work_stops_as_soon_as_it_is_cancelled_and_the_camera_is_usable_afterwar
     # the body is busy until the exposure is over
     rig.driver.configure(SHORT, deadline=in_seconds(60))
     assert rig.capture(tmp_path) == rig.latest()
-    assert rig.emulator.exposures == 2
+    assert rig.emulator.body.exposures == 2
 
 
 def test_an_exposure_that_cannot_fit_into_the_deadline_is_not_begun(rig: Rig, tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_an_exposure_that_cannot_fit_into_the_deadline_is_not_begun(rig: Rig, tm
     with pytest.raises(DeviceTimeout) as caught:
         rig.capture(tmp_path, seconds=5.0)
     assert caught.value.code == "camera-deadline-too-short"
-    assert rig.emulator.exposures == 0
+    assert rig.emulator.body.exposures == 0
 
 
 def test_a_full_card_is_named_and_nothing_is_exposed(rig: Rig, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_full_card_is_named_and_nothing_is_exposed(rig: Rig, tmp_path: Path) -
     with pytest.raises(DeviceRefused) as caught:
         rig.capture(tmp_path)
     assert caught.value.code == "card-full"
-    assert rig.emulator.exposures == 0
+    assert rig.emulator.body.exposures == 0
     rig.emulator.faults.card_full = False
     assert rig.capture(tmp_path) == rig.latest()
 
@@ -218,7 +218,7 @@ def test_another_camera_at_the_same_address_does_not_go_unnoticed(tmp_path: Path
         driver = connect(first)
         ports = [int(port) for port in first.address.split(":")[2:]]
     other = CameraNames(serial="ANOTHER")
-    with EmulatedPtpCamera(studio.expose, command_port=ports[0], event_port=ports[1], names=other):
+    with EmulatedPtpCamera(studio.expose, ports=(ports[0], ports[1]), names=other):
         with pytest.raises(DeviceRefused) as caught:
             driver.capture(tmp_path / "shot", deadline=in_seconds(20))
         assert caught.value.code == "camera-other"
@@ -229,7 +229,7 @@ def test_one_port_for_both_connections_is_how_most_cameras_do_it(tmp_path: Path)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     studio = Studio()
-    with EmulatedPtpCamera(studio.expose, command_port=port, event_port=port, time_scale=0.0):
+    with EmulatedPtpCamera(studio.expose, ports=(port, port), time_scale=0.0):
         driver = open_camera({"address": f"ptpip:127.0.0.1:{port}"}, OpenContext(tmp_path), in_seconds(20))
         driver.configure(SHORT, deadline=in_seconds(20))
         assert driver.capture(tmp_path / "shot", deadline=in_seconds(20))
@@ -240,7 +240,7 @@ def test_a_port_in_use_is_named_by_the_emulated_camera() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(DeviceError) as caught:
-            EmulatedPtpCamera(Studio().expose, command_port=port).start()
+            EmulatedPtpCamera(Studio().expose, ports=(port, 0)).start()
     assert caught.value.code == "port-in-use"
     assert str(port) in caught.value.what
 
@@ -261,8 +261,8 @@ def test_many_captures_with_faults_lose_and_double_nothing(tmp_path: Path) -> No
             for number in range(24):
                 faults[number * 7 % len(faults)](rig)
                 assert rig.capture(tmp_path, f"{flavour}-{number}") == rig.latest()
-                assert rig.emulator.exposures == number + 1
-            return rig.emulator.exposures
+                assert rig.emulator.body.exposures == number + 1
+            return rig.emulator.body.exposures
 
     with ThreadPoolExecutor(len(FLAVOURS)) as side_by_side:
         assert list(side_by_side.map(endure, FLAVOURS)) == [24] * len(FLAVOURS)

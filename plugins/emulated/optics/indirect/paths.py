@@ -22,7 +22,7 @@ from scipy import sparse
 
 from hal.errors import DeviceError
 from plugins.emulated.core.truth import BenchTruth
-from plugins.emulated.optics.objects import Scene, StageObject, furnished
+from plugins.emulated.optics.objects import Scene, StageObject, scene_of
 from plugins.emulated.optics.rays import SHADOW_BIAS_M, Progress, arriving, directions
 
 VARIANT: Final = "llvm_ad_rgb"
@@ -177,7 +177,7 @@ def trace(truth: BenchTruth, thing: StageObject, pixels: npt.NDArray[np.int32], 
 
     Use ``tracing.traced_transfer``, which does this in a process of its own. Raises DeviceError ``engine-missing``.
     """
-    scene = furnished(thing, truth.surfaces)
+    scene = scene_of(thing, truth.surfaces)
     rng = np.random.default_rng([truth.seed, 6])
     group = tuple(max(1, round(p.lens.size_px[0] / PIXELS_ACROSS)) for p in truth.projectors)
     at_once = max(1, PATHS_AT_ONCE // truth.paths)

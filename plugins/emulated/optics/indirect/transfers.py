@@ -13,15 +13,15 @@ from scipy import sparse
 from plugins.emulated.core.truth import BenchTruth, SurfaceTruth
 from plugins.emulated.optics.indirect.paths import TracedTransfer, traced_transfer
 from plugins.emulated.optics.indirect.radiosity import Scattering, Transfer, scattering_of, transfer_of
-from plugins.emulated.optics.light_cache import read_kept, write_kept
-from plugins.emulated.optics.objects import StageObject, furnished
+from plugins.emulated.optics.light_cache import read_arrays, write_arrays
+from plugins.emulated.optics.objects import StageObject, scene_of
 from plugins.emulated.optics.rays import Progress, key_of
 
 KIND: Final = "indirect"
 VERSION: Final = 1
 
 
-class Indirect:
+class IndirectTransfers:
     """Transfers of one object; what depends on the scene alone is kept for a stage whose devices move."""
 
     def __init__(self, thing: StageObject, cache: Path) -> None:
@@ -54,14 +54,14 @@ class Indirect:
 
     def _scattered(self, truth: BenchTruth, progress: Progress) -> Scattering:
         if self._scattering is None or self._scattering[0] != truth.surfaces:
-            scene = furnished(self._thing, truth.surfaces)
+            scene = scene_of(self._thing, truth.surfaces)
             self._scattering = (truth.surfaces, scattering_of(scene, truth.patches, truth.seed, progress))
         return self._scattering[1]
 
 
 def _read(folder: Path, key: str) -> Transfer | TracedTransfer | None:
     """A file that is absent, damaged or of another stage counts as none."""
-    arrays = read_kept(folder, KIND, key)
+    arrays = read_arrays(folder, KIND, key)
     try:
         if arrays is None:
             return None
@@ -91,7 +91,7 @@ def _write(folder: Path, key: str, transfer: Transfer | TracedTransfer) -> None:
         for name, matrix in matrices.items()
         for part in ("data", "indices", "indptr", "shape")
     }
-    write_kept(folder, KIND, key, {"projectors": np.array(count), **arrays})
+    write_arrays(folder, KIND, key, {"projectors": np.array(count), **arrays})
 
 
 def _matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> sparse.csr_matrix:

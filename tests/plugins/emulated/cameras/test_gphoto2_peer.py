@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from plugins.emulated.cameras.camera import NAMES
+from plugins.emulated.cameras.camera import BODIES
 from tests.campaigns.camera_peers import FLAVOURS, SIZE, Flavour, Peer, Way, network_peer, usb_peer
 
 
@@ -31,8 +31,8 @@ def peer(way: Way, flavour: Flavour) -> Iterator[Peer]:
 
 def test_the_summary_and_the_settings_tell_what_the_camera_is(peer: Peer, flavour: Flavour) -> None:
     said = peer.gphoto2("--summary", "--list-config")
-    assert f"Model: {NAMES[flavour].model}" in said
-    assert f"Serial Number: {NAMES[flavour].serial}" in said
+    assert f"Model: {BODIES[flavour].usual_names.model}" in said
+    assert f"Serial Number: {BODIES[flavour].usual_names.serial}" in said
     assert "Maximum Capability: 4294967296" in said
     # gphoto2 reads a Sony body's battery only as one of its own properties, 0xd218.
     assert ("/main/other/d218" if flavour == "sony" else "value: 90%") in said

@@ -15,9 +15,9 @@ from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.core.tables import dump, load
 from plugins.emulated.core.truth import BenchTruth, SurfaceTruth, read_truth
 from plugins.emulated.optics.indirect.radiosity import Transfer, scattering_of, transfer_of
-from plugins.emulated.optics.indirect.transfers import Indirect
+from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.layout import table_and_wall
-from plugins.emulated.optics.objects import StageObject, corner_normals, furnished
+from plugins.emulated.optics.objects import StageObject, corner_normals, scene_of
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
 
@@ -83,11 +83,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def indirect(folder: Path, vase_and_bust: StageObject) -> Indirect:
-    return Indirect(vase_and_bust, folder)
+def indirect(folder: Path, vase_and_bust: StageObject) -> IndirectTransfers:
+    return IndirectTransfers(vase_and_bust, folder)
 
 
-def transfer_in(indirect: Indirect, truth: BenchTruth, thing: StageObject, shares: list[float]) -> Transfer:
+def transfer_in(indirect: IndirectTransfers, truth: BenchTruth, thing: StageObject, shares: list[float]) -> Transfer:
     samples = cast(truth, thing, lambda share: None)
     found = indirect.transfer(truth, samples.pixels, shares.append, keep=True)
     assert isinstance(found, Transfer)
@@ -96,7 +96,7 @@ def transfer_in(indirect: Indirect, truth: BenchTruth, thing: StageObject, share
 
 @pytest.mark.slow
 def test_table_and_wall_light_the_object_in_their_colour(
-    roomy: BenchTruth, vase_and_bust: StageObject, indirect: Indirect
+    roomy: BenchTruth, vase_and_bust: StageObject, indirect: IndirectTransfers
 ) -> None:
     samples = cast(roomy, vase_and_bust, lambda share: None)
     transfer = transfer_in(indirect, roomy, vase_and_bust, [])
@@ -115,11 +115,11 @@ def test_table_and_wall_light_the_object_in_their_colour(
 
 @pytest.mark.slow
 def test_a_transfer_is_kept_for_the_very_stage(
-    roomy: BenchTruth, vase_and_bust: StageObject, indirect: Indirect, folder: Path
+    roomy: BenchTruth, vase_and_bust: StageObject, indirect: IndirectTransfers, folder: Path
 ) -> None:
     first = transfer_in(indirect, roomy, vase_and_bust, [])
     shares: list[float] = []
-    again = transfer_in(Indirect(vase_and_bust, folder), roomy, vase_and_bust, shares)
+    again = transfer_in(IndirectTransfers(vase_and_bust, folder), roomy, vase_and_bust, shares)
     assert shares == [1.0]
     np.testing.assert_array_equal(first.back, again.back)
     assert abs(first.blend - again.blend).max() == 0.0
@@ -130,7 +130,7 @@ def test_a_transfer_is_kept_for_the_very_stage(
 
 def test_a_stage_without_engine_has_no_transfer(tiny_truth: BenchTruth, vase_and_bust: StageObject) -> None:
     pixels = np.zeros(1, np.int32)
-    assert Indirect(vase_and_bust, Path("/nowhere")).transfer(tiny_truth, pixels, print, keep=True) is None
+    assert IndirectTransfers(vase_and_bust, Path("/nowhere")).transfer(tiny_truth, pixels, print, keep=True) is None
 
 
 def prepared(folder: Path, room: str) -> BenchTruth:
@@ -166,4 +166,4 @@ def test_a_surface_of_no_use_is_refused() -> None:
     with pytest.raises(DeviceError, match=r"between 0 and 0\.95"):
         load(dump(good).replace("[0.5, 0.5, 0.5]", "[1.0, 0.5, 0.5]"), SurfaceTruth, file="bench.toml")
     with pytest.raises(DeviceError, match=r"'wall' in bench\.toml has no area"):
-        furnished(sphere(), (dataclasses.replace(good, along_m=good.across_m),))
+        scene_of(sphere(), (dataclasses.replace(good, along_m=good.across_m),))

@@ -17,7 +17,7 @@ from hal.errors import DeviceError
 from plugins.emulated.core.truth import BenchTruth
 from plugins.emulated.optics.indirect.paths import traced_transfer
 from plugins.emulated.optics.indirect.radiosity import scattering_of, transfer_of
-from plugins.emulated.optics.indirect.transfers import Indirect
+from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.render import Renderer
@@ -121,7 +121,7 @@ def test_a_mitsuba_that_can_not_run_is_a_sentence(tmp_path: Path, monkeypatch: p
     stage_object = two_objects()
     truth = dataclasses.replace(stage_of(stage_object), engine="mitsuba")
     with pytest.raises(DeviceError) as refused:
-        Indirect(stage_object, tmp_path).transfer(truth, np.arange(4, dtype=np.int32), print, keep=True)
+        IndirectTransfers(stage_object, tmp_path).transfer(truth, np.arange(4, dtype=np.int32), print, keep=True)
     assert refused.value.code == "engine-missing"
     assert "radiosity" in refused.value.remedy
 
@@ -131,14 +131,14 @@ def test_what_was_traced_is_kept_for_the_very_same_stage(tmp_path: Path, monkeyp
     truth = dataclasses.replace(stage_of(stage_object), engine="mitsuba", subsamples=1, paths=4)
     pixels = cast(truth, stage_object, lambda share: None).pixels
     sent = [np.random.default_rng(1).random((28, 36, 3)).astype(np.float32)]
-    first = Indirect(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
+    first = IndirectTransfers(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "absent.so"))
-    again = Indirect(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
+    again = IndirectTransfers(stage_object, tmp_path).transfer(truth, pixels, lambda share: None, keep=True)
     assert first is not None
     assert again is not None
     np.testing.assert_array_equal(first.light(sent), again.light(sent))
     assert first.light(sent).max() > 0.0
     with pytest.raises(DeviceError):
-        Indirect(stage_object, tmp_path).transfer(
+        IndirectTransfers(stage_object, tmp_path).transfer(
             dataclasses.replace(truth, paths=5), pixels, lambda share: None, keep=True
         )

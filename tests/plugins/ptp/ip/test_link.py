@@ -322,5 +322,5 @@ def test_an_event_port_that_never_opens_is_named_with_the_camera() -> None:
         with pytest.raises(DeviceRefused) as caught:
             PtpIpLink.connect(address, deadline=in_seconds(20))
         assert caught.value.code == "camera-no-events"
-        assert camera.names.model in caught.value.what
+        assert camera.body.names.model in caught.value.what
         assert str(address.event_port) in caught.value.what
