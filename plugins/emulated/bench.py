@@ -14,7 +14,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -106,7 +106,7 @@ PORTS: Final = range(20000, 32768)
 class EmulatedBench:
     """``hal.interfaces.Bench``.
 
-    ``stands``: where the projectors of a stage that it prepares shall stand; ``engine`` None: as the ``room`` says
+    ``stands``: where it puts the projectors of a stage that it prepares; ``engine`` None: as the ``room`` says
     """
 
     def __init__(self, stands: Stands | None = None, room: str = DARK, engine: str | None = None) -> None:
@@ -145,44 +145,50 @@ class EmulatedBench:
 
         ``scenario``: a script of faults, instead of the one in bench.toml; relative to the working folder.
         """
-        out = OutputLines(json_lines)
-        stopped = threading.Event()
-        with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
-            try:
-                world = _start(stage.resolve(), out, stack, stopped, scenario)
-            except DeviceError as error:
-                out.failed(error)
-                return DEVICE_FAILED
-            except _Interrupted:
-                return 0
-            out.ready()
-            while not stopped.wait(0.5):
-                _follow_bumps(world, out)
-        out.say({"stopped": True}, "All devices are off.")
-        return 0
+
+        def start(out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event) -> Callable[[], None]:
+            world = _start(stage.resolve(), out, stack, stopped, scenario)
+            return lambda: _follow_bumps(world, out)
+
+        return _serve(json_lines, start)
 
     def replay(self, tape: Path, *, json_lines: bool) -> int:
         """See ``hal.interfaces.Bench``."""
-        out = OutputLines(json_lines)
-        stopped = threading.Event()
-        with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
-            try:
-                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velatura-tape-")))
-                count = serve_tape(read_tape(tape), folder, stack, out.served)
-            except DeviceError as error:
-                out.failed(error)
-                return DEVICE_FAILED
-            except _Interrupted:
-                return 0
+
+        def start(out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event) -> Callable[[], None]:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velatura-tape-")))
+            count = serve_tape(read_tape(tape), folder, stack, out.served)
             out.say({"devices": count}, f"{count} devices of the tape.")
-            out.ready()
-            stopped.wait()
-        out.say({"stopped": True}, "All devices are off.")
-        return 0
+            return lambda: None
+
+        return _serve(json_lines, start)
 
 
 class _Interrupted(Exception):
     """A signal came before everything was up."""
+
+
+Start = Callable[[OutputLines, contextlib.ExitStack, threading.Event], Callable[[], None]]
+"""Brings devices up on the stack, unless the event is set; returns what is called twice a second afterwards."""
+
+
+def _serve(json_lines: bool, start: Start) -> int:
+    """Serve until SIGINT or SIGTERM; 0, or 3 when a device can't be served."""
+    out = OutputLines(json_lines)
+    stopped = threading.Event()
+    with _stop_on_signals(stopped), contextlib.ExitStack() as stack:
+        try:
+            look = start(out, stack, stopped)
+        except DeviceError as error:
+            out.failed(error)
+            return DEVICE_FAILED
+        except _Interrupted:
+            return 0
+        out.ready()
+        while not stopped.wait(0.5):
+            look()
+    out.say({"stopped": True}, "All devices are off.")
+    return 0
 
 
 def _start(
@@ -247,7 +253,7 @@ def _timing(lamp: LampTruth) -> LampTiming:
 
 
 def _write_fast_profile(stage: Path, family: str) -> None:
-    """Write the profile with the times of emulated lamps, unless the stage has it: somebody may have changed it."""
+    """Write the profile with the times of emulated lamps, unless the stage has it: it may have been changed."""
     path = stage / (FAST_PROFILE if family == DEFAULT_BOARD else f"{FOLDER}/{family}-fast.toml")
     if not path.exists():
         times = LampTiming(FAST_LAMP.warm_up_s, FAST_LAMP.cool_down_s)
@@ -268,7 +274,7 @@ def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
 def _follow_bumps(world: World, out: OutputLines) -> None:
     try:
         count = world.follow_bumps()
-    except DeviceError as error:  # somebody is writing it, or wrote it wrongly: the stage stays as it was
+    except DeviceError as error:  # it is half written, or wrong: the stage stays as it was
         out.failed(error)
         return
     if count is not None:
@@ -276,8 +282,9 @@ def _follow_bumps(world: World, out: OutputLines) -> None:
 
 
 def _free_ports() -> tuple[int, int]:
-    """Two TCP ports without a listener. The stage keeps them while no bench serves it, so they are none of
-    those that the system gives to whoever asks for any.
+    """Two TCP ports without a listener.
+
+    The stage keeps them while no bench serves it, so they lie outside the range from which the system gives free ports.
     """
     in_any_order = secrets.SystemRandom().sample(PORTS, len(PORTS))
     first, second = itertools.islice(filter(_is_free, in_any_order), 2)

@@ -88,9 +88,9 @@ class LineReplay:
     def __init__(self, track: Track) -> None:
         self.unknown = 0
         self.greeting, exchanges = _exchanges(track.entries)
-        asked = Counter(exchange.question for exchange in exchanges)
+        counts = Counter(exchange.question for exchange in exchanges)
         # Text protocols mark queries; of others it is only known that what is sent again and again changes nothing.
-        self._replay = Replay(exchanges, acts=lambda command: b"?" not in bytes(command) and asked[command] == 1)  # type: ignore[call-overload]
+        self._replay = Replay(exchanges, acts=lambda command: b"?" not in bytes(command) and counts[command] == 1)  # type: ignore[call-overload]
         self._commands = sorted({bytes(e.question) for e in exchanges}, key=len, reverse=True)  # type: ignore[call-overload]
         self._heard = b""
         self._heard_at_s = 0.0
@@ -116,7 +116,7 @@ class LineReplay:
 def _exchanges(entries: Iterable[Entry]) -> tuple[Pieces, list[Exchange[Pieces]]]:
     """The greeting of the first connection, and every command with what came before the next one."""
     greeting: list[tuple[float, bytes]] = []
-    found: list[tuple[bytes, list[tuple[float, bytes]]]] = []
+    commands: list[tuple[bytes, list[tuple[float, bytes]]]] = []
     answers, began_s, greeted = greeting, 0.0, False
     for entry in entries:
         if entry.way is Direction.REMARK:
@@ -124,11 +124,11 @@ def _exchanges(entries: Iterable[Entry]) -> tuple[Pieces, list[Exchange[Pieces]]
                 answers, began_s = ([] if greeted else greeting), entry.at_s
                 greeted = True
         elif entry.way is Direction.SENT and entry.data:
-            found.append((entry.data, []))
-            answers, began_s = found[-1][1], entry.at_s
+            commands.append((entry.data, []))
+            answers, began_s = commands[-1][1], entry.at_s
         elif entry.data:
             answers.append((min(_LONGEST_DELAY_S, max(0.0, entry.at_s - began_s)), entry.data))
-    return tuple(greeting), [Exchange(command, tuple(pieces)) for command, pieces in found]
+    return tuple(greeting), [Exchange(command, tuple(pieces)) for command, pieces in commands]
 
 
 def _say(pieces: Pieces, write: Callable[[bytes], object], time_scale: float, stopped: threading.Event) -> None:
@@ -228,9 +228,9 @@ class TapeBody(EmulatedBody):
     def answer(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:
         with self.lock:
             self.answered[code] += 1
-            found = self._replay.answer((code, parameters, data)) or self._replay.answer((code, parameters, b""))
-            if found is not None:
-                return self._again(found)
+            operation = self._replay.answer((code, parameters, data)) or self._replay.answer((code, parameters, b""))
+            if operation is not None:
+                return self._again(operation)
             if code in _PARTS and (whole := self._objects.get(parameters[0] if parameters else -1)) is not None:
                 piece = whole[parameters[1] : parameters[1] + parameters[2]]
                 return PtpOutcome(parameters=(len(piece),), data=piece)
@@ -253,7 +253,7 @@ def _acts(question: Hashable) -> bool:
 
 
 def _operations(entries: Iterable[Entry]) -> list[_Done]:
-    found: list[_Done] = []
+    operations: list[_Done] = []
     for entry in entries:
         if entry.way is Direction.REMARK or len(entry.data) < _HEADER.size:
             continue
@@ -261,16 +261,16 @@ def _operations(entries: Iterable[Entry]) -> list[_Done]:
         body = entry.data[_HEADER.size :]
         numbers = struct.unpack(f"<{len(body) // 4}I", body[: len(body) // 4 * 4]) if kind != _DATA else ()
         if kind == _COMMAND:
-            found.append(_Done(code, numbers))
-        elif found and kind == _DATA and entry.way is Direction.SENT:
-            found[-1].sent = body
-        elif found and kind == _DATA:
-            found[-1].data = body
-        elif found and kind == _RESPONSE:
-            found[-1].answer = (code, numbers)
-        elif found and kind == _EVENT:
-            found[-1].events.append((code, numbers))
-    return found
+            operations.append(_Done(code, numbers))
+        elif operations and kind == _DATA and entry.way is Direction.SENT:
+            operations[-1].sent = body
+        elif operations and kind == _DATA:
+            operations[-1].data = body
+        elif operations and kind == _RESPONSE:
+            operations[-1].answer = (code, numbers)
+        elif operations and kind == _EVENT:
+            operations[-1].events.append((code, numbers))
+    return operations
 
 
 def _objects(done: Iterable[_Done]) -> dict[int, bytes]:
@@ -282,8 +282,8 @@ def _objects(done: Iterable[_Done]) -> dict[int, bytes]:
         if one.code == _GET_OBJECT:
             objects[one.parameters[0]] = one.data
         elif one.code in _PARTS and len(one.parameters) > 1:
-            known = objects.get(one.parameters[0], b"")
-            objects[one.parameters[0]] = known[: one.parameters[1]] + one.data
+            fetched = objects.get(one.parameters[0], b"")
+            objects[one.parameters[0]] = fetched[: one.parameters[1]] + one.data
     return objects
 
 

@@ -236,11 +236,11 @@ class EmulatedBody:
                 return PtpOutcome(NOT_SUPPORTED)
             if not self._open and code not in (0x1001, 0x1002):
                 return PtpOutcome(NOT_OPEN)
-            asked = parameters + (0,) * (5 - len(parameters))
-            outcome = self.standard(code, asked) if code in self._common else None
-            return outcome if outcome is not None else self.vendor(code, asked, data)
+            padded = parameters + (0,) * (5 - len(parameters))
+            outcome = self.standard(code, padded) if code in self._common else None
+            return outcome if outcome is not None else self.vendor(code, padded, data)
 
-    def standard(self, code: int, asked: tuple[int, ...]) -> PtpOutcome | None:  # noqa: PLR0911
+    def standard(self, code: int, parameters: tuple[int, ...]) -> PtpOutcome | None:  # noqa: PLR0911
         """Operations of the standard that every family has; None for those that differ."""
         match code:
             case 0x1001:
@@ -257,24 +257,24 @@ class EmulatedBody:
             case 0x1005:
                 return PtpOutcome(data=self.card.storage_info())
             case 0x1006:
-                return PtpOutcome(parameters=(len(self.card.handles(asked[1], asked[2])),))
+                return PtpOutcome(parameters=(len(self.card.handles(parameters[1], parameters[2])),))
             case 0x1007:
-                return PtpOutcome(data=u32s(*self.card.handles(asked[1], asked[2])))
+                return PtpOutcome(data=u32s(*self.card.handles(parameters[1], parameters[2])))
             case 0x1008 | 0x1009 | 0x100A | 0x100B:
-                return self._object(code, asked[0])
+                return self._object(code, parameters[0])
             case _:
-                return self._battery(code) if asked[0] == 0x5001 else None
+                return self._battery(code) if parameters[0] == 0x5001 else None
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> PtpOutcome:
+    def vendor(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:
         """Everything else that is in ``operations``."""
         return PtpOutcome(NO_SUCH_PROPERTY)
 
-    def partial(self, asked: tuple[int, ...]) -> PtpOutcome:
+    def partial(self, parameters: tuple[int, ...]) -> PtpOutcome:
         """GetPartialObject: handle, offset, most bytes."""
-        stored = self.card.find(asked[0])
+        stored = self.card.find(parameters[0])
         if stored is None:
             return PtpOutcome(NO_SUCH_HANDLE)
-        piece = memoryview(stored.data)[asked[1] : asked[1] + asked[2]]
+        piece = memoryview(stored.data)[parameters[1] : parameters[1] + parameters[2]]
         return PtpOutcome(parameters=(len(piece),), data=piece)
 
     def full(self) -> bool:
@@ -317,7 +317,7 @@ class EmulatedBody:
         try:
             files = self._expose(exposed.settings)  # of a stage it lasts as long as the exposure, of a test no time
         except BaseException:
-            self.exposing = False  # the picture is lost, but the camera goes on
+            self.exposing = False  # the picture is lost, but the camera still works
             raise
         while (left_s := until - time.monotonic()) > 0 and not self.stopped.is_set():
             self.stopped.wait(min(left_s, 1.0))

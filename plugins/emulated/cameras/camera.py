@@ -208,7 +208,7 @@ class PtpIpCamera(Switchable):
         self._reply(connection, transaction, self.body.answer(code, parameters, data))
 
     def _hold_back(self) -> None:
-        """Slow and silent cameras; a silent one goes on once it may speak again."""
+        """Slow and silent cameras; a silent one continues once it may answer again."""
         if self.faults.slow_s:
             self.body.stopped.wait(self.faults.slow_s)
         while self.faults.silent and not self.body.stopped.is_set():

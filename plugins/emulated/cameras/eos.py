@@ -1,7 +1,7 @@
 """Emulated Canon EOS bodies: ``new`` with 9128/9129, and ``old`` with 910F as the EOS 400D of the paper has it.
 
-They report by records of 9116, keep pictures for the computer (D11C = 4) until 9117, and report those again to whoever
-connects next, until they are confirmed.
+They report by records of 9116, keep pictures for the computer (D11C = 4) until 9117, and report those again to the
+program that connects next, until they are confirmed.
 """
 
 from __future__ import annotations
@@ -145,10 +145,10 @@ class EmulatedEosBody(EmulatedBody):
             self._values[0xD1B0] = 0
         self._view_at = 0.0
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911, PLR0912
+    def vendor(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911, PLR0912
         match code:
             case 0x101B | 0x9107:
-                return self.partial(asked)
+                return self.partial(parameters)
             case 0x9101:
                 return PtpOutcome(data=u32s(STORAGE))
             case 0x9102:
@@ -156,11 +156,11 @@ class EmulatedEosBody(EmulatedBody):
             case 0x9110:
                 return self._set(data)
             case 0x9115:
-                return self._report_everything(on=asked[0] != 0)
+                return self._report_everything(on=parameters[0] != 0)
             case 0x9116:
                 return self._changes()
             case 0x9117:
-                return PtpOutcome() if self.card.waiting.pop(asked[0], None) else PtpOutcome(NO_SUCH_HANDLE)
+                return PtpOutcome() if self.card.waiting.pop(parameters[0], None) else PtpOutcome(NO_SUCH_HANDLE)
             case 0x911A if self.faults.space_refused:
                 self._values[0xD11B] = 1000
                 return PtpOutcome(GENERAL_ERROR)
@@ -170,7 +170,7 @@ class EmulatedEosBody(EmulatedBody):
             case 0x910F:
                 return self._release_old()
             case 0x9128 | 0x9129:
-                return self._button(asked[0], down=code == 0x9128)
+                return self._button(parameters[0], down=code == 0x9128)
             case 0x9125:
                 return self._fire(bulb=True) if self._values[0xD102] == BULB else PtpOutcome(GENERAL_ERROR)
             case 0x9126:
@@ -264,11 +264,11 @@ class EmulatedEosBody(EmulatedBody):
             return PtpOutcome(WRONG_VALUE)
         code, value = struct.unpack_from("<II", data, 4)
         if code == 0xD120:
-            wanted = read_format(data[8:])
-            if wanted not in FORMATS:
+            formats = read_format(data[8:])
+            if formats not in FORMATS:
                 return PtpOutcome(WRONG_VALUE)
-            self._format = wanted
-            self._report(0xC189, struct.pack("<I", code) + format_bytes(wanted))
+            self._format = formats
+            self._report(0xC189, struct.pack("<I", code) + format_bytes(formats))
             return PtpOutcome()
         if code not in self._values or value not in self._lists.get(code, (value,)):
             return PtpOutcome(WRONG_VALUE)

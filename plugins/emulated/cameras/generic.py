@@ -71,16 +71,16 @@ class EmulatedGenericBody(EmulatedBody):
             0x500F: Setting(0x0004, "H", 100, isos),
         }
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> PtpOutcome:
+    def vendor(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:
         if code == 0x101B:
-            return self.partial(asked)
+            return self.partial(parameters)
         if code == 0x100E:
-            return self._capture(asked[1])
-        setting = self.settings.get(asked[0])
+            return self._capture(parameters[1])
+        setting = self.settings.get(parameters[0])
         if setting is None:
             return PtpOutcome(NO_SUCH_PROPERTY)
         if code == 0x1014:
-            return PtpOutcome(data=setting.description(asked[0]))
+            return PtpOutcome(data=setting.description(parameters[0]))
         if code == 0x1015:
             return PtpOutcome(data=struct.pack("<" + setting.pack, setting.current))
         return self._set(setting, data)
@@ -150,7 +150,7 @@ class EmulatedNikonBody(EmulatedGenericBody):
     def session_ended(self) -> None:
         self._view_at = None
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911
+    def vendor(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911
         match code:
             case 0x90C2:
                 return PtpOutcome()
@@ -173,7 +173,7 @@ class EmulatedNikonBody(EmulatedGenericBody):
             case 0x100E | 0x9207:
                 return self._release()
             case _:
-                return self._linked(asked[0], super().vendor(code, asked, data))
+                return self._linked(parameters[0], super().vendor(code, parameters, data))
 
     def exposed(self, exposed: ExposedPicture) -> None:
         for stored in exposed.stored:

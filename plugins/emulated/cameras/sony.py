@@ -69,30 +69,30 @@ class EmulatedSonyBody(EmulatedBody):
                     self.card.waiting.pop(next(iter(self.card.waiting), 0), None)
             return super().answer(code, parameters, data)
 
-    def standard(self, code: int, asked: tuple[int, ...]) -> PtpOutcome | None:
-        if code in (0x1008, 0x1009) and asked[0] == _HANDLE:
+    def standard(self, code: int, parameters: tuple[int, ...]) -> PtpOutcome | None:
+        if code in (0x1008, 0x1009) and parameters[0] == _HANDLE:
             stored = self._next_picture()
             if stored is None:
                 return PtpOutcome(NO_SUCH_HANDLE)
             self._fetched = code == 0x1009
             return PtpOutcome(data=stored.info() if code == 0x1008 else stored.data)
-        return super().standard(code, asked)
+        return super().standard(code, parameters)
 
-    def vendor(self, code: int, asked: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911
+    def vendor(self, code: int, parameters: tuple[int, ...], data: bytes) -> PtpOutcome:  # noqa: PLR0911
         match code:
             case 0x9201:
-                self._phase = asked[0]
+                self._phase = parameters[0]
                 return PtpOutcome(data=bytes(8))
             case 0x9202:
                 codes = (*self.settings, _MEMORY, _BATTERY)
-                self._version = min(asked[0], _VERSION)
+                self._version = min(parameters[0], _VERSION)
                 return PtpOutcome(data=struct.pack("<H", self._version) + u16s(*codes) + u16s(_HALF, _FULL))
             case _ if self._phase != 3:
                 return PtpOutcome(GENERAL_ERROR)
             case 0x9205:
-                return self._set(asked[0], data)
+                return self._set(parameters[0], data)
             case 0x9207:
-                return self._button(asked[0], data)
+                return self._button(parameters[0], data)
             case 0x9209:
                 return PtpOutcome(data=self._properties())
             case _:

@@ -77,9 +77,6 @@ class Faults:
         with self._lock:
             self._now = WireFaults()
 
-    def drop_next_reply(self, count: int = 1) -> None:
-        self.set(drop=count)
-
     def loses_this_one(self) -> bool:
         """Whether the answer about to be sent is lost; counts ``drop`` down."""
         with self._lock:

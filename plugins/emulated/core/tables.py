@@ -156,7 +156,7 @@ class _Reader:
     def _line(self, path: Path_) -> int:
         """Line of the key, or of the table that should hold it; 1-based. tomllib keeps no positions."""
         best, matched, counts = 1, 0, dict[str, int]()
-        wanted = [(i, part) for i, part in enumerate(path) if isinstance(part, str)]
+        names = [(i, part) for i, part in enumerate(path) if isinstance(part, str)]
         current: Path_ = ()
         for number, line in enumerate(self._lines, start=1):
             header = _HEADER.match(line)
@@ -167,7 +167,7 @@ class _Reader:
                     best, matched = number, depth
                 continue
             key = line.partition("=")[0].strip().strip("\"'")
-            for index, part in wanted:
+            for index, part in names:
                 if key == part and path[:index] == current and "=" in line:
                     return number
         return best

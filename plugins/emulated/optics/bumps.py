@@ -1,4 +1,4 @@
-"""Bumps: what somebody does to the emulated stage after it was set up, as ``bench/bumps.toml``; changes count at once.
+"""Bumps: changes of the emulated stage after it was set up, as ``bench/bumps.toml``; changes count at once.
 
 [[bump]]
 what = "projector"      # or "camera", "object", "ambient"
@@ -90,7 +90,7 @@ class Bump:
 
 @dataclass(frozen=True, slots=True)
 class Bumps:
-    """All of them, each on top of the one before."""
+    """All of them; each is applied to the stage that the earlier ones left."""
 
     bump: tuple[Bump, ...] = ()
 

@@ -212,8 +212,8 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
     """
     count, file = settings.get("projectors"), settings.get("stands")
     if isinstance(count, list | tuple):
-        known = [place[0] for place in PLACES]
-        if not count or len(set(map(str, count))) != len(count) or any(name not in known for name in count):
+        names = [place[0] for place in PLACES]
+        if not count or len(set(map(str, count))) != len(count) or any(name not in names for name in count):
             raise _wrong("projectors", count)
         return Stands(len(count), names=tuple(count))
     if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(PLACES)):

@@ -83,9 +83,9 @@ def _remove_oldest(folder: Path, newest: Path) -> None:
     for path, status in _files(folder, "*.part"):
         if status.st_mtime < now.st_mtime - UNFINISHED_S:
             path.unlink(missing_ok=True)
-    found = [(path, status) for path, status in _files(folder, "*.npz") if path != newest]
+    older = [(path, status) for path, status in _files(folder, "*.npz") if path != newest]
     total = now.st_size
-    for path, status in sorted(found, key=lambda one: -one[1].st_mtime):
+    for path, status in sorted(older, key=lambda one: -one[1].st_mtime):
         total += status.st_size
         if total > MOST_BYTES:
             path.unlink(missing_ok=True)

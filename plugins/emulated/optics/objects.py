@@ -301,10 +301,10 @@ class ObjectInRoom:
     def albedo(self, points: Floats, faces: npt.NDArray[np.int32], weights: npt.NDArray[np.float32]) -> Rgb:
         """As ``StageObject.albedo``."""
         on_object = faces < self.object_faces
-        found = np.empty((len(points), 3), dtype=np.float32)
-        found[on_object] = self.thing.albedo(points[on_object], faces[on_object], weights[on_object])
-        found[~on_object] = self.colours[(faces[~on_object] - self.object_faces) // 2]
-        return found
+        colours = np.empty((len(points), 3), dtype=np.float32)
+        colours[on_object] = self.thing.albedo(points[on_object], faces[on_object], weights[on_object])
+        colours[~on_object] = self.colours[(faces[~on_object] - self.object_faces) // 2]
+        return colours
 
     def fingerprint(self) -> list[npt.NDArray[Any]]:
         """Arrays that differ where the scene does."""

@@ -63,7 +63,7 @@ class FrameReader:
     def _read(self, handle: int) -> VisibleFrameSet | None:
         status = os.fstat(handle)
         identity = (status.st_dev, status.st_ino)
-        known = self._last[1] if self._last is not None and self._last[0] == identity else None
+        previous = self._last[1] if self._last is not None and self._last[0] == identity else None
         for _ in range(TRIES):
             head = os.pread(handle, LONGEST_HEAD_BYTES, 0)
             try:
@@ -71,19 +71,19 @@ class FrameReader:
             except ProtocolError:
                 return None
             sequence, presented_at_s = parse_set(head)
-            if known is not None and known.sequence == sequence:
-                return known
+            if previous is not None and previous.sequence == sequence:
+                return previous
             if sequence % 2 == 0:
                 frames = _frames(handle, layout, status.st_size)
                 after = os.pread(handle, LONGEST_HEAD_BYTES, 0)
                 if len(after) == len(head) and parse_set(after)[0] == sequence:
                     if frames is None:
                         return None
-                    found = VisibleFrameSet(sequence, presented_at_s, frames)
-                    self._last = (identity, found)
-                    return found
+                    newest = VisibleFrameSet(sequence, presented_at_s, frames)
+                    self._last = (identity, newest)
+                    return newest
             time.sleep(0.0005)
-        return known
+        return previous
 
 
 def _frames(handle: int, layout: FrameLayout, file_size: int) -> dict[str, ByteImage] | None:
@@ -123,12 +123,12 @@ class VisibleFrames:
     def update(self) -> None:
         """Read the memory output now."""
         with self._lock:
-            found = self._reader.latest()
+            latest = self._reader.latest()
             _, newest = self._history[-1]
-            if found is not newest:
+            if latest is not newest:
                 self._changed_s = time.monotonic()
-                at = self._changed_s if found is None else found.presented_at_s
-                self._history.append((max(at + self._latency_s, self._history[-1][0]), found))
+                at = self._changed_s if latest is None else latest.presented_at_s
+                self._history.append((max(at + self._latency_s, self._history[-1][0]), latest))
 
     def during(self, start_s: float, end_s: float) -> list[tuple[float, VisibleFrameSet | None]]:
         """The sets that were visible between two times, with their shares of that time (sum 1); None is no picture."""

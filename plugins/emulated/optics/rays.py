@@ -74,13 +74,13 @@ def samples_of(truth: BenchTruth, stage_object: StageObject, cache: Path | None,
     key = key_of(truth, stage_object)
     arrays = None if cache is None else read_arrays(cache, KIND, key)
     if arrays is not None and set(arrays) == {field.name for field in fields(Samples)}:
-        found = Samples(**arrays)
+        samples = Samples(**arrays)
     else:
-        found = cast(truth, stage_object, progress)
+        samples = cast(truth, stage_object, progress)
         if cache is not None:
-            write_arrays(cache, KIND, key, {field.name: getattr(found, field.name) for field in fields(Samples)})
+            write_arrays(cache, KIND, key, {field.name: getattr(samples, field.name) for field in fields(Samples)})
     progress(1.0)
-    return found
+    return samples
 
 
 def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Samples:
@@ -146,15 +146,15 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
     at_x, at_y = np.asarray(x + dx, np.float64).ravel(), np.asarray(y + dy, np.float64).ravel()
     ray = directions(camera.pose, camera.lens, at_x, at_y)
     origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
-    found = scene.run(origin, ray.astype(np.float32), output=1)
-    hit = found["primID"] >= 0
+    hits = scene.run(origin, ray.astype(np.float32), output=1)
+    hit = hits["primID"] >= 0
     counts = hit.reshape(-1, s * s).sum(axis=1)
-    ray, faces = ray[hit], found["primID"][hit]
-    weights = np.stack((1.0 - found["u"][hit] - found["v"][hit], found["u"][hit], found["v"][hit]), axis=-1)
+    ray, faces = ray[hit], hits["primID"][hit]
+    weights = np.stack((1.0 - hits["u"][hit] - hits["v"][hit], hits["u"][hit], hits["v"][hit]), axis=-1)
     points = np.einsum("nk,nkc->nc", weights.astype(np.float64), things.vertices[things.faces[faces]])
     normals = np.einsum("nk,nkc->nc", weights, things.normals[faces]).astype(np.float64)
     normals /= np.maximum(length(normals), 1e-12)[:, None]
-    normals *= _facing(found["Ng"][hit].astype(np.float64), normals, ray)[:, None]
+    normals *= _facing(hits["Ng"][hit].astype(np.float64), normals, ray)[:, None]
     lit = [_lit(projector, scene, points, normals) for projector in truth.projectors]
     on_object = faces < things.object_faces
     gloss = [_highlight(truth, one, points, normals, ray, on_object) / (s * s) for one in truth.projectors]
@@ -244,10 +244,10 @@ def _highlight(
     half = towards - ray
     half /= np.maximum(length(half), 1e-9)[:, None]
     cosine = np.clip(dot(half, normals), 0.0, 1.0)
-    found = strength * (exponent + 8.0) / 8.0 * cosine**exponent
+    highlight = strength * (exponent + 8.0) / 8.0 * cosine**exponent
     if varnish.strength > 0.0:
-        found += varnish.strength * reflected(towards, -ray, normals, varnish.roughness, varnish.index)
-    return np.asarray(on_object * found)
+        highlight += varnish.strength * reflected(towards, -ray, normals, varnish.roughness, varnish.index)
+    return np.asarray(on_object * highlight)
 
 
 def _in_shadow(lens: Floats, scene: Any, points: Floats, distance: Floats) -> npt.NDArray[np.bool_]:

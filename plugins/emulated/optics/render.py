@@ -63,8 +63,8 @@ def channels(
         each = _looked_up(table, frame)
     else:
         start, frames = shutter.start_s / dithering.frame_s, shutter.open_s / dithering.frame_s
-        wanted = _looked_up(table, frame)
-        made = mean_light(wanted, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
+        exact = _looked_up(table, frame)
+        made = mean_light(exact, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
         each = np.float32(black) + np.float32(1.0 - black) * made
     if light.white_segment > 0.0:
         each += np.float32(light.white_segment) * each.min(axis=-1, keepdims=True)

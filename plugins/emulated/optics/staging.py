@@ -264,7 +264,7 @@ def _aimed(
     """
     width, height = lens.size_px
     roll = float(np.deg2rad(rng.uniform(-1.0, 1.0)))
-    wanted = np.array([middle[0] * (width - 1), middle[1] * (height - 1)])
+    image_middle = np.array([middle[0] * (width - 1), middle[1] * (height - 1)])
     target = np.zeros(3)
     lens = dataclasses.replace(lens, focal_px=1.8 * width)
     for _ in range(16):
@@ -274,7 +274,7 @@ def _aimed(
         lens = dataclasses.replace(
             lens, focal_px=lens.focal_px * fill * float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
         )
-        miss = (0.5 * (low + high) - wanted) / lens.focal_px * float(np.mean(local[:, 2]))
+        miss = (0.5 * (low + high) - image_middle) / lens.focal_px * float(np.mean(local[:, 2]))
         target = target + pose.rotation.T @ np.array([miss[0], miss[1], 0.0])
     return pose, lens
 

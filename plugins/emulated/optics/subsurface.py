@@ -66,13 +66,15 @@ def _triangles(pixels: npt.NDArray[np.int32], points: Floats, width: int) -> tup
     index = _index(pixels, width, 1)
     here, right, below, across = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     pairs = (here, right, below), (right, across, below)
-    found = np.concatenate([np.stack([one.ravel() for one in corners], axis=1) for corners in pairs])
-    found = found[(found >= 0).all(axis=1)]
-    if not len(found):
-        return found, np.inf
-    sides = np.max([np.linalg.norm(points[found[:, n]] - points[found[:, n - 1]], axis=1) for n in range(3)], axis=0)
+    triangles = np.concatenate([np.stack([one.ravel() for one in corners], axis=1) for corners in pairs])
+    triangles = triangles[(triangles >= 0).all(axis=1)]
+    if not len(triangles):
+        return triangles, np.inf
+    sides = np.max(
+        [np.linalg.norm(points[triangles[:, n]] - points[triangles[:, n - 1]], axis=1) for n in range(3)], axis=0
+    )
     usual = float(np.median(sides))
-    return found[sides <= TORN * usual], usual
+    return triangles[sides <= TORN * usual], usual
 
 
 def _index(pixels: npt.NDArray[np.int32], width: int, around: int) -> npt.NDArray[np.int64]:
@@ -84,7 +86,7 @@ def _index(pixels: npt.NDArray[np.int32], width: int, around: int) -> npt.NDArra
 
 
 def _between(
-    pixels: npt.NDArray[np.int32], points: Floats, known: Mask, width: int, step: int, farthest_m: float
+    pixels: npt.NDArray[np.int32], points: Floats, has_area: Mask, width: int, step: int, farthest_m: float
 ) -> Any:
     """(P, N) shares of the light at every ``step``th pixel of both axes, linear between them; their sum is 1.
 
@@ -101,7 +103,7 @@ def _between(
             at = index[(row // step + down) * step, (column // step + right) * step]
             share = np.abs(1 - down - row % step / step) * np.abs(1 - right - column % step / step)
             near = np.linalg.norm(points - points[at], axis=1) <= farthest_m
-            used = np.flatnonzero((at >= 0) & near & known & known[at] & (share > 0))
+            used = np.flatnonzero((at >= 0) & near & has_area & has_area[at] & (share > 0))
             rows.append(used)
             places.append(at[used])
             values.append(share[used])

@@ -8,7 +8,6 @@ the only state that they act on.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar, Final, Protocol
 
 from plugins.emulated.projectors.lamp import EmulatedLamp
@@ -76,36 +75,3 @@ class LineBoard(LampBoard):
             return None
         self._received[:] = rest
         return line[max(0, line.rfind(self.start)) :] if self.start else line
-
-
-class OddBoard:
-    """Any board, except for ``answers``: by the bytes of a question, what is answered instead; None: no answer.
-
-    ``heard``: those questions, in the order in which they were asked.
-    """
-
-    def __init__(self, board: Board, answers: Mapping[bytes, bytes | None]) -> None:
-        self._board = board
-        self._answers = answers
-        self._tail = b""
-        self.heard: list[bytes] = []
-
-    def feed(self, data: bytes, *, busy: bool = False) -> list[bytes]:
-        """See ``Board``."""
-        sent = []
-        for byte in data:
-            usual = self._board.feed(bytes([byte]), busy=busy)
-            self._tail = (self._tail + bytes([byte]))[-_LONGEST:]
-            question = next((question for question in self._answers if self._tail.endswith(question)), None)
-            if question is None:
-                sent += usual
-                continue
-            self.heard.append(question)
-            self._tail = b""
-            answer = self._answers[question]
-            sent += [] if answer is None else [answer]
-        return sent
-
-    def notices(self) -> list[bytes]:
-        """See ``Board``."""
-        return self._board.notices()

@@ -47,8 +47,8 @@ def read_levels(datagram: bytes) -> Levels | None:
         return None
     (preamble, _, identifier, _, root, source, _, framing, _, priority, _, sequence, options, universe, length, set_,
      kind, first, step, count) = _HEAD.unpack_from(datagram)  # fmt: skip
-    known = (preamble, identifier, root, framing, set_, kind, first, step)
-    if known != (0x10, _IDENTIFIER, 4, 2, 2, 0xA1, 0, 1) or count < 1 or length & _LENGTH != count + 10:
+    fixed = (preamble, identifier, root, framing, set_, kind, first, step)
+    if fixed != (0x10, _IDENTIFIER, 4, 2, 2, 0xA1, 0, 1) or count < 1 or length & _LENGTH != count + 10:
         return None
     values = datagram[_HEAD.size : _HEAD.size + count]
     if len(values) != count or values[0] != 0 or options & 0x80:

@@ -26,7 +26,7 @@ _TICK_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What comes of received bytes: ``say`` back at once, ``commands`` for the board, ``close`` the connection."""
+    """What received bytes lead to: ``say`` back at once, ``commands`` for the board, ``close`` the connection."""
 
     say: bytes = b""
     commands: bytes = b""
@@ -41,7 +41,7 @@ class Gate(Protocol):
 
     def hear(self, data: bytes) -> Heard: ...
 
-    def answer(self, said: bytes) -> bytes:
+    def answer(self, reply: bytes) -> bytes:
         """An answer of the board as it goes out."""
 
 
@@ -60,8 +60,8 @@ class OpenGate:
     def hear(self, data: bytes) -> Heard:
         return Heard(commands=data)
 
-    def answer(self, said: bytes) -> bytes:
-        return said
+    def answer(self, reply: bytes) -> bytes:
+        return reply
 
 
 class EscVpNetGate(OpenGate):
@@ -78,10 +78,10 @@ class EscVpNetGate(OpenGate):
         rest = bytes(self._kept[16 + 18 * count :])
         if head[:12] != b"ESC/VP.net\x10\x03":
             return Heard(b"ESC/VP.net\x10\x03\0\0\x40\0", close=True)
-        given = [header[2:].rstrip(b"\0") for header in headers if header[:1] == b"\x01"]
-        if self._password and not given:
+        passwords = [header[2:].rstrip(b"\0") for header in headers if header[:1] == b"\x01"]
+        if self._password and not passwords:
             return Heard(b"ESC/VP.net\x10\x03\0\0\x41\0", close=True)
-        if self._password and given[0] != self._password.encode():
+        if self._password and passwords[0] != self._password.encode():
             return Heard(b"ESC/VP.net\x10\x03\0\0\x43\0", close=True)
         self._passed = True
         return Heard(b"ESC/VP.net\x10\x03\0\0\x20\0", rest)
@@ -111,8 +111,8 @@ class NtControlGate(OpenGate):
             return Heard(b"ERRA\r" if self._proof else b"ERR1\r", close=True)
         return Heard(commands=b"\x02ADZZ;" + line[len(self._proof) + 2 :] + b"\x03")
 
-    def answer(self, said: bytes) -> bytes:
-        body = said.strip(b"\x02\x03")
+    def answer(self, reply: bytes) -> bytes:
+        body = reply.strip(b"\x02\x03")
         if body.startswith(b"ER"):
             return {b"ER401": b"ERR3", b"ER402": b"ERR2"}.get(body, b"ERR1") + b"\r"
         return b"00" + body + b"\r"

@@ -88,7 +88,7 @@ class UsbDevices:
     """The bus with its devices plugged in, in a process of its own; a context.
 
     ``stage_camera``: what ``usb_stage_camera.Exposures.camera`` tells, for the device that is one;
-    ``environment``: what a program's environment must have besides, so that it sees them. Raises DeviceError
+    ``environment``: variables that a program needs to see them. Raises DeviceError
     ("usb-no-preload") where the preload library is missing.
     """
 

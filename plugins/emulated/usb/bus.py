@@ -158,7 +158,7 @@ _USB_MAJOR: Final = 189
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """What a program's environment must have besides, so that it sees the bus in ``folder``."""
+    """The variables that a program needs to see the bus in ``folder``."""
     return {"LD_PRELOAD": PRELOAD, "UMOCKDEV_DIR": os.fspath(folder)}
 
 

@@ -47,7 +47,7 @@ _VENDORS: Final = {
 
 @dataclass(slots=True)
 class UsbCameraFaults(FaultCounts):
-    """Knobs of the pipes, besides ``CameraFaults``. Counts go down as they are used.
+    """Knobs of the pipes; ``CameraFaults`` has the others. Counts go down as they are used.
 
     ``stall_in``, ``stall_out``: that many transfers end with a halted pipe; ``split_headers``: the header of data
     comes in a packet of its own; ``zero_packets``: transfers of whole packets end with an empty one, as they should;
@@ -120,7 +120,7 @@ class EmulatedUsbCamera(EmulatedUsbDevice):
         self.body.power_on()
 
     def plugged(self) -> None:
-        """Power of the bus, or a reset: a new life, though the card and the shutter go on."""
+        """Power of the bus, or a reset: a new life, but the card and the shutter stay as they are."""
         super().plugged()
         self._life += 1
         self._asked = None
@@ -305,7 +305,7 @@ class ExposureServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # A camera that never asked: who waits for a connection hears of nothing but a connection.
+        # A camera that never asked: only a connection ends the wait for one.
         with contextlib.suppress(OSError):
             Client(str(self._listener.address), "AF_UNIX").close()
         self._thread.join()
@@ -315,14 +315,14 @@ class ExposureServer:
 def stage_camera(exposures: str, serial: str, *, raw: bool = True) -> EmulatedUsbCamera:
     """A camera whose pictures are those of the stage; its arguments are what ``ExposureServer.camera`` tells."""
     turn = threading.Lock()
-    asked: list[Connection] = []
+    bench: list[Connection] = []
 
     def expose(settings: ShotSettings) -> ShotFiles:
         with turn:
-            if not asked:
-                asked.append(Client(exposures, "AF_UNIX"))
-            asked[0].send_bytes(json.dumps(dataclasses.asdict(settings)).encode())
-            found, shown = asked[0].recv_bytes(), asked[0].recv_bytes()
+            if not bench:
+                bench.append(Client(exposures, "AF_UNIX"))
+            bench[0].send_bytes(json.dumps(dataclasses.asdict(settings)).encode())
+            found, shown = bench[0].recv_bytes(), bench[0].recv_bytes()
         return ShotFiles(raw=found or None, jpeg=shown or None)
 
     # The world behind it spends the exposure time itself, since it must know what is visible meanwhile.

@@ -95,7 +95,7 @@ class InPipe:
         self.halted = False
 
     def put(self, data: bytes | memoryview, *, whole: bool = True) -> None:
-        """Queue one transfer; ``whole`` False: it goes on in the next one, with no short packet between them."""
+        """Queue one transfer; ``whole`` False: the next one continues it, with no short packet between them."""
         self._waiting.append(memoryview(bytes(data) if len(data) < self._packet else data))
         if whole and self._zero_packets and data and len(data) % self._packet == 0:
             self._waiting.append(memoryview(b""))
@@ -135,7 +135,7 @@ class EmulatedUsbDevice:
     hid_descriptor: bytes = b""
     kernel_driver: str = ""
     wrongs: Mapping[str, tuple[Any, ...]] = {}
-    """Further knobs besides ``faults``, and the values that cause a fault."""
+    """Knobs outside ``faults``, and their values that cause a fault."""
 
     def __init__(self, names: UsbNames) -> None:
         self.names = names
@@ -148,7 +148,7 @@ class EmulatedUsbDevice:
         self.pipes = {one.address: InPipe(one.packet) for one in self.endpoints if one.address & 0x80}
 
     def plugged(self) -> None:
-        """Hook: power has come; state starts afresh."""
+        """Hook: power has come; the state is new."""
         for pipe in self.pipes.values():
             pipe.clear()
 

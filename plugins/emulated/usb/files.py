@@ -244,9 +244,9 @@ class UsbFile:
                 urb.answer = self._device.control(urb.setup, urb.data)
                 urb.result = (0, len(urb.answer) if urb.setup.to_host else len(urb.data))
             elif urb.endpoint & 0x80:
-                if (found := self._device.pipes[urb.endpoint].take(urb.length)) is None:
+                if (data := self._device.pipes[urb.endpoint].take(urb.length)) is None:
                     return False
-                urb.answer, urb.result = found, (0, len(found))
+                urb.answer, urb.result = data, (0, len(data))
             else:
                 self._device.out(urb.endpoint, urb.data)
                 urb.result = (0, len(urb.data))

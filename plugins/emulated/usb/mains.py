@@ -1,7 +1,7 @@
 """The mains of an emulated stage: which relay of which emulated board feeds which projector (``[[mains]]``).
 
-The relays are moved by whoever drives the emulated board, through real bytes; the projectors behind them then lose
-their mains or boot, and a lamp that was cut hot counts the damage.
+The relays are moved by the program that drives the emulated board, through real bytes; the projectors behind them then
+lose their mains or boot, and a lamp that was cut hot counts the damage.
 """
 
 from __future__ import annotations

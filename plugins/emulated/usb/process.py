@@ -251,7 +251,7 @@ class _Commands:
                 holder, knob = _find(device, command["knob"])
                 is_set = isinstance(getattr(holder, knob), frozenset)
                 setattr(holder, knob, frozenset(command["value"]) if is_set else command["value"])
-                device.on_ready()  # what a fault has held back may go on now
+                device.on_ready()  # what a fault has held back may continue
             case "get":
                 holder, knob = _find(device, command["knob"])
                 return getattr(holder, knob)
@@ -289,8 +289,8 @@ def _kind(name: str) -> Callable[..., EmulatedUsbDevice]:
     module, separator, attribute = name.partition(":")
     if not separator:
         return KINDS[name]
-    found: Callable[..., EmulatedUsbDevice] = getattr(importlib.import_module(module), attribute)
-    return found
+    factory: Callable[..., EmulatedUsbDevice] = getattr(importlib.import_module(module), attribute)
+    return factory
 
 
 def _find(device: EmulatedUsbDevice, dotted: str) -> tuple[Any, str]:
@@ -309,7 +309,7 @@ def serve(folder: Path, commands: IO[str], answers: IO[str]) -> None:
         for line in commands:
             try:
                 answer = {"value": table.obey(json.loads(line))}
-            except Exception as error:  # noqa: BLE001 - whatever it is, whoever gave the command must hear of it
+            except Exception as error:  # noqa: BLE001 - any error goes to the program that gave the command
                 answer = {"error": f"{type(error).__name__}: {error}"}
             answers.write(json.dumps(answer, default=sorted) + "\n")  # JSON has no sets
             answers.flush()

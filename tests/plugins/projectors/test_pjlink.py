@@ -46,7 +46,7 @@ def test_a_wrong_or_missing_password_is_refused_with_where_to_set_it(
 
 def test_a_lost_answer_is_asked_again_once(open_pjlink: Any) -> None:
     pair = open_pjlink(edit=hasty)
-    pair.emulator.faults.drop_next_reply()
+    pair.emulator.faults.set(drop=1)
     assert pair.driver.status(deadline=in_seconds(SOON)).lamp_hours == 1200
 
 

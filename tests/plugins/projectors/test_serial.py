@@ -39,7 +39,7 @@ SOON = 30.0
 
 def test_a_lost_answer_is_asked_again_and_never_mistaken_for_the_next(open_serial: Any) -> None:
     pair = open_serial(edit=hasty)
-    pair.emulator.faults.drop_next_reply()
+    pair.emulator.faults.set(drop=1)
     status = pair.driver.status(deadline=in_seconds(SOON))
     assert (status.power, status.lamp_hours) == (Power.OFF, 1200)
 

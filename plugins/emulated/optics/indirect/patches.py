@@ -65,13 +65,13 @@ class Patches:
 
     def hit(self, origins: Floats, rays: Floats) -> Hits:
         """What each ray hits first."""
-        found = self.rays.run(origins.astype(np.float32), rays.astype(np.float32), output=1)
-        face = np.asarray(found["primID"], dtype=np.int64)
+        hits = self.rays.run(origins.astype(np.float32), rays.astype(np.float32), output=1)
+        face = np.asarray(hits["primID"], dtype=np.int64)
         normals = self.normals[face]
         front = np.sum(normals * rays, axis=1) < 0.0
         return Hits(
             patch=np.where(face >= 0, 2 * self.group[face] + np.where(front, 0, 1), -1),
-            points=origins + np.where(face >= 0, found["tfar"], 0.0)[:, None] * rays,
+            points=origins + np.where(face >= 0, hits["tfar"], 0.0)[:, None] * rays,
             normals=np.where(front[:, None], normals, -normals),
         )
 
@@ -84,8 +84,8 @@ def patches_of(scene: Scene, count: int) -> Patches:
     areas = [_area(scene, np.arange(n, n + 2)) for n in range(scene.object_faces, len(scene.faces), 2)]
     for number in range(surfaces):
         first = scene.object_faces + 2 * number
-        wanted = max(4, round((count - on_object) * areas[number] / sum(areas)))
-        parts.append(_groups(scene, np.arange(first, first + 2), wanted))
+        share = max(4, round((count - on_object) * areas[number] / sum(areas)))
+        parts.append(_groups(scene, np.arange(first, first + 2), share))
     offsets = np.cumsum([0, *(part[1].max() + 1 for part in parts)])
     corners = np.concatenate([part[0] for part in parts])
     group = np.concatenate([part[1] + offset for part, offset in zip(parts, offsets, strict=False)])
@@ -117,11 +117,11 @@ def _sorted(corners: Floats, group: Integers, albedo: Floats, body: Integers, si
     )  # fmt: skip
 
 
-def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integers, Floats, float]:
+def _groups(scene: Scene, faces: Integers, count: int) -> tuple[Floats, Integers, Floats, float]:
     """Corners of the (cut) faces, their groups, their albedo, and the size of a group."""
     import trimesh
 
-    size = np.sqrt(_area(scene, faces) / wanted)
+    size = np.sqrt(_area(scene, faces) / count)
     corners, source = _cut(scene, faces, FINEST * size)
     normals, areas = _normals(corners)
     corners, normals, source = corners[areas > 0.0], normals[areas > 0.0], source[areas > 0.0]
@@ -141,7 +141,7 @@ def _groups(scene: Scene, faces: Integers, wanted: int) -> tuple[Floats, Integer
     low, high = 0.5 * size, 4.0 * size
     for _ in range(10):
         size = np.sqrt(low * high)
-        many = len(np.unique(keys(size, max(1, len(place) // FACES_COUNTED)))) > wanted
+        many = len(np.unique(keys(size, max(1, len(place) // FACES_COUNTED)))) > count
         low, high = (size, high) if many else (low, size)
     group = np.unique(keys(size), return_inverse=True)[1]
     return corners, group.reshape(-1), albedo.astype(np.float64), float(size)

@@ -46,7 +46,7 @@ class Met:
 
 
 class MitsubaScene:
-    """Use by one thread, in a process where nobody else uses Mitsuba: its variant is one for all.
+    """Use by one thread, in a process where nothing else uses Mitsuba: its variant is one for all.
 
     Raises DeviceError ``engine-missing`` where Mitsuba can't be used.
     """
@@ -90,10 +90,17 @@ class MitsubaScene:
         o, d = ([mi.Float(axis) for axis in part] for part in columns)
         return mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
 
-    def _met(self, found: Any, rays: Floats) -> Met:
+    def _met(self, interaction: Any, rays: Floats) -> Met:
         import drjit
 
-        parts = (found.is_valid(), found.sh_frame.n, found.n, found.uv, found.p, found.prim_index)
+        parts = (
+            interaction.is_valid(),
+            interaction.sh_frame.n,
+            interaction.n,
+            interaction.uv,
+            interaction.p,
+            interaction.prim_index,
+        )
         # All of them by one kernel: each array by itself would trace the rays again.
         drjit.eval(*parts)
         valid, smooth, flat, corners, points, faces = (np.array(part) for part in parts)
@@ -227,11 +234,11 @@ class _Cells:
         tree = cKDTree(np.concatenate([centres, TURN_M * facing], axis=1))
         places = np.concatenate([self.points, TURN_M * self.normals], axis=1)
         nearest = tree.query(places, k=np.arange(1, min(NEAREST, self.count) + 1), workers=-1)
-        away, found = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
+        away, cell = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
         weight = (1.0 - (away / (1.001 * away[:, -1:] + 1e-12)) ** 2) ** 2
         weight /= weight.sum(axis=1, keepdims=True)
-        rows = np.repeat(np.arange(len(places)), found.shape[1])
-        whole = sparse.csr_matrix((weight.ravel(), (rows, found.ravel())), shape=(len(places), self.count))
+        rows = np.repeat(np.arange(len(places)), cell.shape[1])
+        whole = sparse.csr_matrix((weight.ravel(), (rows, cell.ravel())), shape=(len(places), self.count))
         return whole.astype(np.float32)
 
 
@@ -242,9 +249,9 @@ def _cells(truth: BenchTruth, traced: MitsubaScene, pixels: npt.NDArray[np.int32
     missed = np.arange(len(row))
     for dx, dy in ((0.0, 0.0), (-0.4, -0.4), (0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)):
         rays = directions(truth.camera.pose, truth.camera.lens, column[missed] + dx, row[missed] + dy)
-        found = traced.hit(np.broadcast_to(np.asarray(truth.camera.pose.position_m), rays.shape), rays)
-        points[missed[found.ray]], normals[missed[found.ray]] = found.points, found.normals
-        missed = np.setdiff1d(missed, missed[found.ray])
+        hits = traced.hit(np.broadcast_to(np.asarray(truth.camera.pose.position_m), rays.shape), rays)
+        points[missed[hits.ray]], normals[missed[hits.ray]] = hits.points, hits.normals
+        missed = np.setdiff1d(missed, missed[hits.ray])
     side = max(1, round(width / CELLS_ACROSS))
     block = (row // side) * width + column // side
     depth = np.floor(np.linalg.norm(points - truth.camera.pose.position_m, axis=1) / SPLIT_M).astype(np.int64)
@@ -267,7 +274,7 @@ def _block(
     points, normals = cells.draw(mine, truth.paths, rng)
     row = np.repeat(np.arange(len(mine)), truth.paths)
     through = np.full((len(row), 3), 1.0 / truth.paths)
-    found: list[list[tuple[Any, ...]]] = [[] for _ in truth.projectors]
+    entries: list[list[tuple[Any, ...]]] = [[] for _ in truth.projectors]
     for _ in range(BOUNCES):
         met = traced.leave(points, normals, _diffuse(normals, rng))
         row, points, normals = row[met.ray], met.points, met.normals
@@ -278,10 +285,10 @@ def _block(
             x, y = np.floor(at + 0.5).astype(np.int64).T
             lit = np.flatnonzero((gain > 0.0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
             place = (y[lit] // group[n]) * (-(-width // group[n])) + x[lit] // group[n]
-            found[n].append((row[lit], place, through[lit] * gain[lit, None]))
+            entries[n].append((row[lit], place, through[lit] * gain[lit, None]))
     return [
         _matrices(part, len(mine), -(-p.lens.size_px[0] // side) * -(-p.lens.size_px[1] // side))
-        for part, p, side in zip(found, truth.projectors, group, strict=True)
+        for part, p, side in zip(entries, truth.projectors, group, strict=True)
     ]
 
 
@@ -324,12 +331,12 @@ def traced_transfer(
         while True:
             while not ours.poll(POLL_S):
                 progress(done)
-            said = ours.recv()
-            if isinstance(said, TracedTransfer):
-                return said
-            if isinstance(said, dict):
-                raise DeviceError(**said)
-            progress(done := said)
+            message = ours.recv()
+            if isinstance(message, TracedTransfer):
+                return message
+            if isinstance(message, dict):
+                raise DeviceError(**message)
+            progress(done := message)
     except EOFError as error:
         raise DeviceError("engine-failed", what="Mitsuba ended without a result.", remedy=REMEDY) from error
     finally:

@@ -61,16 +61,16 @@ def _form_factors(patches: Patches, rng: np.random.Generator, progress: Progress
             face.reshape(place.shape), *(patches.starts[sides // 2 + n][:, None] - n for n in (0, 1))
         ).ravel()
         points, rays = _leaving(patches, face, np.repeat(1.0 - 2.0 * (sides % 2), RAYS), drawn[..., 1:].reshape(-1, 4))
-        found = patches.hit(points, rays).patch
-        hit = found >= 0
+        reached = patches.hit(points, rays).patch
+        hit = reached >= 0
         row = np.repeat(np.arange(len(sides)), RAYS)[hit]
-        block = sparse.coo_matrix((np.full(len(row), 1.0 / RAYS), (row, found[hit])), shape=(len(sides), count))
+        block = sparse.coo_matrix((np.full(len(row), 1.0 / RAYS), (row, reached[hit])), shape=(len(sides), count))
         rows.append(block.tocsr())
         progress(min(first + PATCHES_AT_ONCE, count) / count)
-    found = sparse.vstack(rows)
+    reached = sparse.vstack(rows)
     # Both ways between two patches carry the same, so each is counted twice: areas times factors are symmetric.
     area = np.repeat(np.add.reduceat(patches.areas, patches.starts[:-1]), 2)
-    both = sparse.diags(area) @ found
+    both = sparse.diags(area) @ reached
     return sparse.csr_matrix(sparse.diags(0.5 / area) @ (both + both.T))
 
 
@@ -173,13 +173,13 @@ def _arriving(projector: ProjectorTruth, patches: Patches) -> sparse.csr_matrix:
         x = np.asarray(pixel % width + (n % parts + 0.5) / parts - 0.5, np.float64)
         y = np.asarray(pixel // width + (n // parts + 0.5) / parts - 0.5, np.float64)
         rays = directions(projector.pose, lens, x, y)
-        found = patches.hit(np.broadcast_to(np.asarray(projector.pose.position_m), rays.shape), rays).patch
+        patch = patches.hit(np.broadcast_to(np.asarray(projector.pose.position_m), rays.shape), rays).patch
         corner = ((x - 0.5 * (width - 1)) / (0.5 * width)) ** 2 + ((y - 0.5 * (height - 1)) / (0.5 * height)) ** 2
         power = light.brightness * light.reference_m**2 * np.maximum(1.0 - light.vignetting * corner / 2.0, 0.0)
         power *= _solid(projector, x, y) / parts**2
-        hit = np.flatnonzero(found >= 0)
-        shares = power[hit] / area[found[hit] // 2]
-        total = total + sparse.csr_matrix((shares, (found[hit], hit)), shape=total.shape)
+        hit = np.flatnonzero(patch >= 0)
+        shares = power[hit] / area[patch[hit] // 2]
+        total = total + sparse.csr_matrix((shares, (patch[hit], hit)), shape=total.shape)
     return total
 
 
@@ -221,8 +221,8 @@ def _hit_by_pixels(camera: CameraTruth, patches: Patches, row: Integers, column:
         missed = np.flatnonzero(seen.patch < 0)
         x, y = np.asarray(column[missed] + dx, np.float64), np.asarray(row[missed] + dy, np.float64)
         rays = directions(camera.pose, camera.lens, x, y)
-        found = patches.hit(np.broadcast_to(eye, rays.shape), rays)
-        for part, of_all in ((found.patch, seen.patch), (found.points, seen.points), (found.normals, seen.normals)):
+        hits = patches.hit(np.broadcast_to(eye, rays.shape), rays)
+        for part, of_all in ((hits.patch, seen.patch), (hits.points, seen.points), (hits.normals, seen.normals)):
             of_all[missed] = part
     return seen
 
@@ -252,12 +252,12 @@ def _blended(patches: Patches, kept: Integers, seen: Hits) -> sparse.csr_matrix:
         tree = cKDTree(np.concatenate([patches.centres[group[near]], turn * facing[near]], axis=1))
         places = np.concatenate([seen.points[mine], turn * seen.normals[mine]], axis=1)
         nearest = tree.query(places, k=np.arange(1, min(NEAREST, len(near)) + 1), workers=-1)
-        away, found = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
+        away, nearest_patch = np.asarray(nearest[0], np.float64), np.asarray(nearest[1], np.int64)
         reach = 1.001 * away[:, -1:]
         weight = (1.0 - (away / reach) ** 2) ** 2
         weight /= weight.sum(axis=1, keepdims=True)
-        rows = np.repeat(mine, found.shape[1])
-        blend = blend + sparse.csr_matrix((weight.ravel(), (rows, near[found].ravel())), shape=blend.shape)
+        rows = np.repeat(mine, nearest_patch.shape[1])
+        blend = blend + sparse.csr_matrix((weight.ravel(), (rows, near[nearest_patch].ravel())), shape=blend.shape)
     return blend.astype(np.float32)
 
 

@@ -41,16 +41,16 @@ class IndirectTransfers:
             return None
         fineness = truth.patches if truth.engine == "radiosity" else f"{truth.engine} {truth.paths}"
         key = f"{VERSION} {fineness} {truth.seed} {key_of(truth, self._thing)}"
-        found = _read(self._folder, key) if keep else None
-        if found is None:
+        transfer = _read(self._folder, key) if keep else None
+        if transfer is None:
             if truth.engine == "mitsuba":
-                found = traced_transfer(truth, self._thing, pixels, progress)
+                transfer = traced_transfer(truth, self._thing, pixels, progress)
             else:
-                found = transfer_of(truth, self._scattered(truth, progress), pixels)
+                transfer = transfer_of(truth, self._scattered(truth, progress), pixels)
             if keep:
-                _write(self._folder, key, found)
+                _write(self._folder, key, transfer)
         progress(1.0)
-        return found
+        return transfer
 
     def _scattered(self, truth: BenchTruth, progress: Progress) -> Scattering:
         if self._scattering is None or self._scattering[0] != truth.surfaces:
