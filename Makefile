@@ -1,6 +1,7 @@
 # make demo   the whole job on an emulated stage, ending in demo/report.html
 # make test   every test but the long ones; WORKERS=3 chooses how many run side by side, TESTS=tests/hal which
 # make test-long   the long ones: booted machines, whole stages, a second renderer
+# make test-all    both at once, in less time than one after the other: the others run while a long one waits
 # make check  lint, types, import contracts, documentation and the fast tests, side by side, in two minutes
 # make docs   this documentation as a website in build/docs; fails on a broken link
 # make figures   measured figures into the documents that name them, and the pages of the study from their data
@@ -35,7 +36,7 @@ FAST ?= tests/hal/codecs $(addprefix tests/controller/,bundle config core kiosk/
 	tests/plugins/ptp tests/test_architecture.py tests/test_house.py
 DOCS_PYTHON ?= .venv/bin/python
 
-.PHONY: deb demo docs figures blender test test-long test-setup fast check lint style types contracts website timings campaign nightly lock clean
+.PHONY: deb demo docs figures blender test test-long test-all test-setup fast check lint style types contracts website timings campaign nightly lock clean
 
 demo:
 	@.ci/setup demo
@@ -51,6 +52,9 @@ test: test-setup
 
 test-long: test-setup
 	$(PYTEST) -m long $(TESTS)
+
+test-all: test-setup
+	$(PYTEST) $(TESTS)
 
 test-setup:
 	@.ci/setup test

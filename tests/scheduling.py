@@ -47,6 +47,7 @@ LONGEST_FIRST: Final = (
     "tests/controller/cli/test_extras.py",
     "tests/end_to_end/test_killed_demo.py",
     "tests/lab/study/test_beyond.py",
+    "tests/lab/simulate/test_simulate.py",
 )
 """What would keep one worker busy for a minute after the others have ended, were it to come last."""
 LONG: Final = (*NEEDS_THE_DEMO, *LONGEST_FIRST)
@@ -56,6 +57,7 @@ SHARES_NOTHING: Final = (
     "tests/end_to_end/test_never_black.py",
     "tests/end_to_end/test_refine.py",
     "tests/controller/cli/test_extras.py",
+    "tests/lab/simulate/test_simulate.py",
 )
 """Each of their tests takes long and starts with what it needs itself, so any worker may have it."""
 PARTS: Final[Mapping[str, tuple[str, ...]]] = {
