@@ -1,22 +1,17 @@
-"""Calls of a library that may hang, with deadlines: they run on a thread of their own.
-
-A call that exceeds its deadline stays behind with its thread. The next call waits for that thread to end before it
-opens anything, so that at most one thread stays behind.
-"""
+"""Calls of a library that may hang, with deadlines: they run on a thread of their own (``CallThread``), which opens the
+device, and closes it when it ends."""
 
 from __future__ import annotations
 
 import contextlib
-import queue
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
-from hal.deadline import SLICE_S, Deadline, turn
+from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, ProtocolError
+from hal.runtime.call_threads import CallThread
 
 Opened = TypeVar("Opened")
 Result = TypeVar("Result")
@@ -24,46 +19,6 @@ Result = TypeVar("Result")
 _CLOSE_S: Final = 0.7
 _LISTED_S: Final = 2.0
 """Time limit for a listed device that can't be opened: it was just unplugged, or udev has not applied its rules yet."""
-
-
-@dataclass(slots=True)
-class _Job(Generic[Result]):
-    work: Callable[[_Worker[Any]], Result]
-    done: threading.Event = field(default_factory=threading.Event)
-    result: list[Result] = field(default_factory=list)
-    error: BaseException | None = None
-
-
-class _Worker(Generic[Opened]):
-    """One thread and its open device. It always closes what it opened."""
-
-    def __init__(self, close: Callable[[Opened], None]) -> None:
-        self.open: Opened | None = None
-        self._close = close
-        self._jobs: queue.SimpleQueue[_Job[Any] | None] = queue.SimpleQueue()
-        self.thread = threading.Thread(target=self._run, name="hid", daemon=True)
-        self.thread.start()
-
-    def start(self, job: _Job[Any]) -> None:
-        self._jobs.put(job)
-
-    def end(self) -> None:
-        self._jobs.put(None)
-
-    def drop(self) -> None:
-        """Close the device. On the worker's thread."""
-        was_open, self.open = self.open, None
-        if was_open is not None:
-            self._close(was_open)
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                job.result.append(job.work(self))
-            except BaseException as error:  # noqa: BLE001 - it is raised again in the waiting thread
-                job.error = error
-            job.done.set()
-        self.drop()
 
 
 class NotOpened(DeviceRefused):
@@ -80,11 +35,8 @@ class WorkerLink(ABC, Generic[Opened]):
     def __init__(self, name: str, *, broken: tuple[type[Exception], ...]) -> None:
         self._name = name
         self._broken = broken
-        self._turn = threading.Lock()
-        self._worker: _Worker[Opened] | None = None
-        self._left_behind: _Worker[Opened] | None = None
-        self._opening = threading.Lock()
-        self._closed = False
+        self._opened: Opened | None = None
+        self._thread = CallThread("hid", check=self._still_time, closed=self._was_closed, at_end=self._drop)
 
     @abstractmethod
     def find(self) -> Opened:
@@ -103,36 +55,32 @@ class WorkerLink(ABC, Generic[Opened]):
         Raises what ``find`` and ``work`` raise, DeviceGone for one that was closed, DeviceTimeout, ProtocolError where
         the device is there and fails the transfer, or Cancelled.
         """
-        with turn(self._turn, deadline, partial(self._still_time, deadline)):
-            self._still_time(deadline)
-            self._check_open()
-            given_up = threading.Event()
-            theirs = Deadline(deadline.at_s, given_up)
-            return self._on_worker(lambda worker: self._try(worker, work, theirs), deadline, given_up)
+        return self._thread.run(partial(self._try, work), deadline)
 
     def close(self) -> None:
         """Close the device; a hanging call is left behind after 0.7 s."""
-        with self._opening:
-            self._closed = True
-            worker, self._worker = self._worker, None
-        if worker is not None:
-            worker.end()
-            worker.thread.join(_CLOSE_S)
+        self._thread.close(_CLOSE_S)
 
-    def _try(self, worker: _Worker[Opened], work: Callable[[Opened], Result], deadline: Deadline) -> Result:
+    def _drop(self) -> None:
+        """Close the device. On the thread of the calls."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            self.let_go(opened)
+
+    def _try(self, work: Callable[[Opened], Result], deadline: Deadline) -> Result:
         for again in (False, True):
             try:
-                if worker.open is None:
-                    worker.open = self._find_device(deadline)
+                if self._opened is None:
+                    self._opened = self._find_device(deadline)
                 deadline.sleep(0.0)  # the caller has given up: a relay must not move minutes later
-                return work(worker.open)
+                return work(self._opened)
             except self._broken as error:
-                worker.drop()
+                self._drop()
                 if again:
-                    self._check_there(worker, deadline)
+                    self._check_there(deadline)
                     raise self._failed(error) from error
             except ProtocolError:
-                worker.drop()
+                self._drop()
                 raise
         raise AssertionError
 
@@ -147,50 +95,17 @@ class WorkerLink(ABC, Generic[Opened]):
                     raise
                 listed.sleep(SLICE_S)
 
-    def _check_there(self, worker: _Worker[Opened], deadline: Deadline) -> None:
+    def _check_there(self, deadline: Deadline) -> None:
         """Raises DeviceGone if the device was unplugged during the second attempt."""
         with contextlib.suppress(*self._broken):
             try:
-                worker.open = self._find_device(deadline)
+                self._opened = self._find_device(deadline)
             except DeviceError as error:
                 if isinstance(error, DeviceGone):
                     raise
 
-    def _on_worker(
-        self, work: Callable[[_Worker[Opened]], Result], deadline: Deadline, given_up: threading.Event
-    ) -> Result:
-        if (behind := self._left_behind) is not None:
-            self._wait(lambda seconds: _ended(behind, seconds), deadline)
-            self._left_behind = None
-        job: _Job[Result] = _Job(work)
-        worker = self._begun(job)
-        try:
-            self._wait(job.done.wait, deadline)
-        except DeviceError:
-            given_up.set()
-            if not job.done.is_set():
-                worker.end()
-                self._left_behind, self._worker = worker, None
-            raise
-        if job.error is not None:
-            raise job.error
-        return job.result[0]
-
-    def _begun(self, job: _Job[Result]) -> _Worker[Opened]:
-        """The worker that does ``job``; none is made, and none gets a job, once ``close`` has looked for it."""
-        with self._opening:
-            self._check_open()
-            worker = self._worker = self._worker or _Worker(self.let_go)
-            worker.start(job)
-        return worker
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise DeviceGone("hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again.")
-
-    def _wait(self, ready: Callable[[float], bool], deadline: Deadline) -> None:
-        while not ready(min(SLICE_S, deadline.left_s())):
-            self._still_time(deadline)
+    def _was_closed(self) -> DeviceGone:
+        return DeviceGone("hid-closed", what=f"The {self._name} was closed.", remedy=f"Open the {self._name} again.")
 
     def _still_time(self, deadline: Deadline) -> None:
         deadline.check(
@@ -214,8 +129,3 @@ class WorkerLink(ABC, Generic[Opened]):
             what=f"The {self._name} is plugged in, but refuses commands ({error}).",
             remedy="Unplug it and plug it in again. If this happens again, replace it.",
         )
-
-
-def _ended(worker: _Worker[Any], seconds: float) -> bool:
-    worker.thread.join(seconds)
-    return not worker.thread.is_alive()

@@ -1,4 +1,9 @@
-"""Calls of code that may never return: they run on a thread that can be left behind."""
+"""Calls of code that may never return: they run on a thread that can be left behind.
+
+``CallThreads`` is for drivers of other authors, whose methods may be called from several threads. ``CallThread`` is for
+a library that must not get a second call while one hangs. What may crash, too, runs in a process instead
+(``plugins.library_process``).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,13 @@ import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar
+
+from hal.deadline import SLICE_S, Deadline, turn
+from hal.errors import DeviceError
+
+Result = TypeVar("Result")
 
 LOOK_S: Final = 0.1
 """Time between two looks at whether to go on waiting."""
@@ -119,9 +130,104 @@ class CallThreads:
         jobs.put(None)
 
 
-def _serve(jobs: _Jobs) -> None:
+class CallThread:
+    """The thread of one device's calls, for one caller at a time.
+
+    A call that exceeds its deadline stays behind with its thread. The next call waits for that thread to end, so that
+    at most one stays behind, and a device that hangs gets no second call.
+
+    Parameters
+    ----------
+    name : of the thread
+    check : raises Cancelled, and the error for a passed deadline (``Deadline.check``)
+    closed : the error of a call after ``close``
+    at_end : called on each thread when it ends; releases what its calls have opened
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        check: Callable[[Deadline], object],
+        closed: Callable[[], DeviceError],
+        at_end: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._name, self._check, self._closed_error, self._at_end = name, check, closed, at_end
+        self._turn = threading.Lock()
+        self._starting = threading.Lock()
+        self._running: tuple[threading.Thread, _Jobs] | None = None
+        self._left_behind: threading.Thread | None = None
+        self._closed = False
+
+    def run(self, work: Callable[[Deadline], Result], deadline: Deadline) -> Result:
+        """The result of ``work``, or its error. It gets a deadline that is cancelled when its caller gives up.
+
+        Raises what ``check`` raises, and the error of ``closed``.
+        """
+        check = partial(self._check, deadline)
+        with turn(self._turn, deadline, check):
+            check()
+            self.require_open()
+            given_up = threading.Event()
+            theirs = Deadline(deadline.at_s, given_up, deadline.time)
+            if self._left_behind is not None:
+                while not _ended(self._left_behind, min(SLICE_S, deadline.left_s())):
+                    check()
+                self._left_behind = None
+            job = _Job(partial(work, theirs), late=lambda _: None)
+            thread = self._start(job)
+            try:
+                while not job.done.wait(min(SLICE_S, deadline.left_s())):
+                    check()
+            except BaseException:
+                given_up.set()
+                if job.leave():
+                    self._left_behind, self._running = thread, None
+                raise
+            if job.error is not None:
+                raise job.error
+            result: Result = job.result
+            return result
+
+    def require_open(self) -> None:
+        """Raises the error of ``closed`` after ``close``."""
+        if self._closed:
+            raise self._closed_error()
+
+    def close(self, patience_s: float) -> None:
+        """End the thread; a hanging call is left behind after ``patience_s``. Harmless when called twice."""
+        with self._starting:
+            self._closed = True
+            running, self._running = self._running, None
+        if running is not None:
+            thread, jobs = running
+            jobs.put(None)
+            thread.join(patience_s)
+
+    def _start(self, job: _Job) -> threading.Thread:
+        """The thread that does ``job``; none is made, and none gets a job, once ``close`` has looked for it."""
+        with self._starting:
+            self.require_open()
+            if self._running is None:
+                jobs: _Jobs = queue.SimpleQueue()
+                thread = threading.Thread(target=_serve, args=(jobs, self._at_end), name=self._name, daemon=True)
+                thread.start()
+                self._running = thread, jobs
+            thread, jobs = self._running
+            jobs.put(job)
+            return thread
+
+
+def _ended(thread: threading.Thread, seconds: float) -> bool:
+    thread.join(seconds)
+    return not thread.is_alive()
+
+
+def _serve(jobs: _Jobs, at_end: Callable[[], object] = lambda: None) -> None:
+    """Do jobs until there are no more, or until one was left behind."""
     while (job := jobs.get()) is not None:
         job.run()
         if job.left:
-            return
+            break
         del job  # an idle thread keeps no device alive
+    at_end()

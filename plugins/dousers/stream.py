@@ -49,6 +49,7 @@ class Stream:
         self._number = 0
         self._running: _Running | None = None
         self._turn = threading.Lock()
+        self._over = False
 
     def put(self, channel: int, level: int, *, deadline: Deadline) -> None:
         """Send ``level`` (0 to 255) from now on; returns when it was sent three times.
@@ -74,7 +75,12 @@ class Stream:
             self._await_sent(deadline)
 
     def end(self) -> None:
-        """End the stream, and tell its receivers. Harmless when called twice."""
+        """End the stream for good, and tell its receivers: at most 2 s. Harmless when called twice."""
+        self._over = True  # a movement that still waits ends soon, and starts no other process
+        with self._turn:
+            self._end_process()
+
+    def _end_process(self) -> None:
         running, self._running = self._running, None
         if running is not None:
             running.end()
@@ -84,7 +90,7 @@ class Stream:
         before = self._running
         if before is not None and before.write(line):
             return
-        self.end()
+        self._end_process()
         # Receivers drop packets whose number is up to 20 behind: the new process goes on well ahead of the old one.
         self._running = _Running(self._target, 0 if before is None else (before.sequence + _SKIPPED) % 256)
         self._running.write(line)
@@ -96,6 +102,7 @@ class Stream:
             if running.ended and again:
                 # It ended in the moment in which it was written to.
                 again = False
+                self._check(deadline)
                 self._publish_levels()
                 running = self._process()
                 continue
@@ -113,6 +120,8 @@ class Stream:
         return self._running
 
     def _check(self, deadline: Deadline) -> None:
+        if self._over:
+            raise DeviceGone("douser-closed", what=f"{self._name} was ended.", remedy="Open the stage again.")
         deadline.check(
             "douser-no-answer",
             what=f"{self._name} was not sent in time.",
@@ -193,10 +202,10 @@ def joined(target: Target) -> Stream:
 
 
 def left(target: Target) -> None:
-    """One user less; after the last one the stream ends."""
+    """One user less. After the last one the stream ends, before another user of this universe can start one."""
     with _LOCK:
         stream, users = _STREAMS.pop(target)
         if users > 1:
             _STREAMS[target] = stream, users - 1
-            return
-    stream.end()
+        else:
+            stream.end()

@@ -1,66 +1,59 @@
-"""Relays by Modbus TCP: boards whose relays are coils. The caller keeps the lamp rules."""
+"""Relays by Modbus TCP: boards whose relays are coils."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
-from hal.deadline import Deadline
-from hal.errors import DeviceGone, DeviceRefused, PluginError
+from hal.errors import DeviceGone, DeviceRefused
 from hal.links import host_and_port
-from hal.registry import Driver, OpenContext, setting
-from hal.values import DeviceIdentity
-from plugins.mains.outlets import Outlets, answering, require_library
+from hal.outlets import Outlets, outlets_driver, whole_number
+from hal.registry import setting
 
 PORT: Final = 502
 _ANSWER_S: Final = 1.0
 
 
-class ModbusRelays:
-    """``hal.interfaces.PowerSwitch``. ``first``: address of the coil of channel 1. A connection for each call."""
+@dataclass(frozen=True, slots=True)
+class ModbusBoard:
+    """A board and where its coils begin: ``first`` is the address of the coil of channel 1. Each call connects."""
 
-    def __init__(self, host: str, port: int, *, unit: int, first: int, channels: int) -> None:
-        self._outlets = Outlets(f"The relay board at {host}:{port}", channels)
-        self._place = (host, port)
-        self._unit = unit
-        self._first = first
+    host: str
+    port: int
+    unit: int
+    first: int
 
-    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
-        self._outlets.run(self._coil(1), deadline)
-        return DeviceIdentity("", f"Modbus relays, unit {self._unit}")
+    @property
+    def name(self) -> str:
+        return f"The relay board at {self.host}:{self.port}"
 
-    def channels(self, *, deadline: Deadline) -> int:
-        self._outlets.check(deadline)
-        return self._outlets.count
+    def describe(self) -> str:
+        """Its name, once it answers."""
+        self.coil(1)
+        return f"Modbus relays, unit {self.unit}"
 
-    def state(self, channel: int, *, deadline: Deadline) -> bool:
-        """See ``hal.interfaces.PowerSwitch.state``. Raises DeviceRefused("relay-no-channel")."""
-        self._outlets.require(channel)
-        return self._outlets.run(self._coil(channel), deadline)
+    def coil(self, channel: int) -> bool:
+        """Whether a relay is closed."""
+        return asyncio.run(self._coil(self.first + channel - 1))
 
-    def switch(self, channel: int, closed: bool, *, deadline: Deadline) -> None:
-        """Switch a relay, and check it. Raises DeviceRefused("relay-no-channel") or DeviceRefused("relay-stuck")."""
-        self._outlets.require(channel)
-        if self._outlets.run(self._coil(channel, closed), deadline) is not closed:
-            raise self._outlets.stuck(channel, closed)
+    def write_coil(self, channel: int, closed: bool) -> None:
+        """Close or open a relay; the command is sent once."""
+        asyncio.run(self._coil(self.first + channel - 1, closed))
 
-    def close(self) -> None:
-        self._outlets.close()
-
-    async def _coil(self, channel: int, closed: bool | None = None) -> bool:
-        """Whether a coil is set, after it was written if ``closed`` is given. Nothing is written twice."""
+    async def _coil(self, address: int, closed: bool | None = None) -> bool:
         from pymodbus import ModbusException
         from pymodbus.client import AsyncModbusTcpClient
 
-        host, port = self._place
-        client = AsyncModbusTcpClient(host, port=port, timeout=_ANSWER_S, retries=0, reconnect_delay=0)
-        address = self._first + channel - 1
+        client = AsyncModbusTcpClient(self.host, port=self.port, timeout=_ANSWER_S, retries=0, reconnect_delay=0)
         try:
             if not await client.connect():
                 raise self._gone("it does not accept a connection")
             if closed is not None:
-                self._checked(await client.write_coil(address, closed, device_id=self._unit))
-            return bool(self._checked(await client.read_coils(address, count=1, device_id=self._unit)).bits[0])
+                self._checked(await client.write_coil(address, closed, device_id=self.unit))
+                return closed
+            return bool(self._checked(await client.read_coils(address, count=1, device_id=self.unit)).bits[0])
         except ModbusException as error:
             raise self._gone(str(error)[:80]) from error
         finally:
@@ -70,7 +63,7 @@ class ModbusRelays:
         if answer.isError():
             raise DeviceRefused(
                 "outlets-refused",
-                what=f"{self._outlets.name} refused with exception {getattr(answer, 'exception_code', 'unknown')}.",
+                what=f"{self.name} refused with exception {getattr(answer, 'exception_code', 'unknown')}.",
                 remedy="Check unit, first and channels in stage.toml.",
             )
         return answer
@@ -78,45 +71,22 @@ class ModbusRelays:
     def _gone(self, why: str) -> DeviceGone:
         return DeviceGone(
             "outlets-gone",
-            what=f"{self._outlets.name} can't be reached: {why}.",
+            what=f"{self.name} can't be reached: {why}.",
             remedy="Check its power, its network cable, its address, and unit in stage.toml.",
         )
 
 
-def _read(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _outlets(settings: Mapping[str, Any]) -> Outlets:
     host, port = host_and_port(str(setting(settings, "address", str)), PORT)
-    numbers = {
-        "unit": setting(settings, "unit", int, 1),
-        "first": setting(settings, "first", int, 0),
-        "channels": setting(settings, "channels", int),
-    }
-    allowed = {"unit": (0, 255), "first": (0, 65_000), "channels": (1, 256)}
-    for key, (low, high) in allowed.items():
-        if not low <= numbers[key] <= high:
-            raise PluginError(
-                "setting-wrong",
-                what=f"The setting '{key}' is {numbers[key]}, not {low} to {high}.",
-                remedy=f"Correct {key} in stage.toml.",
-            )
-    return {"host": host, "port": port, **numbers}
+    unit, first = whole_number(settings, "unit", 0, 255, 1), whole_number(settings, "first", 0, 65_000, 0)
+    board = ModbusBoard(host, port, unit, first)
+    channels = whole_number(settings, "channels", 1, 256)
+    return Outlets(board.name, channels, board.coil, board.write_coil, board.describe)
 
 
-def open_modbus_relays(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> ModbusRelays:
-    """Open the board of a stage's table: read its first coil."""
-    require_library("pymodbus")
-    return answering(ModbusRelays(**_read(settings)), deadline)
-
-
-def check_modbus_relays(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    _read(settings)
-
-
-DRIVER: Final = Driver(
-    kind="power_switch",
-    name="modbus-relays",
+DRIVER: Final = outlets_driver(
+    "modbus-relays",
     summary="Relay boards by Modbus TCP, whose relays are coils (needs the extra mains).",
-    open=open_modbus_relays,
     settings={
         "address": 'host, or host:port for another port than 502, e.g. "192.168.0.31"',
         "channels": "how many relays it has, 1 to 256",
@@ -124,5 +94,6 @@ DRIVER: Final = Driver(
         "first": "address of the coil of channel 1, counted from 0 (default: 0)",
     },
     required=("address", "channels"),
-    check=check_modbus_relays,
+    outlets=_outlets,
+    library="pymodbus",
 )

@@ -177,6 +177,74 @@ def test_a_sender_that_is_killed_is_started_again_and_the_node_does_what_it_is_s
             assert (lamp.light_level(), [is_open for _, is_open in told]) == (1.0, [True, False, True])
 
 
+@contextlib.contextmanager
+def heard_sources() -> Iterator[tuple[list[int], str]]:
+    """The UDP port that each packet came from, in order, and the address to send to."""
+    ports: list[int] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as node:
+        node.bind(("127.0.0.1", 0))
+        node.settimeout(0.05)
+        over = threading.Event()
+
+        def listen() -> None:
+            while not over.is_set():
+                with contextlib.suppress(TimeoutError):
+                    ports.append(node.recvfrom(2048)[1][1])
+
+        thread = threading.Thread(target=listen)
+        thread.start()
+        try:
+            yield ports, f"127.0.0.1:{node.getsockname()[1]}"
+        finally:
+            over.set()
+            thread.join()
+
+
+def test_a_douser_that_is_closed_during_a_movement_starts_no_second_source() -> None:
+    with heard_sources() as (ports, address):
+        douser = douser_at(address)
+        douser.move(False, deadline=in_seconds(SOON))
+        # The movement waits for a process that hangs, and the closing kills that.
+        os.kill(sender_of(douser), signal.SIGSTOP)
+        moving = threading.Thread(target=moved, args=(douser,))
+        moving.start()
+        time.sleep(0.3)
+        douser.close()
+        moving.join(SOON)
+        assert not moving.is_alive()
+        time.sleep(1.5)
+        assert len(set(ports)) == 1
+
+
+def continued(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
+
+
+def moved(douser: SacnDouser) -> None:
+    with contextlib.suppress(DeviceError):
+        douser.move(True, deadline=in_seconds(SOON))
+
+
+def test_a_universe_that_is_opened_again_has_its_second_source_after_its_first() -> None:
+    with heard_sources() as (ports, address):
+        first = douser_at(address)
+        first.move(False, deadline=in_seconds(SOON))
+        sender = sender_of(first)
+        os.kill(sender, signal.SIGSTOP)
+        closing = threading.Thread(target=first.close)
+        closing.start()
+        time.sleep(0.1)
+        threading.Timer(0.55, continued, (sender,)).start()
+        second = douser_at(address)
+        second.move(True, deadline=in_seconds(SOON))
+        closing.join()
+        time.sleep(0.5)
+        changes = [port for port, before in zip(ports, [0, *ports], strict=False) if port != before]
+        assert len(changes) == 2
+        second.close()
+
+
 def test_blades_take_their_time() -> None:
     now = [0.0]
     blades = EmulatedDouser(2.0, clock=lambda: now[0])

@@ -96,7 +96,7 @@ class TestSnmpPdu(PowerSwitchConformance):
     @pytest.fixture
     def power_switch(self, snmpd: int, tmp_path: Path) -> Iterator[PowerSwitch]:
         table = {"address": f"127.0.0.1:{snmpd}", "channels": OUTLETS, "version": 2}
-        pdu = snmp_pdu.open_snmp_pdu(table, OpenContext(tmp_path), in_seconds(SOON))
+        pdu = snmp_pdu.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
         yield pdu
         pdu.close()
 
@@ -105,7 +105,7 @@ class TestModbusRelays(PowerSwitchConformance):
     @pytest.fixture
     def power_switch(self, modbus: int, tmp_path: Path) -> Iterator[PowerSwitch]:
         table = {"address": f"127.0.0.1:{modbus}", "channels": OUTLETS, "first": 2}
-        board = modbus_relay.open_modbus_relays(table, OpenContext(tmp_path), in_seconds(SOON))
+        board = modbus_relay.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
         yield board
         board.close()
 
@@ -116,10 +116,10 @@ def test_a_hot_lamp_keeps_its_mains_and_a_cold_one_loses_them(
 ) -> None:
     if kind == "snmp":
         table = {"address": f"127.0.0.1:{request.getfixturevalue('snmpd')}", "channels": OUTLETS}
-        switch: Any = snmp_pdu.open_snmp_pdu(table, OpenContext(tmp_path), in_seconds(SOON))
+        switch: Any = snmp_pdu.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
     else:
         table = {"address": f"127.0.0.1:{request.getfixturevalue('modbus')}", "channels": OUTLETS}
-        switch = modbus_relay.open_modbus_relays(table, OpenContext(tmp_path), in_seconds(SOON))
+        switch = modbus_relay.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
     projector = open_network(profile="jvc")
     guard = LampGuard("left", projector.driver, Shelf())
     circuit = Circuit("outlet 3", 3, ("left",), 0.0, switch)
@@ -148,7 +148,7 @@ def struck(guard: LampGuard) -> bool:
 
 def test_an_outlet_that_net_snmp_reads_is_the_one_that_was_switched(snmpd: int, tmp_path: Path) -> None:
     table = {"address": f"127.0.0.1:{snmpd}", "channels": OUTLETS}
-    pdu = snmp_pdu.open_snmp_pdu(table, OpenContext(tmp_path), in_seconds(SOON))
+    pdu = snmp_pdu.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
     pdu.switch(2, True, deadline=in_seconds(SOON))
     pdu.close()
     snmpget = shutil.which("snmpget")
@@ -161,7 +161,7 @@ def test_an_outlet_that_net_snmp_reads_is_the_one_that_was_switched(snmpd: int, 
 
 def test_a_community_that_may_not_write_is_told_and_nothing_moves(snmpd: int, tmp_path: Path) -> None:
     table = {"address": f"127.0.0.1:{snmpd}", "channels": OUTLETS, "community": "public", "version": 2}
-    pdu = snmp_pdu.open_snmp_pdu(table, OpenContext(tmp_path), in_seconds(SOON))
+    pdu = snmp_pdu.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
     before = pdu.state(1, deadline=in_seconds(SOON))
     with pytest.raises((DeviceRefused, DeviceTimeout)):
         pdu.switch(1, not before, deadline=in_seconds(SOON))
@@ -169,11 +169,11 @@ def test_a_community_that_may_not_write_is_told_and_nothing_moves(snmpd: int, tm
     pdu.close()
 
 
-@pytest.mark.parametrize("open_it", [snmp_pdu.open_snmp_pdu, modbus_relay.open_modbus_relays])
+@pytest.mark.parametrize("open_it", [snmp_pdu.DRIVER.open, modbus_relay.DRIVER.open])
 def test_silence_ends_at_the_deadline_and_a_cancelled_call_sooner(open_it: Any, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
-        one = mute if open_it is modbus_relay.open_modbus_relays else silent
+        one = mute if open_it is modbus_relay.DRIVER.open else silent
         table = {"address": f"127.0.0.1:{one.getsockname()[1]}", "channels": 1}
         started = time.monotonic()
         with pytest.raises((DeviceTimeout, DeviceGone)):
