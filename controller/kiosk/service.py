@@ -16,7 +16,7 @@ from controller.kiosk.alerts import Alerts
 from controller.kiosk.backup import NightlyBackup
 from controller.kiosk.changes.inventory import Inventory
 from controller.kiosk.changes.watch import InventoryWatch
-from controller.kiosk.decide.clock import TrustedClock, beginning
+from controller.kiosk.decide.clock import Timetable, TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
@@ -95,11 +95,8 @@ class Service:
         safety = stage.tables.safety
         self.reconciler = Reconciler(
             self.devices.projectors, self.player, self.jobs, self.bundles, log,
-            schedule=lambda: self.schedule.now,
-            clock=TrustedClock(log, world.wall, world.monotonic, world.synchronised),
-            monotonic=world.monotonic,
-            without_time=self.schedule.open_without_time,
-            limits=Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
+            Timetable(self.schedule, TrustedClock(log, world.wall, world.monotonic, world.synchronised)),
+            Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
         )  # fmt: skip
         self.disk = DiskSupervisor(
             stage.folder, lambda: self.checked.stage.tables.disk, self.bundles, log,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, Protocol
 
-from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, believed
+from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, Plan, believed, plan
+from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
 
@@ -33,7 +35,7 @@ def synchronised() -> bool:
 
 
 class TrustedClock:
-    """The time to plan with; remembers the latest one over restarts."""
+    """The time to plan with; remembers the latest one over restarts. ``monotonic``: seconds that only go up."""
 
     def __init__(
         self,
@@ -42,7 +44,8 @@ class TrustedClock:
         monotonic: Callable[[], float],
         is_synchronised: Callable[[], bool] = synchronised,
     ) -> None:
-        self._log, self._wall, self._monotonic, self._synchronised = log, wall, monotonic, is_synchronised
+        self._log, self._wall, self._synchronised = log, wall, is_synchronised
+        self.monotonic = monotonic
         kept = log.value("latest")
         self._latest: float | None = None if kept is None else float(kept)
         self._kept = self._latest
@@ -53,7 +56,7 @@ class TrustedClock:
     def now(self) -> float | None:
         """Unix seconds to plan with, or None while the time is unknown; logs when that changes."""
         wall_s = self._wall()
-        self._check_jump(wall_s - self._monotonic())
+        self._check_jump(wall_s - self.monotonic())
         now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
         if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
             self._log.add(_LOST if now_s is None else _FOUND)
@@ -84,8 +87,30 @@ class TrustedClock:
             self._ahead_since_s = None
             return True
         if self._ahead_since_s is None:
-            self._ahead_since_s = self._monotonic()
-        return self._monotonic() - self._ahead_since_s >= _PROVE_S
+            self._ahead_since_s = self.monotonic()
+        return self.monotonic() - self._ahead_since_s >= _PROVE_S
+
+
+class Hours(Protocol):
+    """The opening hours in use; ``open_without_time``: whether the stage is open while the time is unknown."""
+
+    @property
+    def now(self) -> Schedule: ...
+
+    @property
+    def open_without_time(self) -> bool: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Timetable:
+    """The opening hours and the time, from which the plan follows."""
+
+    hours: Hours
+    clock: TrustedClock
+
+    def plan(self, done: Collection[str]) -> Plan:
+        """What is wanted now; ``done``: the keys of the tasks that were done or skipped."""
+        return plan(self.clock.now(), self.hours.now, done, since_s=self.clock.since_s)
 
 
 def beginning(log: EventLog) -> Notice:

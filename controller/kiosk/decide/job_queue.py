@@ -219,7 +219,7 @@ class JobQueue:
 
     def _tell(self, outcome: Notice) -> None:
         """Log it; a failure stays on the panel until an operator confirms it."""
-        (self._log.add_failure if outcome.level == "error" else self._log.add)(outcome)
+        (self._log.add_failure if outcome.level is Level.ERROR else self._log.add)(outcome)
 
     def _settle(self, how: str) -> None:
         for request in self._queue:

@@ -161,12 +161,12 @@ def _override_in(text: str | None) -> Override | None:
         stored: Any = json.loads(text or "null")
     except (ValueError, RecursionError):
         return None
-    if not isinstance(stored, list) or len(stored) not in (2, 3):
-        return None
-    wanted, said, until_s = (*stored, None)[:3]
-    if not isinstance(wanted, bool) or not isinstance(said, bool | None):
-        return None
-    return Override(wanted, said, float(until_s) if isinstance(until_s, int | float) else None)
+    match stored:
+        case [bool(wanted), bool() | None as said, int() | float() as until_s]:
+            return Override(wanted, said, float(until_s))
+        case [bool(wanted), bool() | None as said, *_] if len(stored) <= 3:
+            return Override(wanted, said)
+    return None
 
 
 def effect(schedule: Schedule, overrides: OperatorOverrides, now: Plan, now_s: float) -> str:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.clock import TrustedClock
+from controller.kiosk.decide.clock import Timetable
 from controller.kiosk.decide.interfaces import (
     BLACK,
     Bundles,
@@ -28,9 +28,8 @@ from controller.kiosk.decide.interfaces import (
 )
 from controller.kiosk.decide.job_queue import JobQueue
 from controller.kiosk.decide.operator_overrides import LiveChanges, LiveChangesKept, OperatorOverrides
-from controller.kiosk.decide.planner import Plan, plan
+from controller.kiosk.decide.planner import Plan
 from controller.kiosk.decide.stage_states import LightNeed, Limits, StageStates
-from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import IN_TURN
 from controller.run.state_machine import Event, Machine, State
@@ -124,11 +123,7 @@ _SHOWING: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, St
 class Reconciler:
     """The kiosk's decisions. One thread calls ``step`` about four times a second; commands may come from any thread.
 
-    Parameters
-    ----------
-    schedule : read at every step
-    clock : the time to plan with; ``monotonic``: seconds that only go up, for deadlines
-    without_time : whether the stage is open while the time is unknown
+    ``timetable``: the opening hours and the time, read at every step.
     """
 
     def __init__(
@@ -138,19 +133,15 @@ class Reconciler:
         jobs: Jobs,
         bundles: Bundles,
         log: EventLog,
-        *,
-        schedule: Callable[[], Schedule],
-        clock: TrustedClock,
-        monotonic: Callable[[], float],
-        without_time: bool = False,
+        timetable: Timetable,
         limits: Limits | None = None,
     ) -> None:
         self._supervisors, self._player, self._log = supervisors, player, log
-        self._schedule, self._clock, self._monotonic = schedule, clock, monotonic
+        self._timetable, self._monotonic = timetable, timetable.clock.monotonic
         self._limits = limits or Limits()
-        self._queue = JobQueue(jobs, log, monotonic=monotonic, patience_s=self._limits.power_up_s)
-        self._states = StageStates(log, self._limits, monotonic)
-        self.overrides = OperatorOverrides(log, without_time=without_time)
+        self._queue = JobQueue(jobs, log, monotonic=self._monotonic, patience_s=self._limits.power_up_s)
+        self._states = StageStates(log, self._limits, self._monotonic)
+        self.overrides = OperatorOverrides(log, without_time=timetable.hours.open_without_time)
         self._live = LiveChangesKept(log)
         self._content = ContentSelector(bundles, self.overrides, self._live, self._queue, log)
         self._lock = threading.RLock()
@@ -300,7 +291,7 @@ class Reconciler:
             self._take_finished()
             self._update_plan()
             wanted_open = self.overrides.open(self._plan)
-            self._queue.take_due(self._plan, playing=wanted_open and bool(self._schedule().rows))
+            self._queue.take_due(self._plan, playing=wanted_open and bool(self._timetable.hours.now.rows))
             views = [supervisor.view for supervisor in self._supervisors]
             open_now = self._content.something(wanted_open)
             if not wanted_open:
@@ -317,8 +308,7 @@ class Reconciler:
             self._show(views, open_now)
 
     def _update_plan(self) -> None:
-        now_s = self._clock.now()
-        self._plan = plan(now_s, self._schedule(), self._log.done(), since_s=self._clock.since_s)
+        self._plan = self._timetable.plan(self._log.done())
         self.overrides.follow(self._plan)
 
     # -- jobs

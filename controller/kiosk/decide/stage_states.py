@@ -9,7 +9,7 @@ from typing import Final
 from controller.kiosk.decide.interfaces import Condition, ProjectorView
 from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import Event, Machine, State
-from hal.notices import Notice
+from hal.notices import Level, Notice
 
 RETRY_S: Final = (30.0, 60.0, 120.0, 300.0, 900.0)
 """Between attempts to leave FAULT."""
@@ -145,8 +145,8 @@ class StageStates:
         bad = machine.state in (State.FAULT, State.DEGRADED)
         remedy = "See the devices for what to do." if bad else ""
         text = f"The stage is {machine.state.value}" + (f": {machine.reason}" if machine.reason else "")
-        level = "error" if machine.state is State.FAULT else "warning" if bad else "info"
-        self._log.add(Notice("state", text.rstrip(".") + ".", remedy, level))  # type: ignore[arg-type]
+        level = Level.ERROR if machine.state is State.FAULT else Level.WARNING if bad else Level.INFO
+        self._log.add(Notice("state", text.rstrip(".") + ".", remedy, level))
 
 
 def _without_light(names: Collection[str]) -> str:

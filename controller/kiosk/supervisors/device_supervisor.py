@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
-from controller.kiosk.world import Lock
-from hal.deadline import Deadline, in_seconds
+from controller.kiosk.world import Lock, World
+from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.interfaces import Device
 from hal.notices import Level, Notice
@@ -38,25 +37,24 @@ Look = Callable[[Device, Deadline], tuple[LiveValue, ...]]
 class DeviceSupervisor:
     """One device. One thread calls ``step`` repeatedly.
 
-    ``look`` polls the device and returns the values to show; ``every_s``: seconds between two polls.
+    ``row``: its name, kind and driver; ``look`` polls the device and returns the values to show; ``every_s``: seconds
+    between two polls. ``lent`` is held while a job has the device for itself.
     """
 
     def __init__(
-        self, name: str, kind: str, driver: str, open_it: Callable[[Deadline], Device], look: Look,
-        tell: Callable[[Notice], object], *, every_s: float = 30.0, monotonic: Callable[[], float] = time.monotonic,
-        deadline: Callable[[float], Deadline] = in_seconds, lock: Lock | None = None,
+        self, row: DeviceRow, open_it: Callable[[Deadline], Device], look: Look, tell: Callable[[Notice], object],
+        *, every_s: float = 30.0, world: World | None = None,
     ) -> None:  # fmt: skip
-        self.name, self.kind, self.driver = name, kind, driver
+        world = world or World()
+        self.name, self._row = row.name, row
         self._open, self._look, self._tell = open_it, look, tell
-        self._every_s, self._monotonic = every_s, monotonic
+        self._every_s, self._monotonic, self._deadline = every_s, world.monotonic, world.deadline
         self._device: Device | None = None
-        self._values: tuple[LiveValue, ...] = ()
         self._problem: Notice | None = None
         self._next_s = 0.0
         self._lost_since_s: float | None = None
         self._closed = False
-        self._deadline = deadline
-        self.lent: Lock = lock or threading.Lock()
+        self.lent: Lock = world.lock()
 
     @property
     def device(self) -> Device | None:
@@ -70,7 +68,7 @@ class DeviceSupervisor:
     @property
     def row(self) -> DeviceRow:
         what, remedy = (None, "") if self._problem is None else (self._problem.what, self._problem.remedy)
-        return DeviceRow(self.name, self.kind, self.driver, self._values, what, remedy)
+        return replace(self._row, problem=what, remedy=remedy)
 
     def step(self) -> None:
         """Poll the device if it is time to, except while it is lent to a job."""
@@ -79,7 +77,8 @@ class DeviceSupervisor:
         try:
             if self._device is None:
                 self._device = self._open(self._deadline(OPEN_S))
-            self._values = self._look(self._device, self._deadline(LOOK_S))
+            values = self._look(self._device, self._deadline(LOOK_S))
+            self._row = replace(self._row, values=values)
             self._recovered()
         except (DeviceError, VelaturaError) as error:
             self._lost(Notice(error.code, error.what, error.remedy, Level.ERROR))
@@ -110,7 +109,7 @@ class DeviceSupervisor:
 
     def _lost(self, problem: Notice) -> None:
         self._release()
-        self._values = ()
+        self._row = replace(self._row, values=())
         now_s = self._monotonic()
         if self._lost_since_s is None:
             self._lost_since_s = now_s

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from controller.core.text import printable
 from controller.kiosk.changes.devices import camera_facts, projector_facts
@@ -17,7 +17,7 @@ from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.light_records import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
-from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.supervisors.projector_supervisor import LampBefore, Mains, ProjectorSupervisor
 from controller.kiosk.world import World
 from controller.stage.rig.ambient_light import AmbientLightLimit, LightWatch
 from controller.stage.rig.lamp_guard import LampGuard
@@ -52,16 +52,8 @@ class Devices:
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
         self._dose = LightDose(checked.stage.folder, monotonic=self._world.monotonic)
-        self.camera = DeviceSupervisor(
-            "camera",
-            "camera",
-            tables.camera.driver,
-            self._open_camera,
-            _look_at_camera,
-            tell,
-            every_s=60.0,
-            **self._of_the_world(),
-        )
+        row = DeviceRow("camera", "camera", tables.camera.driver)
+        self.camera = DeviceSupervisor(row, self._open_camera, _look_at_camera, tell, every_s=60.0, world=self._world)
         self.sensor = self._sensor()
 
     def use(self, checked: Checked) -> None:
@@ -159,9 +151,6 @@ class Devices:
 
     # -- opening
 
-    def _of_the_world(self) -> dict[str, Any]:
-        return {"monotonic": self._world.monotonic, "deadline": self._world.deadline, "lock": self._world.lock()}
-
     def _projector(self, number: int) -> ProjectorSupervisor:
         tables = self._checked.stage.tables
         table = tables.projectors[number]
@@ -172,17 +161,18 @@ class Devices:
             return LampGuard(table.name, projector, self._ledger, at_least=at_least, clock=self._world,
                              lock=self._world.rlock())  # fmt: skip
 
-        silenced = None if self.mains is None else partial(self.mains.silences, table.name)
-        unfed = partial(self._unfed, table.name)
+        mains = Mains(problem=partial(self._unfed, table.name))
+        if self.mains is not None:
+            mains = replace(mains, asleep=partial(self.mains.silences, table.name))
         # Lit when the service before this one ended: it may burn behind a line that does not answer. So may one of
         # which nothing is known, because the ledger was damaged: its record has no boot.
         record = self._ledger.read(table.name)
         maybe_lit = record is not None and record.lit and record.boot in ("", self._world.boot())
         # Before its projector is reached: an opening may come first.
         failed = 0 if record is None else record.failed_in(self._world.boot())
-        return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, asleep=silenced, unfed=unfed,
-                                   deadline=self._world.deadline, maybe_lit=maybe_lit, failed=failed,
-                                   keep_forgiven=partial(self._ledger.forgive, table.name))  # fmt: skip
+        lamp = LampBefore(maybe_lit, failed, partial(self._ledger.forgive, table.name))
+        return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, mains=mains, lamp=lamp,
+                                   deadline=self._world.deadline)  # fmt: skip
 
     def _unfed(self, projector: str) -> Notice | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
@@ -211,8 +201,8 @@ class Devices:
             dark = DARK_ENOUGH if lux <= table.most_lux else TOO_BRIGHT
             return (LiveValue.said("Light", dark, lux, digits=2),)
 
-        return DeviceSupervisor("light sensor", "sensor", table.driver, open_sensor, look, self._tell, every_s=10.0,
-                                **self._of_the_world())  # fmt: skip
+        row = DeviceRow("light sensor", "sensor", table.driver)
+        return DeviceSupervisor(row, open_sensor, look, self._tell, every_s=10.0, world=self._world)
 
     def _report_light(self, room: str | None) -> None:
         before, self._room = self._room, room
@@ -237,7 +227,7 @@ class Devices:
             circuits = mains_circuits(self._checked, self._context, stack, deadline)
             return Boards(circuits, stack)
 
-        return MainsSupervisor(drivers, open_circuits, self._tell, **self._of_the_world())
+        return MainsSupervisor(drivers, open_circuits, self._tell, self._world)
 
 
 DARK_ENOUGH: Final = "{0} lux (dark enough to calibrate)"

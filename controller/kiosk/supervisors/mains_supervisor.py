@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import cast
 
-from controller.kiosk.interface import LiveValue
+from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
-from controller.kiosk.world import Lock
+from controller.kiosk.world import World
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.power import Circuit
-from hal.deadline import Deadline, in_seconds
+from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.interfaces import Device
 from hal.notices import Notice
@@ -43,12 +42,9 @@ class MainsSupervisor(DeviceSupervisor):
     """
 
     def __init__(
-        self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell,
-        *, monotonic: Callable[[], float] = time.monotonic, deadline: Callable[[float], Deadline] = in_seconds,
-        lock: Lock | None = None,
-    ) -> None:  # fmt: skip
-        super().__init__("relays", "relay", driver, open_it, self._switch, tell, every_s=2.0, monotonic=monotonic,
-                         deadline=deadline, lock=lock)  # fmt: skip
+        self, driver: str, open_it: Callable[[Deadline], Device], tell: Tell, world: World | None = None
+    ) -> None:
+        super().__init__(DeviceRow("relays", "relay", driver), open_it, self._switch, tell, every_s=2.0, world=world)
         self.want_on = True
         self.supervisors: tuple[ProjectorSupervisor, ...] = ()
         self._off: frozenset[str] = frozenset()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from controller.core.errors import VelaturaError
@@ -34,19 +34,36 @@ _LOOKS: Final = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class Mains:
+    """The mains of a projector. ``asleep``: whether it has none now, or is booting, so that its silence means nothing;
+    ``problem``: that of the relays that supply it, which may be the reason for its silence.
+    """
+
+    asleep: Callable[[], bool] = lambda: False
+    problem: Callable[[], Notice | None] = lambda: None
+
+
+@dataclass(frozen=True, slots=True)
+class LampBefore:
+    """A lamp before this service began. ``maybe_lit``: it may be lit; ``failed``: attempts in a row that gave no light.
+
+    ``keep_forgiven`` keeps over a restart that at most so many attempts count, even while the line is broken.
+    """
+
+    maybe_lit: bool = False
+    failed: int = 0
+    keep_forgiven: Callable[[int], None] = lambda most: None
+
+
 class ProjectorSupervisor:
     """One projector. One thread calls ``step`` repeatedly; any thread may use the rest.
 
     Parameters
     ----------
     open_guard : opens the projector; raises DeviceError or VelaturaError if that fails
-    tell : receives observations and decisions
-    asleep : whether it has no mains now, or is booting, so that its silence means nothing
-    unfed : the problem of the relays that supply it, which may be the reason for its silence
+    tell : receives what people should know
     deadline : one that ends in so many seconds
-    maybe_lit : whether its lamp may be lit before it was looked at
-    failed : attempts in a row that gave no light, before this service began
-    keep_forgiven : keeps over a restart that at most so many attempts count, even while the line is broken
     """
 
     def __init__(
@@ -56,28 +73,26 @@ class ProjectorSupervisor:
         tell: Callable[[Notice], object],
         *,
         clock: Clock | None = None,
-        asleep: Callable[[], bool] | None = None,
-        unfed: Callable[[], Notice | None] | None = None,
+        mains: Mains | None = None,
+        lamp: LampBefore | None = None,
         deadline: Callable[[float], Deadline] = in_seconds,
-        maybe_lit: bool = False,
-        failed: int = 0,
-        keep_forgiven: Callable[[int], None] | None = None,
     ) -> None:
+        lamp = lamp or LampBefore()
         self.name = name
         self._open_guard, self._tell = open_guard, tell
         self._clock = clock or SystemClock()
-        self._asleep, self._unfed = asleep or (lambda: False), unfed or (lambda: None)
-        self._deadline, self._keep_forgiven = deadline, keep_forgiven or (lambda most: None)
+        self._mains = mains or Mains()
+        self._deadline, self._keep_forgiven = deadline, lamp.keep_forgiven
         self._guard: LampGuard | None = None
         self._want_lit: bool | None = None
-        self._view = ProjectorView(name, maybe_lit=maybe_lit)
+        self._view = ProjectorView(name, maybe_lit=lamp.maybe_lit)
         self._stepping = self._closed = False
         self._silent_since_s: float | None = None
         self._reopen_at_s = 0.0
         self._struck_at_s: float | None = None
         """Since when its light is awaited: the attempt, then the first answer that it warms up."""
         self._warms = False
-        self._failed_strikes = failed
+        self._failed_strikes = lamp.failed
         self._unanswered = False
         """Whether the last attempt had neither an answer nor an effect: the projector may never have received it."""
         self._answers_since_s: float | None = None
@@ -129,7 +144,7 @@ class ProjectorSupervisor:
             self._stepping = False
 
     def _step(self) -> None:
-        if self._asleep():
+        if self._mains.asleep():
             self._silent_since_s = None
             self._reopen_at_s = 0.0
             self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
@@ -219,7 +234,7 @@ class ProjectorSupervisor:
         now_s = self._clock.now_s()
         self._reopen_at_s = now_s + pause_s(now_s - self._silent_since_s)
         self._struck_at_s = None
-        problem, unfed = Notice.of(error, level=Level.ERROR), self._unfed()
+        problem, unfed = Notice.of(error, level=Level.ERROR), self._mains.problem()
         if unfed is not None:
             problem = replace(problem, what=f"{problem.what} {unfed.what}", remedy=unfed.remedy)
         self._show(replace(self._view, condition=Condition.LOST, power=Power.UNKNOWN, maybe_lit=maybe_lit, looked=True,

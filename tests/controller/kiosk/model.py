@@ -6,13 +6,13 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from controller.kiosk.decide.clock import TrustedClock, beginning
+from controller.kiosk.decide.clock import Timetable, TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
+from controller.kiosk.supervisors.projector_supervisor import LampBefore, ProjectorSupervisor
 from controller.kiosk.values import Turn
 from controller.run.state_machine import State
 from controller.stage.rig.lamp_guard import LampGuard
@@ -168,11 +168,7 @@ class Kiosk:
         self.supervisors = [self._supervisor(name) for name in NAMES]
         self.reconciler = Reconciler(
             self.supervisors, self.player, self.jobs, self.bundles, self.log,
-            schedule=lambda: self.schedule,
-            clock=TrustedClock(self.log, self.wall, self.world.now_s, lambda: False),
-            monotonic=self.world.now_s,
-            without_time=self.without_time,
-            limits=LIMITS,
+            Timetable(ModelHours(self), TrustedClock(self.log, self.wall, self.world.now_s, lambda: False)), LIMITS,
         )  # fmt: skip
 
     def wall(self) -> float:
@@ -185,9 +181,8 @@ class Kiosk:
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
         record = self.shelf.read(name) or LampRecord()
-        return ProjectorSupervisor(
-            name, open_guard, self.log.add, clock=self.world, failed=record.failed_in(self.world.boot())
-        )
+        lamp = LampBefore(failed=record.failed_in(self.world.boot()))
+        return ProjectorSupervisor(name, open_guard, self.log.add, clock=self.world, lamp=lamp)
 
     def power_cut(self, seconds: float) -> None:
         """Everything goes dark for so long."""
@@ -239,3 +234,18 @@ class Kiosk:
 
 
 __all__ = ["BUNDLE", "NAMES", "RULES", "STEP_S", "FragileLamp", "Kiosk", "ModelJobs", "ModelPlayer", "Power"]
+
+
+@dataclass(frozen=True)
+class ModelHours:
+    """The opening hours of a model, as they are now."""
+
+    kiosk: Kiosk
+
+    @property
+    def now(self) -> Schedule:
+        return self.kiosk.schedule
+
+    @property
+    def open_without_time(self) -> bool:
+        return self.kiosk.without_time

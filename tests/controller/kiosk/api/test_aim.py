@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from controller.kiosk.api.aim import FIGURES, FOLDER, aiming, camera_picture, grazing_share
-from controller.kiosk.interface import Aiming, LiveValue
+from controller.kiosk.interface import Aiming, DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
 from controller.optics.calibrate.values import Geometry, Pinhole
@@ -138,7 +138,9 @@ def devices_with(folder: Path, camera: Camera) -> Devices:
         device.identity(deadline=deadline)
         return ()
 
-    found.camera = DeviceSupervisor("camera", "camera", "model", lambda _: camera, look, lambda _: None, every_s=0.0)
+    found.camera = DeviceSupervisor(
+        DeviceRow("camera", "camera", "model"), lambda _: camera, look, lambda _: None, every_s=0.0
+    )
     return found
 
 

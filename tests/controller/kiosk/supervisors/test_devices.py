@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.kiosk.interface import DeviceRow
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors import projector_supervisor
@@ -95,7 +96,7 @@ def test_a_device_that_opens_after_its_keeper_was_closed_is_let_go_of() -> None:
         opened.append(QuickLamp())
         return opened[0]
 
-    supervisor = DeviceSupervisor("camera", "camera", "model", open_slowly, lambda *_: (), lambda _: None)
+    supervisor = DeviceSupervisor(DeviceRow("camera", "camera", "model"), open_slowly, lambda *_: (), lambda _: None)
     supervisor.step()
     assert [one.open for one in opened] == [False]
     assert supervisor.device is None

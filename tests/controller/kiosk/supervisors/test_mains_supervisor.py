@@ -4,22 +4,39 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import threading
 from dataclasses import dataclass, field
 
 import pytest
 
-from controller.kiosk.interface import LiveValue
+from controller.kiosk import world as kiosk_world
+from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
+from controller.kiosk.supervisors.projector_supervisor import Mains as ProjectorsMains
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.power import Circuit
-from hal.deadline import Deadline
+from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceGone
 from hal.interfaces import Device
 from hal.notices import Notice
 from hal.values import DeviceIdentity
 from tests.controller.stage.rig.lamp_model import Lamp, Shelf, World
+
+
+class KioskWorld(kiosk_world.World):
+    """Time as the lamps have it; deadlines in real time."""
+
+    def __init__(self, lamps: World) -> None:
+        self._lamps = lamps
+
+    def monotonic(self) -> float:
+        return self._lamps.now_s()
+
+    def deadline(self, seconds: float, cancel: threading.Event | None = None) -> Deadline:
+        return in_seconds(seconds, cancel)
+
 
 BOOT_S = 3.0
 
@@ -69,7 +86,7 @@ class Mains:
     def begin(self) -> None:
         """The service begins."""
         self.supervisors = {name: self._supervisor(name) for name in self.lamps}
-        self.relays = MainsSupervisor("model", self._open, self.told.append, monotonic=self.world.now_s)
+        self.relays = MainsSupervisor("model", self._open, self.told.append, KioskWorld(self.world))
         self.relays.supervisors = tuple(self.supervisors.values())
 
     def _open(self, deadline: Deadline) -> Device:
@@ -81,7 +98,7 @@ class Mains:
             return LampGuard(name, self.lamps[name], self.shelf, clock=self.world)
 
         return ProjectorSupervisor(name, open_guard, self.told.append, clock=self.world,
-                               asleep=lambda: self.relays.silences(name))  # fmt: skip
+                               mains=ProjectorsMains(asleep=lambda: self.relays.silences(name)))  # fmt: skip
 
     def run(self, seconds: float) -> None:
         for _ in range(int(seconds)):
@@ -275,8 +292,8 @@ def test_a_device_is_opened_again_less_and_less_often_and_told_of_once_a_trouble
     def look(device: Device, deadline: Deadline) -> tuple[LiveValue, ...]:
         return (LiveValue("Model", device.identity(deadline=deadline).model),)
 
-    supervisor = DeviceSupervisor("sensor", "sensor", "model", sensor.opened, look, told.append, every_s=10.0,
-                          monotonic=world.now_s)  # fmt: skip
+    row = DeviceRow("sensor", "sensor", "model")
+    supervisor = DeviceSupervisor(row, sensor.opened, look, told.append, every_s=10.0, world=KioskWorld(world))
 
     def run(seconds: int) -> None:
         for _ in range(seconds):

@@ -11,6 +11,8 @@ from controller.kiosk.supervisors.projector_supervisor import (
     LIGHT_MARGIN_S,
     MOST_STRIKES,
     REOPEN_AFTER_FAULT_S,
+    LampBefore,
+    Mains,
     ProjectorSupervisor,
 )
 from controller.stage.rig.lamp_guard import LampGuard
@@ -116,8 +118,8 @@ class Kept:
         self.ledger: LampLedger = self.shelf if self.file is None else LampFile(self.file)
         record = self.ledger.read("left") or LampRecord()
         self.supervisor = ProjectorSupervisor(
-            "left", self._opened, self.told.append, clock=self.world, maybe_lit=maybe_lit,
-            failed=record.failed_in(self.world.boot()), keep_forgiven=partial(self.ledger.forgive, "left"),
+            "left", self._opened, self.told.append, clock=self.world,
+            lamp=LampBefore(maybe_lit, record.failed_in(self.world.boot()), partial(self.ledger.forgive, "left")),
         )  # fmt: skip
 
     def _opened(self, deadline: Deadline) -> LampGuard:
@@ -415,7 +417,8 @@ def test_a_short_silence_is_no_event(kept: Kept) -> None:
 def test_without_mains_it_counts_as_dark_and_nobody_asks_it() -> None:
     kept = Kept()
     kept.there = False
-    asleep = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: True)
+    mains = Mains(asleep=lambda: True)
+    asleep = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, mains=mains)
     asleep.want_lit = True
     asleep.step()
     assert asleep.view.condition is Condition.DARK
@@ -427,7 +430,7 @@ def test_a_projector_behind_a_relay_board_that_is_away_says_so(kept: Kept) -> No
     board = Notice("hid-unplugged", "No relay board is plugged in.", "Check its hub.", Level.ERROR)
     fed: list[Notice] = []
     supervisor = ProjectorSupervisor(
-        "left", kept._opened, kept.told.append, clock=kept.world, unfed=lambda: fed[0] if fed else None
+        "left", kept._opened, kept.told.append, clock=kept.world, mains=Mains(problem=lambda: fed[0] if fed else None)
     )
     supervisor.step()
     assert supervisor.view.problem is not None
@@ -440,7 +443,8 @@ def test_a_projector_behind_a_relay_board_that_is_away_says_so(kept: Kept) -> No
 
 def test_a_projector_that_got_its_mains_back_is_spoken_to_at_once(kept: Kept) -> None:
     kept.there, dark = False, False
-    supervisor = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, asleep=lambda: dark)
+    mains = Mains(asleep=lambda: dark)
+    supervisor = ProjectorSupervisor("left", kept._opened, kept.told.append, clock=kept.world, mains=mains)
     for _ in range(60):
         supervisor.step()
         kept.world.time_s += 1.0
