@@ -68,27 +68,41 @@ class Packing:
     codec: str
 
 
+@dataclass(frozen=True, slots=True)
+class NewBundle:
+    """What a new bundle says of itself, beside its appearances.
+
+    Parameters
+    ----------
+    stage, calibration : for which stage, and by which of its calibrations
+    created_unix_s : when it was made, Unix seconds
+    outputs : (name, width_px, height_px) of each output, in stage order
+    schedule : the playlist that the bundle suggests
+    live : the data of live mode; None leaves it out
+    """
+
+    stage: str
+    calibration: str
+    created_unix_s: int
+    outputs: Sequence[tuple[str, int, int]]
+    revision: int = 0
+    schedule: Sequence[fmt.PlaylistEntry] = ()
+    live: NewLive | None = None
+
+
 def write_bundle(
     path: Path,
-    *,
-    stage: str,
-    calibration: str,
-    created_unix_s: int,
-    outputs: Sequence[tuple[str, int, int]],
+    new: NewBundle,
     appearances: Iterable[NewAppearance],
+    *,
     key: SigningKey | None = None,
-    revision: int = 0,
-    schedule: Sequence[fmt.PlaylistEntry] = (),
-    live: NewLive | None = None,
     packing: Packing | None = None,
 ) -> fmt.Index:
     """Write a bundle atomically and return its index.
 
     Parameters
     ----------
-    outputs : (name, width_px, height_px) of each output, in stage order
     appearances : taken one at a time, so that a long list need not be in memory at once
-    schedule : the playlist that the bundle suggests
     packing : None lets the first two appearances decide (``choose_packing``)
     key : signs the bundle; None leaves it unsigned, and players refuse it unless they allow unsigned bundles
 
@@ -100,15 +114,17 @@ def write_bundle(
     def write(file: BinaryIO) -> None:
         file.write(bytes(fmt.FIRST_BLOB))
         blobs, coming = _Blobs(file), iter(appearances)
-        first = [_checked(outputs, appearance) for appearance in itertools.islice(coming, 2)]
-        chosen = packing or choose_packing(outputs, [appearance.frames for appearance in first])
+        first = [_checked(new.outputs, appearance) for appearance in itertools.islice(coming, 2)]
+        chosen = packing or choose_packing(new.outputs, [appearance.frames for appearance in first])
         parts = []
         while first:
             parts.append(_write_appearance(blobs, chosen, first.pop(0)))
-            first += [_checked(outputs, appearance) for appearance in itertools.islice(coming, 0 if first else 1)]
-        kept = None if live is None else _write_live(blobs, live)
-        index = fmt.Index(stage, calibration, created_unix_s, revision, chosen.layouts, tuple(parts), tuple(schedule),
-                          kept, chosen.codec)  # fmt: skip
+            first += [_checked(new.outputs, appearance) for appearance in itertools.islice(coming, 0 if first else 1)]
+        kept = None if new.live is None else _write_live(blobs, new.live)
+        index = fmt.Index(
+            new.stage, new.calibration, new.created_unix_s, new.revision,
+            chosen.layouts, tuple(parts), tuple(new.schedule), kept, chosen.codec,
+        )  # fmt: skip
         _finish(blobs, index, key)
         written.append(index)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,10 @@ from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.calibrations import worst_grade
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import marker
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.photographing import (
+    ShownPicture,
     photograph_hdr,
     photograph_step,
     photographs_s,
@@ -57,7 +59,7 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
     session = OwnSession(stage, around=bench)
     engine = choose_engine(checked.stage.tables.solve.device, reporter.say)
     steps = partial(demo_steps, checked=checked, engine=engine)
-    run = session.run(checked, steps, name="demo", reporter=reporter, cancel=cancel)
+    run = session.run(checked, StageWork("demo", steps), reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")
     html, machine = write_demo_report(out, run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
@@ -106,17 +108,18 @@ def _one_projector_steps(
     """
     after = tuple(StepId(StepKind.APPEARANCE, item=name) for name in names)
     weight = photographs_s(rig, names)
+    alone = _BestProjector(rig, calibrated, longest_s)
     return [
         Step(
             StepId(StepKind.TRADITIONAL),
-            partial(_traditional, rig, calibrated, tuple(names), longest_s),
+            partial(_traditional, alone, tuple(names)),
             after=after,
             title="Photographing one projector for comparison",
             weight=weight,
         ),
         Step(
             StepId(StepKind.DIMMED),
-            partial(_dimmed, rig, calibrated, tuple(names), longest_s, share),
+            partial(_dimmed, alone, tuple(names), share),
             inputs={"share": repr(share)},
             after=after,
             title="Photographing one projector at its own exposure",
@@ -125,56 +128,51 @@ def _one_projector_steps(
     ]
 
 
-def _traditional(
-    rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, context: Context
-) -> Sequence[Path]:
+@dataclass(frozen=True, slots=True)
+class _BestProjector:
+    """The projector that lights most of the object, alone; ``longest_s``: the longest exposure."""
+
+    rig: Rig
+    calibrated: Calibrated
+    longest_s: float
+
+    @property
+    def index(self) -> int:
+        lit = self.calibrated.transport.lit
+        return int(lit.reshape(len(lit), -1).sum(axis=1).argmax())
+
+    def photograph(
+        self, context: Context, kind: StepKind, name: str, target: RequestedTarget, exposure: float
+    ) -> FloatImage:
+        """A photograph of ``target``, made by this projector alone; ``exposure``: the radiance of its white."""
+        calibration, best = self.calibrated.calibration, self.index
+        frames = device_frames(calibration, traditional_compensation(calibration, target.target, best))
+        shown = self.rig.display.show(self.rig.on_outputs(frames), deadline=context.deadline.within(20))
+        of = {"appearance": name, "projector": str(best)}
+        what = ShownPicture(kind, name, of, shown.at_s, exposure, target.target[target.reachable])
+        return photograph_hdr(self.rig, context, what, self.longest_s)
+
+
+def _traditional(alone: _BestProjector, names: Sequence[str], context: Context) -> Sequence[Path]:
     paths = []
     for number, name in enumerate(names):
         context.advance(number / len(names), name)
-        solved = read_solved(context.folder, name, calibrated.projectors)
-        picture = _by_one(
-            rig, calibrated, StepKind.TRADITIONAL, name, solved.requested, solved.exposure, longest_s, context
-        )
+        solved = read_solved(context.folder, name, alone.calibrated.projectors)
+        picture = alone.photograph(context, StepKind.TRADITIONAL, name, solved.requested, solved.exposure)
         paths.append(write_photograph(context.folder, StepKind.TRADITIONAL, name, picture))
     return paths
 
 
-def _dimmed(
-    rig: Rig, calibrated: Calibrated, names: Sequence[str], longest_s: float, share: float, context: Context
-) -> Sequence[Path]:
-    paths = []
+def _dimmed(alone: _BestProjector, names: Sequence[str], share: float, context: Context) -> Sequence[Path]:
+    calibrated, paths = alone.calibrated, []
+    calibration = calibrated.calibration
     for number, name in enumerate(names):
         context.advance(number / len(names), name)
-        asked = read_solved(context.folder, name, calibrated.projectors)
-        picture = np.asarray(asked.requested.target / np.float32(asked.exposure), np.float32)
-        found = exposed_for_one(
-            calibrated.calibration, picture, _best(calibrated), share=share, indirect=calibrated.indirect
-        )
-        target = target_radiance(found.wanted, calibrated.calibration.black, 1.0)
-        wanted = RequestedTarget(target, found.possible.reachable & asked.requested.valid, asked.requested.valid)
-        photograph = _by_one(rig, calibrated, StepKind.DIMMED, name, wanted, found.exposure, longest_s, context)
-        dimmed = Dimmed(photograph, target, wanted.reachable, found.exposure)
-        paths.append(dimmed.write(context.folder, name))
+        solved = read_solved(context.folder, name, calibrated.projectors)
+        picture = np.asarray(solved.requested.target / np.float32(solved.exposure), np.float32)
+        dim = exposed_for_one(calibration, picture, alone.index, share=share, indirect=calibrated.indirect)
+        radiance, valid = target_radiance(dim.wanted, calibration.black, 1.0), solved.requested.valid
+        target = RequestedTarget(radiance, dim.possible.reachable & valid, valid)
+        photograph = alone.photograph(context, StepKind.DIMMED, name, target, dim.exposure)
+        paths.append(Dimmed(photograph, radiance, target.reachable, dim.exposure).write(context.folder, name))
     return paths
-
-
-def _best(calibrated: Calibrated) -> int:
-    """The projector that lights most of the object."""
-    lit = calibrated.transport.lit
-    return int(lit.reshape(len(lit), -1).sum(axis=1).argmax())
-
-
-def _by_one(
-    rig: Rig, calibrated: Calibrated, kind: StepKind, name: str, wanted: RequestedTarget, exposure: float,
-    longest_s: float, context: Context,
-) -> FloatImage:  # fmt: skip
-    """A photograph of what is ``wanted``, made by the best projector alone."""
-    best = _best(calibrated)
-    frames = device_frames(
-        calibrated.calibration, traditional_compensation(calibrated.calibration, wanted.target, best)
-    )
-    shown = rig.display.show(rig.on_outputs(frames), deadline=context.deadline.within(20))
-    return photograph_hdr(
-        rig, context, kind, name, exposure, longest_s, shown_at_s=shown.at_s,
-        of={"appearance": name, "projector": str(best)}, light=wanted.target[wanted.reachable],
-    )  # fmt: skip

@@ -15,7 +15,7 @@ from nacl.signing import SigningKey
 from controller.bundle.format import PlaylistEntry
 from controller.bundle.install import install, revision_floor
 from controller.bundle.signing import Trust
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.config.writer import toml_text
 from controller.kiosk.interface import EventRow, Schedule
 from controller.kiosk.store.bundle_store import slots_without
@@ -64,17 +64,27 @@ def publish(folder: Path, created_unix_s: int, missing: Collection[str] = ()) ->
     revision = revision_floor(slots, TRUST) + 1
     names = [name for name in NAMES if name not in missing]
     write_bundle(
-        built, stage="Simulated", calibration=RUN, created_unix_s=created_unix_s, revision=revision, key=_KEY,
-        outputs=[(output, _SIDE_PX, _SIDE_PX) for output in OUTPUTS.values()],
+        built,
+        NewBundle(
+            stage="Simulated",
+            calibration=RUN,
+            created_unix_s=created_unix_s,
+            revision=revision,
+            outputs=[(output, _SIDE_PX, _SIDE_PX) for output in OUTPUTS.values()],
+            schedule=[PlaylistEntry(name, 30_000, 1_000) for name in APPEARANCES],
+        ),
+        key=_KEY,
         appearances=[
-            NewAppearance(name, {
-                output: np.full((_SIDE_PX, _SIDE_PX, 3), shade * 40 if lit in names else 0, np.uint8)
-                for lit, output in OUTPUTS.items()
-            })
+            NewAppearance(
+                name,
+                {
+                    output: np.full((_SIDE_PX, _SIDE_PX, 3), shade * 40 if lit in names else 0, np.uint8)
+                    for lit, output in OUTPUTS.items()
+                },
+            )
             for shade, name in enumerate(APPEARANCES, 1)
         ],
-        schedule=[PlaylistEntry(name, 30_000, 1_000) for name in APPEARANCES],
-    )  # fmt: skip
+    )
     try:
         return install(built, slots, trusted=TRUST.keys)
     finally:

@@ -24,7 +24,7 @@ from controller.stage.rig.rig import Rig
 from controller.stage.services.calibrate import calibrating
 from controller.stage.sessions.bench import BenchProcess, bench_of
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from controller.stage.steps import costs
 from hal.errors import DeviceError
 from lab.study.catalogue import EXPERIMENTS, SCENES, chosen
@@ -137,7 +137,7 @@ def run_on_bench(
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     session = OwnSession(stage, around=bench, again=True)
     return session.run(
-        checked, lambda rig, run: steps(rig, run, checked, bench), name=name, reporter=reporter, cancel=cancel
+        checked, StageWork(name, lambda rig, run: steps(rig, run, checked, bench)), reporter=reporter, cancel=cancel
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.kiosk_places import RUNTIME
 from controller.kiosk.api.control import NAME as SOCKET
 from controller.kiosk.panel_address import FIRST_LOGIN
@@ -272,11 +272,7 @@ def prepared_stage(folder: Path) -> Path:
     for revision, name in enumerate(_BUNDLES):
         write_bundle(
             stage / name,
-            stage="demo small",
-            calibration="c",
-            created_unix_s=revision,
-            outputs=OUTPUTS,
-            revision=revision,
+            NewBundle(stage="demo small", calibration="c", created_unix_s=revision, outputs=OUTPUTS, revision=revision),
             appearances=[NewAppearance(APPEARANCE, noise(OUTPUTS, (_SEED, OTHER_SEED)[revision % 2]))],
             key=load_signing_key(stage / "keys" / "stage.key"),
         )

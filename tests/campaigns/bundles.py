@@ -19,7 +19,7 @@ from nacl.signing import SigningKey
 
 from controller.bundle.format import OutputLayout, PlaylistEntry
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, NewLive, Packing, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, Packing, write_bundle
 from controller.core.errors import BundleError
 
 KEY = SigningKey(bytes(range(32)))
@@ -49,12 +49,19 @@ def write(path: Path) -> None:
     rising = np.arange(40, dtype=np.uint8)[:, None, None]
     ramp = {name: np.tile(rising[:rows], (1, columns, 3)) for name, columns, rows in OUTPUTS}
     write_bundle(
-        path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS, key=KEY,
-        schedule=[PlaylistEntry("ramp", 900, 9)],
+        path,
+        NewBundle(
+            stage="s",
+            calibration="c",
+            created_unix_s=0,
+            outputs=OUTPUTS,
+            schedule=[PlaylistEntry("ramp", 900, 9)],
+            live=NewLive((5, 4), {"gain": random.random((4, 5, 3)).astype(np.float16)}),
+        ),
+        key=KEY,
         appearances=[NewAppearance("noise", noise), NewAppearance("ramp", ramp, b"\x89PNG\r\n\x1a\n" + bytes(99))],
         packing=Packing(tuple(OutputLayout(name, columns, rows, 16, 9) for name, columns, rows in OUTPUTS), "lz4"),
-        live=NewLive((5, 4), {"gain": random.random((4, 5, 3)).astype(np.float16)}),
-    )  # fmt: skip
+    )
 
 
 def run(flips: int, seed: int = 1, *, every: int = 1) -> Outcome:

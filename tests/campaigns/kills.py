@@ -52,7 +52,7 @@ def work(stage: Path) -> int:
     """What a person would type, and type again: calibrate unless that is done, then the appearance."""
     from controller.optics.capture import latency
     from controller.run.progress import Silent
-    from controller.stage.services.calibrate import calibrate, make_appearances
+    from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
     from controller.stage.sessions.calibrations import finished_calibrations
     from controller.stage.sessions.session import OwnSession
     from controller.stage.steps.capture import camera as camera_steps
@@ -65,7 +65,7 @@ def work(stage: Path) -> int:
     cancel = threading.Event()
     if not finished_calibrations(stage):
         calibrate(session=OwnSession(stage), reporter=Silent(), cancel=cancel)
-    make_appearances(session=OwnSession(stage), names=(APPEARANCE,), reporter=Silent(), cancel=cancel)
+    make_appearances(AppearanceOrder(names=(APPEARANCE,)), session=OwnSession(stage), reporter=Silent(), cancel=cancel)
     print(DONE, flush=True)
     return 0
 

@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.play.control.launch import PlayerSettings, start_player
 from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
@@ -93,7 +93,9 @@ def whole(pictures: Pictures) -> bytes:
 def _bundle(place: Path, outputs: list[tuple[str, int, int]], count: int) -> list[Pictures]:
     sets = [noise(outputs, seed) for seed in range(count)]
     made = [NewAppearance(str(number), pictures) for number, pictures in enumerate(sets)]
-    write_bundle(place / "b.vel", stage="s", calibration="c", created_unix_s=0, outputs=outputs, appearances=made)
+    write_bundle(
+        place / "b.vel", NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=outputs), appearances=made
+    )
     return sets
 
 

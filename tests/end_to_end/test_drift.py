@@ -18,7 +18,7 @@ from controller.core.errors import CalibrationError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.stage.artefacts.grade import graded
-from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.services.recalibrate import check_drift, recalibrate
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.session import OwnSession
@@ -138,7 +138,10 @@ def test_nothing_is_published_below_the_set_grade_unless_a_person_accepts_it(bum
     try:
         with pytest.raises(CalibrationError) as caught:
             make_appearances(
-                session=OwnSession(bumpy.stage), names=["checkerboard"], reporter=Silent(), cancel=threading.Event()
+                AppearanceOrder(names=["checkerboard"]),
+                session=OwnSession(bumpy.stage),
+                reporter=Silent(),
+                cancel=threading.Event(),
             )
         assert caught.value.code == "calibration-below-grade"
         assert "--accept-grade" in caught.value.remedy

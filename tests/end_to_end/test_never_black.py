@@ -15,7 +15,7 @@ import pytest
 from controller.bundle.format import PlaylistEntry
 from controller.bundle.install import CURRENT, install
 from controller.bundle.signing import load_signing_key
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.config.loader import FILE
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
@@ -50,11 +50,18 @@ def install_bundle(stage: Path, revision: int, *names: str) -> Path:
         return {name: random.integers(1, 255, (height, width, 3), np.uint8) for name, (width, height) in outputs}
 
     write_bundle(
-        stage / "made.vel", stage="mini", calibration="none", created_unix_s=1_780_000_000 + revision,
-        outputs=[(name, *size) for name, size in outputs], revision=revision,
-        appearances=[NewAppearance(name, frames()) for name in names], key=key,
-        schedule=[PlaylistEntry(name, SHOWN_MS, FADE_MS) for name in names],
-    )  # fmt: skip
+        stage / "made.vel",
+        NewBundle(
+            stage="mini",
+            calibration="none",
+            created_unix_s=1_780_000_000 + revision,
+            outputs=[(name, *size) for name, size in outputs],
+            revision=revision,
+            schedule=[PlaylistEntry(name, SHOWN_MS, FADE_MS) for name in names],
+        ),
+        appearances=[NewAppearance(name, frames()) for name in names],
+        key=key,
+    )
     return install(stage / "made.vel", stage / "bundles", trusted=[bytes(key.verify_key)])
 
 

@@ -14,7 +14,7 @@ from controller.kiosk.api.control import call_kiosk
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_solved
-from controller.stage.services.calibrate import make_appearances
+from controller.stage.services.calibrate import AppearanceOrder, make_appearances
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
@@ -58,7 +58,9 @@ def test_the_others_take_over_for_a_dead_lamp(finished_demo: FinishedDemo, tmp_p
     # One appearance is solved for the others, instead of all.
     (stage / "stage.toml").write_text(f"{head}\n[[appearances]]\n{table}")
     shutil.rmtree(stage / "bundles")
-    make_appearances(session=OwnSession(stage), names=[NAME], reporter=Silent(), cancel=threading.Event())
+    make_appearances(
+        AppearanceOrder(names=[NAME]), session=OwnSession(stage), reporter=Silent(), cancel=threading.Event()
+    )
     (stage / "bench" / "dead.toml").write_text(FAULTS)
     bench = stage / "bench.toml"
     text = bench.read_text()

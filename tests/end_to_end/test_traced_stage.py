@@ -12,7 +12,7 @@ from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.grade import read_troubles
 from controller.stage.artefacts.solved import read_solved
-from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.services.refine import Refinement
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.calibrations import finished_calibrations
@@ -35,9 +35,11 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with BenchProcess(stage, cancel=cancel):
         calibrate(session=session, reporter=Silent(), cancel=cancel, accept_grade=True)
         make_appearances(
-            session=session, names=["grey"], reporter=Silent(), cancel=cancel, accept_grade=True,
-            refinement=Refinement(0),
-        )  # fmt: skip
+            AppearanceOrder(names=["grey"], accept_grade=True, refinement=Refinement(0)),
+            session=session,
+            reporter=Silent(),
+            cancel=cancel,
+        )
     return stage
 
 

@@ -53,16 +53,25 @@ def appearance(
     """Calculate appearances, and publish them as a signed bundle. Photographs correct each result."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.stage.services.calibrate import make_appearances
+        from controller.stage.services.calibrate import AppearanceOrder, make_appearances
         from controller.stage.services.refine import refinement_of
         from controller.stage.sessions.session import OwnSession
 
         return make_appearances(
-            session=OwnSession(stage), names=tuple(names or ()), scenes=tuple(blender or ()),
-            accept_grade=accept_grade, base=solve.base, scheduler=solve.scheduler, quick=solve.quick,
-            refinement=refinement_of(stage, solve.refine, quick=solve.quick), device=solve.device,
-            reporter=reporter, cancel=cancel,
-        )  # fmt: skip
+            AppearanceOrder(
+                names=tuple(names or ()),
+                scenes=tuple(blender or ()),
+                accept_grade=accept_grade,
+                base=solve.base,
+                scheduler=solve.scheduler,
+                quick=solve.quick,
+                refinement=refinement_of(stage, solve.refine, quick=solve.quick),
+                device=solve.device,
+            ),
+            session=OwnSession(stage),
+            reporter=reporter,
+            cancel=cancel,
+        )
 
     work(do, stage=stage)
 
@@ -108,13 +117,11 @@ def play(
     """Switch the projectors on, and show appearances."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.stage.services.play import play
+        from controller.stage.services.play import PlayRequest, play
         from controller.stage.sessions.session import OwnSession
 
-        return play(
-            session=OwnSession(stage), names=tuple(names or ()), sequence=sequence, seconds=seconds or None,
-            fade_s=fade, repeat=repeat, reporter=reporter, cancel=cancel,
-        )  # fmt: skip
+        request = PlayRequest(tuple(names or ()), sequence, seconds or None, fade, repeat)
+        return play(request, session=OwnSession(stage), reporter=reporter, cancel=cancel)
 
     work(do, stage=stage)
 
@@ -152,18 +159,13 @@ def live(
     """Show a video, a folder or a stream as it changes. Switches the projectors on."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.stage.services.live import feed, live
+        from controller.stage.services.live import LiveInput, feed, live
         from controller.stage.sessions.session import OwnSession
 
         shown = targets_shown
+        pictures = LiveInput(shown.source, shown.fps, shown.loop, shown.seconds or None)
         if into is not None:
-            return feed(
-                stage=stage, source=shown.source, into=into, targets=targets, rate_hz=shown.fps, loop=shown.loop,
-                seconds=shown.seconds or None, reporter=reporter, cancel=cancel,
-            )  # fmt: skip
-        return live(
-            session=OwnSession(stage), source=shown.source, rate_hz=shown.fps, loop=shown.loop,
-            seconds=shown.seconds or None, reporter=reporter, cancel=cancel,
-        )  # fmt: skip
+            return feed(pictures, into, stage=stage, targets=targets, reporter=reporter, cancel=cancel)
+        return live(pictures, session=OwnSession(stage), reporter=reporter, cancel=cancel)
 
     work(do)

@@ -15,7 +15,7 @@ import numpy as np
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_signing_key
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.store.bundle_store import slots_without
 from controller.run.journal import Journal
@@ -123,13 +123,15 @@ def _publish(
 
     write_bundle(
         built,
-        stage=checked.stage.tables.stage.name,
-        calibration=run.name,
-        created_unix_s=int(time.time()),
-        outputs=[(output, *size) for output, size in outputs.values()],
+        NewBundle(
+            stage=checked.stage.tables.stage.name,
+            calibration=run.name,
+            created_unix_s=int(time.time()),
+            outputs=[(output, *size) for output, size in outputs.values()],
+            revision=revision_floor(slots, trust) + 1,
+        ),
         appearances=map(appearance, names),
         key=None if key is None else load_signing_key(key),
-        revision=revision_floor(slots, trust) + 1,
     )
     install(built, slots, trusted=trust.keys, allow_unsigned=trust.allow_unsigned, revoked=trust.revoked)
     return [built]

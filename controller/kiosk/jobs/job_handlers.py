@@ -43,14 +43,14 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
 
     Raises what ``services.calibrate.make_appearances`` raises if no appearance can be solved, and Cancelled.
     """
-    from controller.stage.services.calibrate import make_appearances
+    from controller.stage.services.calibrate import AppearanceOrder, make_appearances
 
     names, failed = _checked(session.stage)
     if failed and not names:
         return Published((), failed)
 
     def make(subset: Sequence[str]) -> None:
-        make_appearances(session=session, names=subset, reporter=reporter, cancel=cancel)
+        make_appearances(AppearanceOrder(names=subset), session=session, reporter=reporter, cancel=cancel)
 
     try:
         make(names)

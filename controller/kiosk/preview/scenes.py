@@ -83,7 +83,7 @@ def _rendered(checked: Checked, scene: str, of: str) -> Path:
     if kept.is_file() and _read(facts) == about:
         return kept
     kept.parent.mkdir(parents=True, exist_ok=True)
-    _render(checked, run, kept, builtin=scene if file is None else None, scene_file=file)
+    _render(checked, run, kept, scene if file is None else file)
     write_atomically(facts, json.dumps(about).encode())
     return kept
 
@@ -95,7 +95,7 @@ def _read(facts: Path) -> Any:
         return None
 
 
-def _render(checked: Checked, run: Path, kept: Path, *, builtin: str | None, scene_file: Path | None) -> None:
+def _render(checked: Checked, run: Path, kept: Path, scene: str | Path) -> None:
     """Write the target as the preview's samples see it, into ``kept``."""
     from controller.core.arrays import save_arrays
     from controller.kiosk.preview.preview_light import preview_light
@@ -115,7 +115,7 @@ def _render(checked: Checked, run: Path, kept: Path, *, builtin: str | None, sce
     with tempfile.TemporaryDirectory(dir=kept.parent) as scratch:
         work = Path(scratch)
         write_job(work, geometry, transport.object_mask, transport.reach(),
-                  builtin=builtin, scene_file=scene_file, settings=settings, view=view)  # fmt: skip
+                  scene=scene, settings=settings, view=view)  # fmt: skip
         picture = read_picture(render(blender, work, lambda share, note: None))
     target = as_seen(picture, view, light.transport.object_mask)
     save_arrays(kept, {"image": target.image, "mask": target.mask})

@@ -49,8 +49,7 @@ def write_job(
     mask: Mask,
     light: FloatImage,
     *,
-    builtin: str | None,
-    scene_file: Path | None,
+    scene: str | Path,
     settings: RenderSettings,
     view: Pinhole | None = None,
 ) -> None:
@@ -59,6 +58,7 @@ def write_job(
     Parameters
     ----------
     mask : (camera rows, columns), the object
+    scene : the name of one of ``BUILTIN``, or a .blend file
     view : the camera of the picture; by default the calibrated one, whose picture a quick look needs only small
     light : (camera rows, columns, 3), what the camera sees under the white of all projectors; from it and the known
         places of the projectors comes the object's own paint
@@ -81,8 +81,8 @@ def write_job(
     )
     view = geometry.camera if view is None else view
     job = {
-        "builtin": builtin,
-        "scene_file": None if scene_file is None else str(scene_file.resolve()),
+        "builtin": scene if isinstance(scene, str) else None,
+        "scene_file": None if isinstance(scene, str) else str(scene.resolve()),
         "camera": _camera_of(view, mesh.vertices_m[:, 2]),
         **dataclasses.asdict(settings),
     }

@@ -20,7 +20,7 @@ from controller.stage.artefacts.solved import is_solved
 from controller.stage.sessions.calibrations import KEY_FILE, output_sizes, signing_key, stage_trust, usable_calibration
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.run import stage_lock
-from controller.stage.steps.appearance.publishing import hints_ms, publish_solved
+from controller.stage.steps.appearance.publishing import BundleTarget, publish_solved
 from hal.deadline import Cancelled
 from hal.notices import Level
 
@@ -52,20 +52,9 @@ def build(
         reporter.say(f"Writing {len(chosen)} appearances.")
         if key is None:
             reporter.say(_warning(None, stage_trust(checked.stage))["warning"], Level.WARNING)
-        index = publish_solved(
-            path,
-            run,
-            output_sizes(checked),
-            chosen,
-            stage=checked.stage.tables.stage.name,
-            calibration=run.name,
-            key=key,
-            slots=folder / BUNDLES,
-            trust=stage_trust(checked.stage),
-            live=live,
-            hints_ms=hints_ms(folder),
-            check=lambda: _check(cancel),
-        )
+        name, trust = checked.stage.tables.stage.name, stage_trust(checked.stage)
+        target = BundleTarget(folder, name, run.name, output_sizes(checked), key, trust)
+        index = publish_solved(path, run, target, chosen, live=live, check=lambda: _check(cancel))
     signed = "not signed" if key is None else str(key)
     return {"file": str(path), "revision": index.revision, "appearances": ", ".join(chosen), "signed_with": signed}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,10 @@ from controller.stage.sessions.calibrations import (
 )
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import LONGEST_RUN_S, marker
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.cluster_solve import answering_on
-from controller.stage.steps.appearance.publishing import publish_step
+from controller.stage.steps.appearance.publishing import BundleTarget, publish_step
 from controller.stage.steps.appearance.requests import requests_of, scene_request
 from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.stage.steps.calibrate.dots import dot_steps
@@ -72,12 +72,14 @@ def calibrate(
     taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
     run = session.run(
         checked,
-        lambda rig, run: calibrating(rig, run, checked=checked, options=options, photographs=taking),
-        name="calibrate",
+        StageWork(
+            "calibrate",
+            lambda rig, run: calibrating(rig, run, checked=checked, options=options, photographs=taking),
+            dark=True,
+            before=lambda rig: device_checks(rig, prior),
+        ),
         reporter=reporter,
         cancel=cancel,
-        dark=True,
-        before=lambda rig: device_checks(rig, prior),
     )
     report_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
@@ -111,61 +113,70 @@ def calibrating(
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class AppearanceOrder:
+    """Which appearances to make, how they are solved, and where.
+
+    Parameters
+    ----------
+    names : of stage.toml; none: all, unless there are scenes
+    scenes : Blender scenes to render in addition to ``names``, or only these if no names are given
+    base : the base image instead of stage.toml's
+    quick : a preview by base times scale only; the next run without it solves them as stage.toml says
+    refinement : how photographs then correct them; None keeps refined frames
+    device : what solves, instead of stage.toml's
+    scheduler : a Dask cluster that solves the appearances
+    accept_grade : publish with any calibration grade
+    """
+
+    names: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+    base: str | None = None
+    quick: bool = False
+    refinement: Refinement | None = None
+    device: str | None = None
+    scheduler: str | None = None
+    accept_grade: bool = False
+
+
 def make_appearances(
-    *,
-    session: StageSession,
-    names: Sequence[str],
-    scenes: Sequence[str] = (),
-    reporter: Reporter,
-    cancel: threading.Event,
-    accept_grade: bool = False,
-    base: str | None = None,
-    scheduler: str | None = None,
-    quick: bool = False,
-    refinement: Refinement | None = None,
-    device: str | None = None,
+    order: AppearanceOrder, *, session: StageSession, reporter: Reporter, cancel: threading.Event
 ) -> Mapping[str, Any]:
     """Solve appearances of stage.toml with the latest calibration, and install them as the stage's bundle.
-
-    ``scenes``: Blender scenes to render in addition to ``names``, or only these if no names are given.
-    ``accept_grade``: publish with any calibration grade. ``base``: base image that replaces stage.toml's.
-    ``scheduler``: a Dask cluster that solves the appearances. ``quick``: a preview by base times scale only;
-    the next run without it solves them as stage.toml says. ``refinement``: how photographs then correct them; None
-    keeps refined frames. ``device``: what solves, instead of stage.toml's.
 
     Without a refinement it uses no device: the projectors may be off, or playing.
     Raises what ``choose_engine``, ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
     """
-    chosen = None if base is None else base_choice(base)
+    chosen = None if order.base is None else base_choice(order.base)
     checked = check_stage(session.stage)
     folder = checked.stage.folder
-    engine = choose_engine(checked.stage.tables.solve.device if device is None else device, reporter.say)
+    engine = choose_engine(checked.stage.tables.solve.device if order.device is None else order.device, reporter.say)
     with session.locked():
-        run = usable_calibration(checked, reporter, accept_grade=accept_grade)
+        run = usable_calibration(checked, reporter, accept_grade=order.accept_grade)
         calibrated = Calibrated(run, checked.names, engine)
-        requests = requests_of(checked.stage, calibrated, names) if names or not scenes else []
-        requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in scenes]
-        options = _options(checked.stage.tables.solve, chosen, quick=quick)
+        requests = requests_of(checked.stage, calibrated, order.names) if order.names or not order.scenes else []
+        requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in order.scenes]
+        options = _options(checked.stage.tables.solve, chosen, quick=order.quick)
         scale = costs.scale(size for _, size in output_sizes(checked).values())
         with (
             kernels_compiled(reporter) as compiled,
-            answering_on(scheduler, calibrated, requests) as answering,
+            answering_on(order.scheduler, calibrated, requests) as answering,
             Journal(run) as journal,
         ):
             steps = [
                 *compiled,
                 *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
-                gate_step(worst_grade(checked), accepted=accept_grade, reporter=reporter),
+                gate_step(worst_grade(checked), accepted=order.accept_grade, reporter=reporter),
                 *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
             publish = publishing(checked, calibrated, names)
-            whole = [*steps, publish] if refinement is None else steps
+            whole = [*steps, publish] if order.refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}
-    if refinement is not None:
+    if order.refinement is not None:
         titles = {request.name: request.title for request in requests}
-        refined = refine(session, checked, calibrated, titles, refinement, reporter=reporter, cancel=cancel)
+        refined = refine(session, checked, calibrated, titles, order.refinement, reporter=reporter, cancel=cancel)
         with session.locked(), Journal(run) as journal:
             Runner([publish], journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     return {"bundle": str(current(folder / "bundles")), "appearances": ", ".join(names), **refined}
@@ -174,15 +185,9 @@ def make_appearances(
 def publishing(checked: Checked, calibrated: Calibrated, names: Sequence[str]) -> Step:
     """The step that makes these appearances of the run of ``calibrated`` the stage's signed bundle."""
     stage = checked.stage
-    return publish_step(
-        stage.folder,
-        output_sizes(checked),
-        names,
-        stage=stage.tables.stage.name,
-        calibration=calibrated.folder.name,
-        key=signing_key(checked),
-        calibrated=calibrated,
-    )
+    name, run = stage.tables.stage.name, calibrated.folder.name
+    target = BundleTarget(stage.folder, name, run, output_sizes(checked), signing_key(checked))
+    return publish_step(target, names, calibrated=calibrated)
 
 
 def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> SolveOptions:

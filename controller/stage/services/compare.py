@@ -21,7 +21,7 @@ from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import finished_calibrations, stage_trust
 from controller.stage.sessions.check import Checked, check_stage, time_zone
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.appearance.compare import compare_steps
 from hal.notices import Level
 
@@ -54,7 +54,7 @@ def photograph(
         both = [step for pair in zip(taken, drawn, strict=True) for step in pair]
         return [*both, *dark_after(rig.ambient_limit, rig.display)]
 
-    run = session.run(checked, steps, name=COMPARE, reporter=reporter, cancel=cancel, dark=True)
+    run = session.run(checked, StageWork(COMPARE, steps, dark=True), reporter=reporter, cancel=cancel)
     html = comparison_report(run, checked)
     rows = [
         {"name": comparison.name, "headline": comparison.headline[0], "delta_e00_median": comparison.delta_e00_median,

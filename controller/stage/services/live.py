@@ -40,7 +40,7 @@ from controller.stage.live import (
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import stage_trust, usable_calibration
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.appearance.live import FrameMaker, Frames, LiveFigures, Maker, TargetMaker, run_live
 from controller.stage.steps.appearance.live_parts import live_maps, target_px
 from hal.codecs.player import MAGIC
@@ -66,26 +66,35 @@ class Ready:
     shaded: bool
 
 
-def live(
-    *,
-    session: StageSession,
-    source: str,
-    rate_hz: float,
-    loop: bool,
-    seconds: float | None,
-    reporter: Reporter,
-    cancel: threading.Event,
-) -> Mapping[str, Any]:
-    """Switch the projectors on and show ``source`` until it ends, ``seconds`` have passed or it is stopped.
+@dataclass(frozen=True, slots=True)
+class LiveInput:
+    """What is shown live.
 
-    ``source``: a file, a folder, or the address of a stream.
+    Parameters
+    ----------
+    source : a file, a folder, or the address of a stream
+    rate_hz : maximum pictures per second
+    loop : repeat a video, or the pictures of a folder
+    seconds : for how long; None: until the source ends or the work is stopped
+    """
+
+    source: str
+    rate_hz: float
+    loop: bool = False
+    seconds: float | None = None
+
+
+def live(
+    pictures: LiveInput, *, session: StageSession, reporter: Reporter, cancel: threading.Event
+) -> Mapping[str, Any]:
+    """Switch the projectors on and show ``pictures``.
 
     Raises UsageError "live-source-unreadable" or "live-file-unfit", WorkError "base-not-solved", what
     ``usable_calibration`` raises, and what devices raise.
     """
     checked = check_stage(session.stage)
     calibrated = _calibrated(checked, reporter)
-    open_it = partial(_opened, source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
+    open_it = partial(_opened, pictures, target_px(calibrated))
     with contextlib.closing(open_it()) as tried:
         _wait_for_picture(tried)
     ready = _ready(checked, calibrated, reporter)
@@ -93,24 +102,31 @@ def live(
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         def show(context: Context) -> Sequence[Path]:
-            figures.update(_show(rig, context, ready, open_it, rate_hz=rate_hz, seconds=seconds))
+            figures.update(_show(rig, context, ready, open_it, rate_hz=pictures.rate_hz, seconds=pictures.seconds))
             return ()
 
         return [
-            Step(StepId("live"), show, title=f"Live: {_name(source)}", enter=Event.PLAY, leave=Event.PAUSE, always=True)
+            Step(
+                StepId("live"),
+                show,
+                title=f"Live: {_name(pictures.source)}",
+                enter=Event.PLAY,
+                leave=Event.PAUSE,
+                always=True,
+            )
         ]
 
-    session.run(checked, steps, name="live", reporter=reporter, cancel=cancel)
+    session.run(checked, StageWork("live", steps), reporter=reporter, cancel=cancel)
     return figures
 
 
-def _opened(source: str, target_px: tuple[int, int], *, loop: bool, rate_hz: float) -> LiveSource:
-    if is_stream(source):
-        return open_stream(source)
-    path = Path(source)
+def _opened(pictures: LiveInput, target_px: tuple[int, int]) -> LiveSource:
+    if is_stream(pictures.source):
+        return open_stream(pictures.source)
+    path = Path(pictures.source)
     if holds_frames(path):
         return FileSource(path, OutputSize(TARGET, *target_px))
-    return open_source(path, loop=loop, rate_hz=rate_hz)
+    return open_source(path, loop=pictures.loop, rate_hz=pictures.rate_hz)
 
 
 def _wait_for_picture(source: LiveSource) -> None:
@@ -263,26 +279,17 @@ def _writer(file: FrameFile, outputs: Sequence[OutputSize], maps: LiveMaps) -> C
 
 
 def feed(
-    *,
-    stage: Path,
-    source: str,
-    into: Path,
-    targets: bool,
-    rate_hz: float,
-    loop: bool,
-    seconds: float | None,
-    reporter: Reporter,
-    cancel: threading.Event,
+    pictures: LiveInput, into: Path, *, stage: Path, targets: bool, reporter: Reporter, cancel: threading.Event
 ) -> Mapping[str, Any]:
-    """Write the pictures of ``source`` to the frame file ``into``, for another player to show live.
+    """Write ``pictures`` to the frame file ``into``, for another player to show live.
 
-    Writes finished frames, or with ``targets`` targets for the bundle's live section. Uses no device. Ends with the
-    source, after ``seconds``, or when it is stopped; the file stays, with its last picture.
+    Writes finished frames, or with ``targets`` targets for the bundle's live section. Uses no device. The file stays,
+    with its last picture.
     """
     checked = check_stage(stage)
     calibrated = _calibrated(checked, reporter)
-    pictures = _opened(source, target_px(calibrated), loop=loop, rate_hz=rate_hz)
-    _wait_for_picture(pictures)
+    source = _opened(pictures, target_px(calibrated))
+    _wait_for_picture(source)
     ready = _ready(checked, calibrated, reporter)
     outputs = [OutputSize(o.name, o.width_px, o.height_px) for o in checked.stage.tables.display.outputs]
     if targets:
@@ -295,7 +302,7 @@ def feed(
             if cancel.is_set():
                 raise Cancelled
 
-        figures = run_live(pictures, maker, write, rate_hz=rate_hz, seconds=seconds, report=report)
+        figures = run_live(source, maker, write, rate_hz=pictures.rate_hz, seconds=pictures.seconds, report=report)
     return {"white": ready.brightness, **figures.as_json()}
 
 

@@ -25,7 +25,7 @@ from controller.stage.services.bundle import check_outputs
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import LONGEST_RUN_S
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from hal.deadline import in_seconds
 
 SHOWN_S: Final = 10.0
@@ -51,22 +51,27 @@ class PlayedSequence:
         return min(rounds_s if self.for_s is None else self.for_s, LONGEST_RUN_S)
 
 
+@dataclass(frozen=True, slots=True)
+class PlayRequest:
+    """What to show. No name: the playlist in the bundle. One name: for ``seconds``, or until stopped.
+
+    Several names, or ``sequence`` (a file, see ``read_sequence``): each for ``seconds``, of which ``fade_s`` fade it
+    in, ``repeat`` rounds, without end if 0.
+    """
+
+    names: Sequence[str] = ()
+    sequence: Path | None = None
+    seconds: float | None = None
+    fade_s: float = 0.0
+    repeat: int = 0
+
+
 def play(
-    *,
-    session: StageSession,
-    names: Sequence[str],
-    sequence: Path | None,
-    seconds: float | None,
-    fade_s: float,
-    repeat: int,
-    reporter: Reporter,
-    cancel: threading.Event,
+    request: PlayRequest, *, session: StageSession, reporter: Reporter, cancel: threading.Event
 ) -> Mapping[str, Any]:
     """Switch the projectors on and show appearances of the installed bundle.
 
-    No name: the playlist in the bundle. One name: for ``seconds``, or until stopped. Several, or
-    ``sequence`` (a file, see ``read_sequence``): each for ``seconds``, of which ``fade_s`` fade it in, ``repeat``
-    rounds, without end if 0. Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
+    Raises UsageError("nothing-installed", "nothing-to-play", "played-twice",
     "sequence-file-wrong", "fade-too-long" or "appearance-unknown"), and BundleError for a bundle that
     the stage does not trust or that was made for other outputs; always before a lamp is struck.
     """
@@ -78,18 +83,17 @@ def play(
             what="No bundle is installed on this stage.",
             remedy="Run `velatura appearance` on it first.",
         )
-    if names or sequence is not None:
-        played_sequence = _requested(names, sequence, seconds, fade_s, repeat)
+    if request.names or request.sequence is not None:
+        played_sequence = requested_sequence(request)
     else:
-        played_sequence = suggested_sequence(installed, stage_trust(checked.stage), repeat, seconds)
+        trust = stage_trust(checked.stage)
+        played_sequence = suggested_sequence(installed, trust, request.repeat, request.seconds)
     index = _checked_index(installed, checked, played_sequence)
     session.run(
         checked,
-        lambda rig, _: _playing(rig, played_sequence, index),
-        name="play",
+        StageWork("play", lambda rig, _: _playing(rig, played_sequence, index), plays=True),
         reporter=reporter,
         cancel=cancel,
-        plays=True,
     )
     played = list(dict.fromkeys(name for name, _, _ in played_sequence.items))
     return {"played": played[0] if len(played) == 1 else played}
@@ -112,9 +116,9 @@ def _checked_index(bundle: Path, checked: Checked, played_sequence: PlayedSequen
     return index
 
 
-def _requested(
-    names: Sequence[str], sequence: Path | None, seconds: float | None, fade_s: float, repeat: int
-) -> PlayedSequence:
+def requested_sequence(request: PlayRequest) -> PlayedSequence:
+    """The names or the file of ``request``. Raises UsageError("played-twice", "fade-too-long")."""
+    names, sequence, seconds, fade_s = request.names, request.sequence, request.seconds, request.fade_s
     if names and sequence is not None:
         raise UsageError(
             "played-twice",
@@ -133,7 +137,7 @@ def _requested(
             what=f"The fade of {fade_s:g} s is longer than the {each_s:g} s for each appearance.",
             remedy="Give a shorter --fade or longer --seconds.",
         )
-    return PlayedSequence(tuple((name, each_s, fade_s) for name in names), repeat)
+    return PlayedSequence(tuple((name, each_s, fade_s) for name in names), request.repeat)
 
 
 def suggested_sequence(bundle: Path, trust: Trust, repeat: int, seconds: float | None) -> PlayedSequence:

@@ -25,7 +25,7 @@ from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import finished_calibration, worst_grade
 from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import marker
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.calibrate.dots import dot_steps
 from controller.stage.steps.calibrate.drift import drift_steps
 from controller.stage.steps.calibrate.full import calibration_steps
@@ -51,7 +51,7 @@ def check_drift(
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
         return drift_steps(rig, calibrated, longest_exposure_s=_longest_s(checked))
 
-    run = session.run(checked, steps, name="drift", reporter=reporter, cancel=cancel)
+    run = session.run(checked, StageWork("drift", steps), reporter=reporter, cancel=cancel)
     content = read_drift_figures(run)
     for sentence in content["sentences"]:
         reporter.say(sentence, Level.INFO if content["advice"] == "nothing" else Level.WARNING)
@@ -102,7 +102,7 @@ def recalibrate(
         ]
 
     name = "recalibrate" if projector is None else "projector"
-    run = session.run(checked, steps, name=name, reporter=reporter, cancel=cancel, dark=True)
+    run = session.run(checked, StageWork(name, steps, dark=True), reporter=reporter, cancel=cancel)
     compare_with_last(run, last, reporter)
     if not passes(run, worst_grade(checked)):
         raise below_grade(run, worst_grade(checked))

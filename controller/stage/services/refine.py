@@ -16,7 +16,7 @@ from controller.stage.artefacts.solved import read_refining, remove_refined
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
-from controller.stage.sessions.session import StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.appearance.refining import RefineOptions, refine_steps, sentence
 from hal.deadline import Cancelled
 from hal.errors import DeviceError
@@ -79,7 +79,7 @@ def refine(
 
     try:
         if left:
-            session.run(checked, steps, name=REFINE, reporter=reporter, cancel=cancel, dark=True)
+            session.run(checked, StageWork(REFINE, steps, dark=True), reporter=reporter, cancel=cancel)
     except DeviceError as error:
         # What fails once lamps may be lit has to be seen by a person.
         before_light = not opened or error.code == "room-not-dark"

@@ -27,6 +27,26 @@ MakeSteps = Callable[[Rig, Path], Sequence[Step]]
 """The steps of a run on the opened stage; the path is the run's folder."""
 
 
+@dataclass(frozen=True, slots=True)
+class StageWork:
+    """A run on the opened stage.
+
+    Parameters
+    ----------
+    name : the run's kind; an unfinished run of this name is continued
+    make_steps : its steps with the lamps on
+    dark : refuse a bright room, if the stage has a light sensor
+    plays : as in ``sessions.open.opened``
+    before : steps before the lamps are struck, if they are not lit yet
+    """
+
+    name: str
+    make_steps: MakeSteps
+    dark: bool = False
+    plays: bool = False
+    before: Callable[[Rig], Sequence[Step]] = lambda rig: ()
+
+
 class StageSession(ABC):
     """Work on one stage. ``stage``: its folder, which holds stage.toml."""
 
@@ -40,25 +60,13 @@ class StageSession(ABC):
         """
 
     @abstractmethod
-    def run(
-        self,
-        checked: Checked,
-        make_steps: MakeSteps,
-        *,
-        name: str,
-        reporter: Reporter,
-        cancel: threading.Event,
-        dark: bool = False,
-        plays: bool = False,
-        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
-    ) -> Path:
-        """Run the steps of a new or unfinished run of this name with the lamps on; the run's folder.
+    def run(self, checked: Checked, work: StageWork, *, reporter: Reporter, cancel: threading.Event) -> Path:
+        """Run the steps of a new or unfinished run with the lamps on; the run's folder.
 
         Those that need no stable light are done while lamps become stable, where it is the session that strikes them.
 
-        ``checked``: the session's stage; ``dark``: refuse a bright room, if the stage has a light sensor;
-        ``plays``: as in ``stage.open.opened``; ``before``: steps before the lamps are struck, if they are not lit yet.
-        Raises what the steps raise; UsageError("already-running") if another program works on the stage.
+        ``checked``: the session's stage. Raises what the steps raise; UsageError("already-running") if another program
+        works on the stage.
         """
 
 
@@ -78,18 +86,7 @@ class OwnSession(StageSession):
         """See ``StageSession``."""
         return stage_lock(self.stage)
 
-    def run(
-        self,
-        checked: Checked,
-        make_steps: MakeSteps,
-        *,
-        name: str,
-        reporter: Reporter,
-        cancel: threading.Event,
-        dark: bool = False,
-        plays: bool = False,
-        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
-    ) -> Path:
+    def run(self, checked: Checked, work: StageWork, *, reporter: Reporter, cancel: threading.Event) -> Path:
         """See ``StageSession``."""
         stage = checked.stage
         deadline = in_seconds(LONGEST_RUN_S, cancel)
@@ -98,19 +95,19 @@ class OwnSession(StageSession):
             stage_lock(stage.folder),
             kernels_compiled(reporter) as compiled,
             self.around or contextlib.nullcontext(),
-            opened(checked, deadline=deadline, plays=plays) as rig,
-            Journal(unfinished_run(stage.folder, name, finished=self.again)) as journal,
+            opened(checked, deadline=deadline, plays=work.plays) as rig,
+            Journal(unfinished_run(stage.folder, work.name, finished=self.again)) as journal,
         ):
             clear_unfinished_writes(journal.folder)
             machine = Machine(journal.record_change)
-            first = dark_before(rig.ambient_limit) if dark else []
-            made = make_steps(rig, journal.folder)
+            first = dark_before(rig.ambient_limit) if work.dark else []
+            made = work.make_steps(rig, journal.folder)
             unsteady = [step for step in made if step.unsteady]
             power = power_steps(rig, power_up_s=safety.power_up_s, early=[*compiled, *unsteady] if unsteady else ())
             rest = [*(() if unsteady else compiled), *(step for step in made if not step.unsteady)]
-            steps = [*first, *before(rig), *power, *rest]
+            steps = [*first, *work.before(rig), *power, *rest]
             with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
-                Runner(steps, journal, reporter=reporter, machine=machine).run(name, deadline=deadline)
+                Runner(steps, journal, reporter=reporter, machine=machine).run(work.name, deadline=deadline)
             return journal.folder
 
 
@@ -128,24 +125,13 @@ class BorrowedSession(StageSession):
         """See ``StageSession``; the kiosk has the lock already."""
         return contextlib.nullcontext()
 
-    def run(
-        self,
-        checked: Checked,
-        make_steps: MakeSteps,
-        *,
-        name: str,
-        reporter: Reporter,
-        cancel: threading.Event,
-        dark: bool = False,
-        plays: bool = False,
-        before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
-    ) -> Path:
+    def run(self, checked: Checked, work: StageWork, *, reporter: Reporter, cancel: threading.Event) -> Path:
         """See ``StageSession``. Raises ValueError without a rig."""
         if self.rig is None:
             raise ValueError("this session has no devices")
-        with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, name)) as journal:
+        with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, work.name)) as journal:
             clear_unfinished_writes(journal.folder)
-            first = dark_before(self.rig.ambient_limit) if dark else []
-            steps = [*first, *compiled, *make_steps(self.rig, journal.folder)]
-            Runner(steps, journal, reporter=reporter).run(name, deadline=in_seconds(LONGEST_RUN_S, cancel))
+            first = dark_before(self.rig.ambient_limit) if work.dark else []
+            steps = [*first, *compiled, *work.make_steps(self.rig, journal.folder)]
+            Runner(steps, journal, reporter=reporter).run(work.name, deadline=in_seconds(LONGEST_RUN_S, cancel))
             return journal.folder

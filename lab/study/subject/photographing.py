@@ -12,7 +12,7 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.rig.rig import Rig
-from controller.stage.steps.appearance.photographing import take_hdr
+from controller.stage.steps.appearance.photographing import ShownPicture, take_hdr
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.capture.photographs import frames_digest
 from lab.study.subject.dots import read_study_dots
@@ -37,10 +37,8 @@ class RigPhotographer:
     def photograph_shown(self, name: str, shown: Mapping[str, ByteImage], *, white: float) -> FloatImage:
         """As ``photograph``, of 8-bit frames by projector name as the displays get them."""
         presented = self.rig.display.show(self.rig.on_outputs(shown), deadline=self.context.deadline.within(20))
-        taken, merged = take_hdr(
-            self.rig, self.context, "study", f"{self.name}-{name}", white, self.longest_exposure_s,
-            shown_at_s=presented.at_s, of={"frames": frames_digest(shown)},
-        )  # fmt: skip
+        what = ShownPicture("study", f"{self.name}-{name}", {"frames": frames_digest(shown)}, presented.at_s, white)
+        taken, merged = take_hdr(self.rig, self.context, what, self.longest_exposure_s)
         self.used.extend(one.path for one in taken)
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
         return np.asarray(np.nan_to_num(merged, nan=1 / min(one.exposure_s for one in taken)), np.float32)

@@ -23,7 +23,7 @@ from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.check import check_stage
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from hal.deadline import in_seconds
 from lab.timings import Row, Timing, at_most, peak_bytes, timed
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
@@ -158,8 +158,7 @@ def _chain(stage: Path, shots: int) -> list[Row]:
         started_s = time.perf_counter() - began
         OwnSession(stage).run(
             checked,
-            lambda rig, _: [Step(StepId("shots"), partial(take, rig))],
-            name="shots",
+            StageWork("shots", lambda rig, _: [Step(StepId("shots"), partial(take, rig))]),
             reporter=Silent(),
             cancel=cancel,
         )

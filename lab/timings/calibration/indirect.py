@@ -26,7 +26,7 @@ from controller.optics.solve.result.metrics import colour_difference
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import Solved, read_solved
-from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.services.refine import Refinement
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.calibrations import finished_calibrations
@@ -114,9 +114,11 @@ def worked(stage: Path) -> Path:
                 calibrate(session=session, reporter=Silent(), cancel=cancel, accept_grade=True)
             for photographs in left:
                 make_appearances(
-                    session=session, names=NAMES, reporter=Silent(), cancel=cancel, accept_grade=True,
-                    refinement=Refinement(photographs),
-                )  # fmt: skip
+                    AppearanceOrder(names=NAMES, accept_grade=True, refinement=Refinement(photographs)),
+                    session=session,
+                    reporter=Silent(),
+                    cancel=cancel,
+                )
                 _keep(stage, photographs)
     return finished_calibrations(stage)[0]
 

@@ -24,7 +24,7 @@ from unittest.mock import patch
 from controller.config.writer import KeyChange, rewrite_stage
 from controller.demo.stage import DEFAULT_ROOM
 from controller.run.progress import Phase, Progress, Silent
-from controller.stage.services.calibrate import calibrate, make_appearances
+from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.session import OwnSession
 from hal.deadline import Deadline
@@ -83,8 +83,11 @@ def _of_set(stage: Path, size: str, which: str) -> Iterator[Row]:
         reporter = _FromSteady(pictures)
         calibrate(session=OwnSession(stage), reporter=reporter, cancel=cancel, photographs=which, accept_grade=True)
     make_appearances(
-        session=OwnSession(stage), names=[APPEARANCE], reporter=Silent(), cancel=cancel, accept_grade=True
-    )  # fmt: skip
+        AppearanceOrder(names=[APPEARANCE], accept_grade=True),
+        session=OwnSession(stage),
+        reporter=Silent(),
+        cancel=cancel,
+    )
     clock_s, processor_s = time.monotonic() - reporter.clock_s, time.process_time() - reporter.processor_s
     goal = GOAL_S if size == "paper" else None
     count = pictures.count - reporter.before

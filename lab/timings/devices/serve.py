@@ -23,7 +23,7 @@ import numpy as np
 
 from controller.bundle.install import install
 from controller.bundle.signing import load_signing_key
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import VelaturaError
 from controller.core.storage import runtime_folder
 from controller.kiosk.api.control import call_kiosk
@@ -170,9 +170,16 @@ def install_grey(stage: Path) -> None:
     built, key_file = stage / "grey.vel", stage / KEY_FILE
     key = load_signing_key(key_file) if key_file.exists() else None
     write_bundle(
-        built, stage=checked.stage.tables.stage.name, calibration="none", created_unix_s=int(time.time()),
-        outputs=[(name, *pixels) for name, pixels in outputs], appearances=[NewAppearance(NAME, frames)], key=key,
-    )  # fmt: skip
+        built,
+        NewBundle(
+            stage=checked.stage.tables.stage.name,
+            calibration="none",
+            created_unix_s=int(time.time()),
+            outputs=[(name, *pixels) for name, pixels in outputs],
+        ),
+        appearances=[NewAppearance(NAME, frames)],
+        key=key,
+    )
     trusted = () if key is None else (bytes(key.verify_key),)
     install(built, stage / "bundles", trusted=trusted, allow_unsigned=key is None)
 

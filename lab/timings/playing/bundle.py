@@ -15,7 +15,7 @@ import zstandard
 
 from controller.bundle import format as fmt
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, Packing, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, Packing, write_bundle
 from controller.core.arrays import ByteImage
 from lab.timings import SIZES as BASE_SIZES
 from lab.timings import Row, Timing, at_least, at_most, peak_bytes, timed
@@ -60,8 +60,11 @@ def _bundle(swaps: Sequence[dict[str, ByteImage]], *, paper: bool) -> list[Row]:
         made = [NewAppearance(f"appearance-{number}", frames) for number, frames in enumerate(swaps)]
 
         def write() -> None:
-            write_bundle(path, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
-                         appearances=made)  # fmt: skip
+            write_bundle(
+                path,
+                NewBundle(stage="timing", calibration="timing", created_unix_s=0, outputs=outputs),
+                appearances=made,
+            )
 
         writing = timed(write, repeats=3)
         ratio = raw / path.stat().st_size
@@ -113,8 +116,12 @@ def _one_way(
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
         path = Path(folder) / "bundle.vel"
         made = [NewAppearance(str(number), frames) for number, frames in enumerate(swaps)]
-        write_bundle(path, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
-                     appearances=made, packing=packing)  # fmt: skip
+        write_bundle(
+            path,
+            NewBundle(stage="timing", calibration="timing", created_unix_s=0, outputs=outputs),
+            appearances=made,
+            packing=packing,
+        )
         raw = sum(frame.nbytes for frames in swaps for frame in frames.values())
         buffers = {name: np.empty_like(frame) for name, frame in swaps[0].items()}
         spent = []

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.arrays import ByteImage
 from controller.play.cache import CACHE_BYTES
 from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
@@ -90,8 +90,11 @@ def more_than_kept(set_bytes: int) -> int:
 def _settings(place: Path, swaps: Sequence[dict[str, ByteImage]]) -> PlayerSettings:
     outputs = [(name, frame.shape[1], frame.shape[0]) for name, frame in swaps[0].items()]
     bundle = place / "bundle.vel"
-    write_bundle(bundle, stage="timing", calibration="timing", created_unix_s=0, outputs=outputs,
-                 appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(swaps)))  # fmt: skip
+    write_bundle(
+        bundle,
+        NewBundle(stage="timing", calibration="timing", created_unix_s=0, outputs=outputs),
+        appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(swaps)),
+    )
     return PlayerSettings(outputs, frames=place / "outputs.frame", bundle=bundle, allow_unsigned=True)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.arrays import ByteImage
 from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
 from lab.timings import Row, at_least, at_most
@@ -86,9 +86,16 @@ def _tiled(solved: str, width: int, height: int) -> list[dict[str, ByteImage]]:
 
 def _bundle(place: Path, sets: Sequence[dict[str, ByteImage]], width: int, height: int) -> Path:
     path = place / "bundle.vel"
-    write_bundle(path, stage="timing", calibration="timing", created_unix_s=0,
-                 outputs=[(name, width, height) for name in OUTPUTS],
-                 appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(sets)))  # fmt: skip
+    write_bundle(
+        path,
+        NewBundle(
+            stage="timing",
+            calibration="timing",
+            created_unix_s=0,
+            outputs=[(name, width, height) for name in OUTPUTS],
+        ),
+        appearances=(NewAppearance(f"a{n}", frames) for n, frames in enumerate(sets)),
+    )
     return path
 
 

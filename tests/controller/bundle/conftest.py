@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from nacl.signing import SigningKey
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 
 OUTPUTS = (("left", 13, 10), ("right", 8, 6))
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
@@ -49,12 +49,8 @@ def unsigned(tmp_path: Path, appearances: list[NewAppearance]) -> Path:
 def write(path: Path, appearances: list[NewAppearance], key: SigningKey | None) -> Path:
     write_bundle(
         path,
-        stage="demo",
-        calibration="run-1",
-        created_unix_s=1_700_000_000,
-        outputs=OUTPUTS,
+        NewBundle(stage="demo", calibration="run-1", created_unix_s=1_700_000_000, outputs=OUTPUTS, revision=3),
         appearances=appearances,
         key=key,
-        revision=3,
     )
     return path

@@ -15,7 +15,7 @@ from nacl.signing import SigningKey
 from controller.bundle.format import Index
 from controller.bundle.install import current, install, rollback
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import BundleError, WorkError
 
 
@@ -23,12 +23,8 @@ def made(path: Path, value: int, revision: int = 0, key: SigningKey | None = Non
     frames = {"P1": np.full((6, 5, 3), value, np.uint8)}
     write_bundle(
         path,
-        stage="s",
-        calibration="c",
-        created_unix_s=0,
-        outputs=[("P1", 5, 6)],
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 6)], revision=revision),
         appearances=[NewAppearance("a", frames)],
-        revision=revision,
         key=key,
     )
     return path

@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,7 @@ from controller.bundle.describe import as_text, describe, differences, differenc
 from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER
-from controller.bundle.writer import NewAppearance, NewLive, sign_bundle, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, sign_bundle, write_bundle
 from controller.core.errors import BundleError, UsageError
 from tests.controller.bundle.conftest import OUTPUTS, PNG, write
 
@@ -43,8 +42,7 @@ def test_a_description_is_json_and_says_what_was_written(signed: Path, key: Sign
 
 
 def test_a_date_beyond_the_calendar_is_shown_as_a_number(tmp_path: Path) -> None:
-    identity: dict[str, Any] = {"stage": "s", "calibration": "c", "outputs": OUTPUTS, "appearances": []}
-    write_bundle(tmp_path / "b.vel", created_unix_s=2**53, **identity)
+    write_bundle(tmp_path / "b.vel", NewBundle("s", "c", created_unix_s=2**53, outputs=OUTPUTS), appearances=[])
     with Bundle.open_trusted(tmp_path / "b.vel", ANY_SIGNER) as bundle:
         assert str(2**53) in as_text(describe(bundle))
 
@@ -82,9 +80,13 @@ def test_two_bundles_differ_in_what_was_changed_and_nothing_else(
 def test_other_outputs_and_signers_are_told(tmp_path: Path, unsigned: Path, key: SigningKey) -> None:
     small = tmp_path / "small.vel"
     write_bundle(
-        small, stage="demo", calibration="run-1", created_unix_s=1_700_000_000, revision=3,
-        outputs=[("left", 4, 4)], appearances=[], key=key,
-    )  # fmt: skip
+        small,
+        NewBundle(
+            stage="demo", calibration="run-1", created_unix_s=1_700_000_000, revision=3, outputs=[("left", 4, 4)]
+        ),
+        appearances=[],
+        key=key,
+    )
     with Bundle.open_trusted(unsigned, ANY_SIGNER) as one, Bundle.open_trusted(small, ANY_SIGNER) as other:
         text = differences_as_text(differences(one, other))
     assert "- signed_by none" in text
@@ -146,10 +148,17 @@ def test_schedule_and_live_section_are_told_and_compared(tmp_path: Path) -> None
 
     def bundle(name: str, fade_ms: int, value: float) -> Bundle:
         write_bundle(
-            tmp_path / name, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
-            appearances=[NewAppearance("a", frame)], schedule=[PlaylistEntry("a", 5000, fade_ms)],
-            live=NewLive((7, 6), {"gain": np.full(3, value, np.float32)}),
-        )  # fmt: skip
+            tmp_path / name,
+            NewBundle(
+                stage="s",
+                calibration="c",
+                created_unix_s=0,
+                outputs=[("P1", 5, 4)],
+                schedule=[PlaylistEntry("a", 5000, fade_ms)],
+                live=NewLive((7, 6), {"gain": np.full(3, value, np.float32)}),
+            ),
+            appearances=[NewAppearance("a", frame)],
+        )
         return Bundle.open(tmp_path / name, allow_unsigned=True)
 
     with bundle("1.vel", 250, 1) as one, bundle("2.vel", 500, 1) as other, bundle("3.vel", 250, 2) as third:

@@ -17,7 +17,7 @@ from nacl.exceptions import BadSignatureError
 from nacl.signing import SigningKey
 
 from controller.bundle.format import PlaylistEntry
-from controller.bundle.writer import NewAppearance, NewLive, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, write_bundle
 from tests.controller.bundle.conftest import OUTPUTS, PNG
 from tests.controller.bundle.test_round_trip import documented_reader
 
@@ -30,9 +30,16 @@ def full(tmp_path: Path, appearances: list[NewAppearance], key: SigningKey) -> P
     random = np.random.default_rng(9)
     arrays = {"wide": random.integers(0, 65536, (7, 5, 2), dtype=np.uint16), "half": random.random((7, 5)).astype("f2"),
               "byte": np.arange(9, dtype=np.uint8), "plain": random.random((3, 4)).astype("f4")}  # fmt: skip
-    several: Document = {"stage": "dämo", "calibration": "run-1", "created_unix_s": 1_700_000_000, "revision": 3}
-    write_bundle(tmp_path / "full.vel", **several, outputs=OUTPUTS, appearances=appearances, key=key,
-                 schedule=[PlaylistEntry("ramp", 9000, 250)], live=NewLive((5, 7), arrays))  # fmt: skip
+    new = NewBundle(
+        "dämo",
+        "run-1",
+        1_700_000_000,
+        OUTPUTS,
+        revision=3,
+        schedule=[PlaylistEntry("ramp", 9000, 250)],
+        live=NewLive((5, 7), arrays),
+    )
+    write_bundle(tmp_path / "full.vel", new, appearances, key=key)
     return tmp_path / "full.vel"
 
 

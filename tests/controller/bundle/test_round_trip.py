@@ -19,7 +19,7 @@ from nacl.signing import SigningKey
 from controller.bundle import format as fmt
 from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, NewLive, Packing, choose_packing, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, Packing, choose_packing, write_bundle
 from controller.core.errors import BundleError
 from tests.controller.bundle.older import write_older
 
@@ -33,13 +33,15 @@ def test_the_same_input_gives_the_same_bytes(
     again = tmp_path / "again.vel"
     write_bundle(
         again,
-        stage="demo",
-        calibration="run-1",
-        created_unix_s=1_700_000_000,
-        outputs=[("left", 13, 10), ("right", 8, 6)],
+        NewBundle(
+            stage="demo",
+            calibration="run-1",
+            created_unix_s=1_700_000_000,
+            outputs=[("left", 13, 10), ("right", 8, 6)],
+            revision=3,
+        ),
         appearances=iter(appearances),
         key=key,
-        revision=3,
     )
     assert again.read_bytes() == signed.read_bytes()
 
@@ -69,10 +71,7 @@ def test_bands_are_aligned_and_pixels_of_a_ramp_shrink(tmp_path: Path) -> None:
     path = tmp_path / "ramp.vel"
     index = write_bundle(
         path,
-        stage="s",
-        calibration="c",
-        created_unix_s=0,
-        outputs=[("P1", 700, 2100)],
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 700, 2100)]),
         appearances=[NewAppearance("ramp", {"P1": ramp})],
     )
     blobs = index.appearances[0].bands["P1"]
@@ -91,10 +90,7 @@ def test_any_size_is_decoded_exactly_on_one_thread_and_on_two(rows: int, columns
         path = Path(folder) / "b.vel"
         write_bundle(
             path,
-            stage="s",
-            calibration="c",
-            created_unix_s=0,
-            outputs=[("P1", columns, rows)],
+            NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", columns, rows)]),
             appearances=[NewAppearance("a", {"P1": frame})],
         )
         with Bundle.open(path, allow_unsigned=True) as bundle:
@@ -112,10 +108,11 @@ def tiled_bundle(path: Path, codec: str, grid: Grid, frames: list[npt.NDArray[np
     rows, columns, _ = frames[0].shape
     layout = fmt.OutputLayout("P1", columns, rows, min(grid[0], columns), min(grid[1], rows))
     write_bundle(
-        path, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", columns, rows)],
+        path,
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", columns, rows)]),
         appearances=[NewAppearance(str(number), {"P1": frame}) for number, frame in enumerate(frames)],
         packing=Packing((layout,), codec),
-    )  # fmt: skip
+    )
     return path
 
 
@@ -216,10 +213,17 @@ def test_schedule_and_live_arrays_are_read_back_exactly(tmp_path: Path) -> None:
     frame = np.zeros((4, 5, 3), np.uint8)
     path = tmp_path / "live.vel"
     index = write_bundle(
-        path, stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 4)],
+        path,
+        NewBundle(
+            stage="s",
+            calibration="c",
+            created_unix_s=0,
+            outputs=[("P1", 5, 4)],
+            schedule=[PlaylistEntry("b", 5000, 250), PlaylistEntry("a", 1, 0)],
+            live=NewLive((11, 13), arrays),
+        ),
         appearances=[NewAppearance("a", {"P1": frame}), NewAppearance("b", {"P1": frame})],
-        schedule=[PlaylistEntry("b", 5000, 250), PlaylistEntry("a", 1, 0)], live=NewLive((11, 13), arrays),
-    )  # fmt: skip
+    )
     with Bundle.open(path, allow_unsigned=True) as bundle:
         bundle.verify()
         assert bundle.index == index
@@ -286,10 +290,7 @@ def test_what_the_format_does_not_allow_is_not_written(tmp_path: Path, change: d
     with pytest.raises(BundleError, match=sentence):
         write_bundle(
             path,
-            stage="s",
-            calibration="c",
-            created_unix_s=0,
-            outputs=[("P1", 5, 6)],
+            NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 5, 6)]),
             appearances=[NewAppearance(**values)],
         )
     assert path.read_bytes() == b"what was there"

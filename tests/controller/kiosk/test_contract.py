@@ -14,7 +14,7 @@ import pytest
 
 from controller.bundle.describe import png
 from controller.bundle.install import current, install
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
@@ -61,9 +61,11 @@ def install_two(stage: Path) -> None:
     preview = png(np.full((4, 6, 3), 90, np.uint8))
     made = [NewAppearance(PLAYING, frames, thumbnail=preview), NewAppearance(OTHER, frames)]
     write_bundle(
-        stage / "made.vel", stage="The vase", calibration=RUN, created_unix_s=1_767_600_000,
-        outputs=[("P1", 1400, 1050)], appearances=made, key=None,
-    )  # fmt: skip
+        stage / "made.vel",
+        NewBundle(stage="The vase", calibration=RUN, created_unix_s=1_767_600_000, outputs=[("P1", 1400, 1050)]),
+        appearances=made,
+        key=None,
+    )
     install(stage / "made.vel", stage / "bundles", trusted=(), allow_unsigned=True)
 
 

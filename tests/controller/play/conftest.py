@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from nacl.signing import SigningKey
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
 from tests.controller.play.wire import Wire, noise
 
@@ -22,17 +23,16 @@ def outputs() -> list[tuple[str, int, int]]:
     return OUTPUTS
 
 
-def write_noise(path: Path, *, outputs: Sequence[tuple[str, int, int]] = OUTPUTS, **more: Any) -> Path:
-    """An unsigned bundle with the appearances "0" to "5": noise of that seed; ``more`` for ``write_bundle``."""
+def write_noise(
+    path: Path, *, outputs: Sequence[tuple[str, int, int]] = OUTPUTS, key: SigningKey | None = None, **more: Any
+) -> Path:
+    """An unsigned bundle with the appearances "0" to "5": noise of that seed; ``more`` for ``NewBundle``."""
     sizes = list(outputs)
     write_bundle(
         path,
-        stage="s",
-        calibration="c",
-        created_unix_s=0,
-        outputs=sizes,
-        appearances=[NewAppearance(str(seed), noise(sizes, seed)) for seed in range(6)],
-        **more,
+        NewBundle("s", "c", created_unix_s=0, outputs=sizes, **more),
+        [NewAppearance(str(seed), noise(sizes, seed)) for seed in range(6)],
+        key=key,
     )
     return path
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from controller.bundle.signing import generate_key, load_signing_key
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Wire, noise, same
 
@@ -22,12 +21,11 @@ def test_bundles_are_swapped_without_a_black_frame_and_only_if_ours(
     keys = [tmp_path / "ours", tmp_path / "theirs"]
     for path in keys:
         generate_key(path)
-    made: dict[str, Any] = {"stage": "s", "calibration": "c", "created_unix_s": 0}
     small = [(name, 8, 8) for name, _, _ in outputs]
     for file, key, sizes in (("a", 0, outputs), ("b", 0, outputs), ("foreign", 1, outputs), ("small", 0, small)):
         appearance = NewAppearance("x", noise(sizes, ord(file[0])))
         signer = load_signing_key(keys[key])
-        write_bundle(tmp_path / file, **made, outputs=sizes, appearances=[appearance], key=signer)
+        write_bundle(tmp_path / file, NewBundle("s", "c", 0, sizes), [appearance], key=signer)
     shown = start(bundle=tmp_path / "a", trusted=[tmp_path / "ours.pub"])
     frames = Frames(tmp_path / "out.frame")
     with Wire(shown.socket) as wire:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.play.control.launch import PlayerProcess
 from tests.controller.play.wire import Frames, Pictures, Wire, dark, noise, same
 
@@ -117,9 +117,10 @@ def test_a_new_bundle_comes_in_over_the_old_one(
 ) -> None:
     new = noise(outputs, 33)
     write_bundle(
-        tmp_path / "new.vel", stage="s", calibration="c2", created_unix_s=0, outputs=outputs,
+        tmp_path / "new.vel",
+        NewBundle(stage="s", calibration="c2", created_unix_s=0, outputs=outputs),
         appearances=[NewAppearance("0", new)],
-    )  # fmt: skip
+    )
     with Wire(start(bundle=bundle, allow_unsigned=True).socket) as wire:
         wire.ask("play", appearance="0")
         assert wire.ask("load-bundle", path=str(tmp_path / "new.vel"))["ok"]

@@ -16,7 +16,7 @@ import pytest
 
 from controller.bundle.install import install
 from controller.bundle.signing import generate_key, load_signing_key
-from controller.bundle.writer import NewAppearance, sign_bundle, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, sign_bundle, write_bundle
 from controller.core.errors import WorkError
 from controller.play.control.launch import PlayerProcess
 from tests.controller.play.conftest import OUTPUTS, write_noise
@@ -31,9 +31,10 @@ def installed(tmp_path: Path) -> Path:
     folder = tmp_path / "bundles"
     install(write_noise(tmp_path / "b.vel"), folder, allow_unsigned=True)
     write_bundle(
-        tmp_path / "bad.vel", stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 4, 4)],
+        tmp_path / "bad.vel",
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=[("P1", 4, 4)]),
         appearances=[NewAppearance("0", noise([("P1", 4, 4)], 1))],
-    )  # fmt: skip
+    )
     install(tmp_path / "bad.vel", folder, allow_unsigned=True)
     return folder / "current"
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.play.control.launch import PlayerProcess, PlayerSettings, start_player
 from hal.conformance import BundleDisplayConformance
 from hal.deadline import Cancelled, in_seconds
@@ -32,10 +32,7 @@ TABLES = [{"name": name, "width_px": width, "height_px": height} for name, width
 def written(bundle: Path) -> None:
     write_bundle(
         bundle,
-        stage="s",
-        calibration="c",
-        created_unix_s=0,
-        outputs=OUTPUTS,
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS),
         appearances=[NewAppearance(str(seed), noise(OUTPUTS, seed)) for seed in range(2)],
     )
 

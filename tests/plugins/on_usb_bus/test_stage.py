@@ -11,7 +11,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import check_stage
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from hal.errors import DeviceRefused
 from hal.registry import Drivers, load_drivers
 from plugins.emulated.usb.process import UsbBusProcess
@@ -50,7 +50,7 @@ def run(models: Models, bus: UsbBusProcess) -> list[list[bool]]:
         return [Step(StepId("look"), look)]
 
     OwnSession(checked.stage.folder).run(
-        checked, steps, name="trial", reporter=models.told, cancel=models.cancel, dark=True
+        checked, StageWork("trial", steps, dark=True), reporter=models.told, cancel=models.cancel
     )
     return seen
 

@@ -25,7 +25,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.solved import Solved, read_solved, solved_figures_path
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
-from controller.stage.steps.appearance.photographing import PLAYED, photograph_hdr
+from controller.stage.steps.appearance.photographing import PLAYED, ShownPicture, photograph_hdr
 
 WINDOWS: Final = 48
 """Windows of the resolution map along the camera picture's longer side."""
@@ -77,10 +77,8 @@ def _compare(
     # The day is part of the photograph's settings, so that yesterday's photographs are not reused.
     of = {"bundle": bundle, "appearance": name, "day": time.strftime("%Y-%m-%d")}
     photographed_s = time.time()
-    picture = photograph_hdr(
-        rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of,
-        light=solved.target[solved.reachable],
-    )  # fmt: skip
+    what = ShownPicture(PLAYED, name, of, shown.at_s, solved.exposure, solved.target[solved.reachable])
+    picture = photograph_hdr(rig, context, what, longest_s)
     context.advance(0.7, "comparing with the target")
     mask, size_px = compared_mask(calibrated, solved), window_px(picture.shape)
     asked = solved.requested.target

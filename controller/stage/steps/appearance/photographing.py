@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -186,34 +186,44 @@ def _photograph(rig: Rig, names: Sequence[str], longest_s: float, context: Conte
         solved = read_solved(context.folder, name, projectors)
         shown = display.play(name, deadline=context.deadline.within(20))
         of = {"bundle": bundle, "appearance": name}
-        picture = photograph_hdr(
-            rig, context, PLAYED, name, solved.exposure, longest_s, shown_at_s=shown.at_s, of=of,
-            light=solved.target[solved.reachable],
-        )  # fmt: skip
+        what = ShownPicture(PLAYED, name, of, shown.at_s, solved.exposure, solved.target[solved.reachable])
+        picture = photograph_hdr(rig, context, what, longest_s)
         paths.append(write_photograph(context.folder, StepKind.PHOTOGRAPH, name, picture))
     return paths
 
 
-def photograph_hdr(
-    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
-    of: Mapping[str, str], light: FloatImage | None = None,
-) -> FloatImage:  # fmt: skip
-    """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second.
+@dataclass(frozen=True, slots=True)
+class ShownPicture:
+    """What is shown now and will be photographed in HDR.
 
-    ``kind`` and ``name`` identify the photographs, together with a number for each. ``white`` is the radiance of
-    the target's white; ``of`` names the picture shown, for the journal; ``light`` (pixels, 3) is about what it shows.
+    Parameters
+    ----------
+    kind, name : identify the photographs, together with a number for each
+    of : names the picture, for the journal
+    at_s : since when it is shown, on the display's clock
+    white : the radiance of the target's white
+    light : (pixels, 3), about what it shows; None: not known
     """
-    _, merged = take_hdr(rig, context, kind, name, white, longest_s, shown_at_s=shown_at_s, of=of, light=light)
+
+    kind: str
+    name: str
+    of: Mapping[str, str]
+    at_s: float
+    white: float
+    light: FloatImage | None = None
+
+
+def photograph_hdr(rig: Rig, context: Context, shown: ShownPicture, longest_s: float) -> FloatImage:
+    """Photograph what is shown now in HDR: (rows, columns, 3) float32, full scales per second."""
+    _, merged = take_hdr(rig, context, shown, longest_s)
     return np.asarray(np.nan_to_num(merged), np.float32)
 
 
-def take_hdr(
-    rig: Rig, context: Context, kind: str, name: str, white: float, longest_s: float, *, shown_at_s: float,
-    of: Mapping[str, str], light: FloatImage | None = None,
-) -> tuple[list[Taken], FloatImage]:  # fmt: skip
+def take_hdr(rig: Rig, context: Context, shown: ShownPicture, longest_s: float) -> tuple[list[Taken], FloatImage]:
     """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
-    exposures_s = speeds(white, rig.acquirer.exposures_s(), longest_s, load_profile(context.folder), light=light)
-    taken = take_bracket(rig, context, kind, name, exposures_s, shown_at_s=shown_at_s, of=of)
+    profile = load_profile(context.folder)
+    exposures_s = speeds(shown.white, rig.acquirer.exposures_s(), longest_s, profile, light=shown.light)
+    taken = take_bracket(rig, context, shown.kind, shown.name, exposures_s, shown_at_s=shown.at_s, of=shown.of)
     merged = merge_brackets(
         [photograph.measured() for photograph in taken], [photograph.exposure_s for photograph in taken]
     ).radiance

@@ -6,6 +6,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -18,7 +19,7 @@ from controller.bundle.format import Index, PlaylistEntry
 from controller.bundle.install import current, install, revision_floor
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER, Trust, load_signing_key, unsigned_warning
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.config import load_stage
 from controller.config.loader import FILE
 from controller.core.arrays import ByteImage, Float64, FloatImage
@@ -45,29 +46,47 @@ Outputs = Mapping[str, tuple[str, tuple[int, int]]]
 """Output name and (width, height) by projector name."""
 
 
+@dataclass(frozen=True, slots=True)
+class BundleTarget:
+    """For which stage a bundle of solved appearances is, how it is signed, and where it is installed.
+
+    Parameters
+    ----------
+    folder : the stage's folder
+    stage, calibration : names of the stage, and of the run with its calibration
+    outputs : by projector, its output and the size
+    key : the signing key's file (its public half beside it), or None for an unsigned bundle
+    trust : which installed bundles count for the revision
+    """
+
+    folder: Path
+    stage: str
+    calibration: str
+    outputs: Outputs
+    key: Path | None
+    trust: Trust = ANY_SIGNER
+
+    @property
+    def slots(self) -> Path:
+        """The stage's folder of installed bundles."""
+        return self.folder / "bundles"
+
+
 def publish_step(
-    stage_folder: Path,
-    outputs: Outputs,
-    names: Sequence[str],
-    *,
-    stage: str,
-    calibration: str,
-    key: Path | None,
-    after: Sequence[StepId] = (),
-    calibrated: Calibrated | None = None,
+    target: BundleTarget, names: Sequence[str], *, after: Sequence[StepId] = (), calibrated: Calibrated | None = None
 ) -> Step:
     """Write, sign and install the bundle of these appearances; the artefacts are the bundle and its figures.
 
     The bundle also holds other appearances solved on the calibration: see ``kept_names``. Publishing is cheap, and the
     content depends on more than its own steps, so every run repeats it; unchanged content gives the same bytes.
 
-    ``key``: the signing key's file (its public half beside it), or None for an unsigned bundle; ``after``: the steps
-    of this run that make the frames; ``calibrated``: what reads the run, where the caller needs it too
+    ``after``: the steps of this run that make the frames; ``calibrated``: what reads the run, where the caller needs it
+    too
     """
     return Step(
         StepId(StepKind.PUBLISH),
-        partial(_publish, stage_folder, dict(outputs), tuple(names), (stage, calibration), key, calibrated),
-        inputs={"names": " ".join(names), "key": "" if key is None else sha256_of(key)},
+        partial(_publish, target, tuple(names), calibrated),
+        inputs={"names": " ".join(names), "key": "" if target.key is None else sha256_of(target.key)},
         after=tuple(after),
         title="Publishing the signed bundle",
         weight=1,
@@ -76,26 +95,17 @@ def publish_step(
 
 
 def _publish(
-    folder: Path,
-    outputs: Outputs,
-    names: Sequence[str],
-    identity: tuple[str, str],
-    key: Path | None,
-    calibrated: Calibrated | None,
-    context: Context,
+    target: BundleTarget, names: Sequence[str], calibrated: Calibrated | None, context: Context
 ) -> Sequence[Path]:
-    built, slots = context.folder / BUNDLE, folder / "bundles"
-    names = kept_names(folder, context.folder, names)
-    _report_dropped(slots, names, context.reporter)
-    trusted = () if key is None else (bytes(load_signing_key(key).verify_key),)
+    built = context.folder / BUNDLE
+    names = kept_names(target.folder, context.folder, names)
+    _report_dropped(target.slots, names, context.reporter)
+    trusted = () if target.key is None else (bytes(load_signing_key(target.key).verify_key),)
     if (warning := unsigned_warning(trusted[0] if trusted else None, Trust(trusted, not trusted))) is not None:
         context.reporter.say(f"{warning.what} {warning.remedy}", Level.WARNING)
-    index = publish_solved(
-        built, context.folder, outputs, names, stage=identity[0], calibration=identity[1], key=key, slots=slots,
-        live=_holds_live(slots), hints_ms=hints_ms(folder), calibrated=calibrated,
-    )  # fmt: skip
-    installed = install(built, slots, trusted=trusted, allow_unsigned=key is None)
-    raw = sum(3 * width * height for _, (width, height) in outputs.values()) * len(names)
+    index = publish_solved(built, context.folder, target, names, live=_holds_live(target.slots), calibrated=calibrated)
+    installed = install(built, target.slots, trusted=trusted, allow_unsigned=target.key is None)
+    raw = sum(3 * width * height for _, (width, height) in target.outputs.values()) * len(names)
     stored = sum(
         blob.length for appearance in index.appearances for blobs in appearance.bands.values() for blob in blobs
     )
@@ -158,50 +168,45 @@ def _holds_live(slots: Path) -> bool:
 def publish_solved(
     path: Path,
     run: Path,
-    outputs: Outputs,
+    target: BundleTarget,
     names: Sequence[str],
     *,
-    stage: str,
-    calibration: str,
-    key: Path | None,
-    slots: Path,
-    trust: Trust = ANY_SIGNER,
     live: bool = False,
-    hints_ms: Mapping[str, tuple[int, int]] | None = None,
     check: Callable[[], None] = lambda: None,
     calibrated: Calibrated | None = None,
 ) -> Index:
-    """Write the solved appearances of the folder ``run`` to a bundle at ``path``, signed with the key file.
+    """Write the solved appearances of the folder ``run`` to a bundle at ``path``, signed with the target's key.
 
-    If the folder ``slots`` has the same bundle installed, the file is identical to it. Otherwise its revision is
-    one above those installed bundles that ``trust`` accepts. ``live``: include the live-mode data.
-    ``hints_ms``: (shown, fade) by name for the bundle's playlist, else ``SHOWN_MS``.
+    If the stage has the same bundle installed, the file is identical to it. Otherwise its revision is one above those
+    installed bundles that ``target.trust`` accepts. ``live``: include the live-mode data.
     ``check`` is called before each appearance and may raise to stop the work. ``calibrated``: what reads ``run``, else
     it is read here where a thumbnail is missing.
     Raises WorkError("appearance-not-solved") and what ``write_bundle`` raises; ``path`` is then unchanged or intact.
     """
     from controller.stage.steps.appearance.live_parts import live_arrays
 
-    arrays = live_arrays(run, outputs) if live else None
+    outputs, hints = target.outputs, hints_ms(target.folder)
+    new = NewBundle(
+        target.stage,
+        target.calibration,
+        created_unix_s(run),
+        [(output, *size) for output, size in outputs.values()],
+        schedule=[PlaylistEntry(name, *hints.get(name, SHOWN_MS)) for name in names],
+        live=live_arrays(run, outputs) if live else None,
+    )
 
     def write(revision: int) -> Index:
         return write_bundle(
             path,
-            stage=stage,
-            calibration=calibration,
-            created_unix_s=created_unix_s(run),
-            outputs=[(output, *size) for output, size in outputs.values()],
-            appearances=_appearances(calibrated or Calibrated(run, tuple(outputs)), outputs, names, check),
-            key=None if key is None else load_signing_key(key),
-            revision=revision,
-            schedule=[PlaylistEntry(name, *(hints_ms or {}).get(name, SHOWN_MS)) for name in names],
-            live=arrays,
+            replace(new, revision=revision),
+            _appearances(calibrated or Calibrated(run, tuple(outputs)), outputs, names, check),
+            key=None if target.key is None else load_signing_key(target.key),
         )
 
-    floor = revision_floor(slots, trust)
+    floor = revision_floor(target.slots, target.trust)
     if floor >= 0:
         index = write(floor)
-        if (slots / f"{sha256_of(path)}.vel").exists():
+        if (target.slots / f"{sha256_of(path)}.vel").exists():
             return index
     return write(floor + 1)
 

@@ -185,20 +185,17 @@ def blender_request(
 
     Raises UsageError with code "blender-missing", "blender-scene-unknown" or "target-missing".
     """
-    scene = str(options.get("scene", "builtin:marble"))
-    builtin, file = _scene(scene, folder)
+    scene = _scene(str(options.get("scene", "builtin:marble")), folder)
     blender = find_blender()
     usual = RenderSettings()
     settings = RenderSettings(int(options.get("samples", usual.samples)), int(options.get("seed", usual.seed)))
-    facts = dict(inputs) if file is None else {**inputs, "file": sha256_of(file)}
+    facts = dict(inputs) if isinstance(scene, str) else {**inputs, "file": sha256_of(scene)}
 
     def prepare(context: Context) -> Sequence[Path]:
         work = render_folder(context.folder, name)
         work.mkdir(exist_ok=True)
         geometry, mask = read_geometry(calibrated.folder, calibrated.projectors), calibrated.transport.object_mask
-        write_job(
-            work, geometry, mask, calibrated.transport.reach(), builtin=builtin, scene_file=file, settings=settings
-        )
+        write_job(work, geometry, mask, calibrated.transport.reach(), scene=scene, settings=settings)
         picture = render(blender, work, context.advance)
         return [write_target(context.folder, name, as_seen(read_picture(picture), geometry.camera, mask))]
 
@@ -214,7 +211,8 @@ def scene_request(calibrated: Calibrated, scene: str, *, folder: Path) -> Appear
     return blender_request(name, calibrated, {"scene": scene}, {"kind": "blender", "scene": scene}, folder=folder)
 
 
-def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
+def _scene(scene: str, folder: Path) -> str | Path:
+    """The name of a built-in scene, or the file. Raises as ``blender_request``."""
     if scene.startswith(PREFIX):
         builtin = scene.removeprefix(PREFIX)
         if builtin not in BUILTIN:
@@ -223,7 +221,7 @@ def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
                 what=f"The scene {scene!r} is unknown.",
                 remedy=f"Choose one of {', '.join(PREFIX + known for known in BUILTIN)}, or give a .blend file.",
             )
-        return builtin, None
+        return builtin
     file = folder / os.fspath(scene)
     if not file.is_file():
         raise UsageError(
@@ -231,4 +229,4 @@ def _scene(scene: str, folder: Path) -> tuple[str | None, Path | None]:
             what=f"The scene file {file} does not exist.",
             remedy="Add the file, or correct `scene`. Paths are relative to the stage's folder.",
         )
-    return None, file
+    return file

@@ -151,7 +151,7 @@ def rendered(subject: Subject, on_progress: ProgressCallback, *, scene: str) -> 
     folder: Path = subject.parts.context.folder / f"study-render-{scene}"
     folder.mkdir(exist_ok=True)
     write_job(
-        folder, subject.geometry, subject.mask, subject.transport.reach(), builtin=scene, scene_file=None,
+        folder, subject.geometry, subject.mask, subject.transport.reach(), scene=scene,
         settings=RenderSettings(SAMPLES, subject.seed),
     )  # fmt: skip
     asked = [folder / "job.json", folder / "mesh.npz", Path(job.__file__).with_name("scenes.py")]

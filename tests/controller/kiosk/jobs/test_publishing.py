@@ -31,7 +31,7 @@ def stage(tmp_path: Path) -> Path:
 
 
 def published(stage: Path, monkeypatch: pytest.MonkeyPatch, make: Make) -> Any:
-    monkeypatch.setattr(services, "make_appearances", lambda **given: make(given["names"]))
+    monkeypatch.setattr(services, "make_appearances", lambda order, **_: make(order.names))
     return publish_appearances(BorrowedSession(stage), reporter=Silent(), cancel=threading.Event())
 
 

@@ -15,7 +15,7 @@ from controller.bundle.describe import png
 from controller.bundle.install import install
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.store import bundle_store as stock_module
@@ -31,9 +31,11 @@ def installed(stage: Path, revision: int, names: tuple[str, ...], slots: Path | 
     frames = {"P1": np.zeros((8, 8, 3), np.uint8)}
     made = [NewAppearance(name, frames, thumbnail=None if name == names[-1] else picture) for name in names]
     write_bundle(
-        stage / "made.vel", stage="demo", calibration="one", created_unix_s=1, outputs=[("P1", 8, 8)],
-        appearances=made, key=None, revision=revision,
-    )  # fmt: skip
+        stage / "made.vel",
+        NewBundle(stage="demo", calibration="one", created_unix_s=1, outputs=[("P1", 8, 8)], revision=revision),
+        appearances=made,
+        key=None,
+    )
     install(stage / "made.vel", slots or stage / "bundles", trusted=(), allow_unsigned=True)
     return 10 * revision
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.bundle.writer import NewAppearance, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import WorkError
 from controller.play.control.launch import PlayerProcess
 from tests.controller.play.conftest import write_noise
@@ -48,7 +48,7 @@ def play(start: Start, tmp_path: Path) -> Callable[..., PlayerProcess]:
     """Start a player with windows and a bundle of noise in the appearances "0" to "3"."""
     path = tmp_path / "windows.vel"
     made = [NewAppearance(str(seed), noise(SIZES, seed)) for seed in range(APPEARANCES)]
-    write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=SIZES, appearances=made)
+    write_bundle(path, NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=SIZES), appearances=made)
 
     def started(**changes: Any) -> PlayerProcess:
         settings = {"outputs": SIZES, "frames": None, "where": WHERE, "bundle": path, "allow_unsigned": True, **changes}

@@ -17,7 +17,7 @@ import pytest
 
 from controller.bundle.live_maps import LiveMaps, compensate, light_table, sigma_table
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance, NewLive, write_bundle
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, write_bundle
 from controller.core.errors import BundleError
 
 ROOT = Path(__file__).parents[4]
@@ -89,8 +89,11 @@ def segments(*shares: float) -> Arrays:
 
 def write(path: Path, arrays: Arrays) -> Path:
     frames = {name: np.zeros((rows, columns, 3), np.uint8) for name, columns, rows in OUTPUTS}
-    write_bundle(path, stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS,
-                 appearances=[NewAppearance("a", frames)], live=NewLive(TARGET, arrays))  # fmt: skip
+    write_bundle(
+        path,
+        NewBundle(stage="s", calibration="c", created_unix_s=0, outputs=OUTPUTS, live=NewLive(TARGET, arrays)),
+        appearances=[NewAppearance("a", frames)],
+    )
     return path
 
 

@@ -94,7 +94,7 @@ def test_blender_sees_what_the_calibrated_camera_sees(
 ) -> None:
     geometry, light = ball(k1)
     mask = known(geometry)
-    write_job(tmp_path, geometry, mask, light, builtin=None, scene_file=paint_scene, settings=QUICK)
+    write_job(tmp_path, geometry, mask, light, scene=paint_scene, settings=QUICK)
     target = as_seen(read_picture(render(blender, tmp_path, no_progress)), geometry.camera, mask)
     y, x = np.mgrid[0:ROWS, 0:COLUMNS]
     facing = mask & (np.sum(geometry.points_m * -geometry.normals, axis=2) > 0.5)
@@ -116,7 +116,7 @@ def test_every_scene_that_comes_along_covers_the_object_and_differs_from_the_oth
     for name in BUILTIN:
         folder = tmp_path / name
         folder.mkdir()
-        write_job(folder, geometry, mask, light, builtin=name, scene_file=None, settings=QUICK)
+        write_job(folder, geometry, mask, light, scene=name, settings=QUICK)
         target = as_seen(read_picture(render(blender, folder, no_progress)), geometry.camera, mask)
         assert np.isfinite(target.image).all()
         assert target.image.min() >= 0
@@ -140,7 +140,7 @@ def test_a_stop_ends_blender_at_once(tmp_path: Path, blender: Blender) -> None:
     geometry, light = ball()
     mask = known(geometry)
     slow = dataclasses.replace(QUICK, samples=4096)
-    write_job(tmp_path, geometry, mask, light, builtin="marble", scene_file=None, settings=slow)
+    write_job(tmp_path, geometry, mask, light, scene="marble", settings=slow)
 
     class Stopped(Exception):
         pass
@@ -167,7 +167,7 @@ def test_a_scene_that_blender_cannot_open_is_told_in_blenders_words(tmp_path: Pa
     mask = known(geometry)
     broken = tmp_path / "broken.blend"
     broken.write_bytes(b"not a scene")
-    write_job(tmp_path, geometry, mask, light, builtin=None, scene_file=broken, settings=QUICK)
+    write_job(tmp_path, geometry, mask, light, scene=broken, settings=QUICK)
     with pytest.raises(WorkError, match="did not render the target") as raised:
         render(blender, tmp_path, no_progress)
     assert raised.value.code == "blender-failed"
@@ -180,7 +180,7 @@ def test_an_object_without_shape_is_refused_before_blender_starts(tmp_path: Path
     with pytest.raises(WorkError, match="shape") as raised:
         write_job(
             tmp_path, nowhere, np.ones((ROWS, COLUMNS), bool), light,
-            builtin="gold", scene_file=None, settings=QUICK,
+            scene="gold", settings=QUICK,
         )  # fmt: skip
     assert raised.value.code == "target-no-geometry"
 
@@ -195,7 +195,7 @@ def test_a_blender_that_is_named_and_not_there_is_said_so(monkeypatch: pytest.Mo
 def test_the_objects_own_paint_is_found_whatever_the_light(tmp_path: Path) -> None:
     geometry, light = ball()
     mask = known(geometry)
-    write_job(tmp_path, geometry, mask, light, builtin="lowered-head", scene_file=None, settings=QUICK)
+    write_job(tmp_path, geometry, mask, light, scene="lowered-head", settings=QUICK)
     found = load_arrays(tmp_path / "mesh.npz")
     front = len(found["reflectance"]) // 2
     u, v = found["uv"][:front].T

@@ -15,8 +15,8 @@ from controller.demo.job import demo
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
-from controller.stage.services.calibrate import make_appearances
-from controller.stage.services.play import play
+from controller.stage.services.calibrate import AppearanceOrder, make_appearances
+from controller.stage.services.play import PlayRequest, play
 from controller.stage.sessions.calibrations import KEY_FILE, finished_calibration, output_sizes, signing_key
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.run import LOCK
@@ -106,7 +106,9 @@ def test_without_a_key_bundles_are_unsigned_only_if_the_stage_says_so(stage: Pat
 
 def test_solving_is_refused_while_the_stage_is_at_work(stage: Path) -> None:
     with exclusive(stage / LOCK, what_is_running="Another"), pytest.raises(UsageError) as refused:
-        make_appearances(session=OwnSession(stage), names=(), reporter=Silent(), cancel=threading.Event())
+        make_appearances(
+            AppearanceOrder(names=()), session=OwnSession(stage), reporter=Silent(), cancel=threading.Event()
+        )
     assert refused.value.code == "already-running"
 
 
@@ -114,7 +116,10 @@ def test_what_solves_is_as_typed_or_as_the_stage_says(stage: Path, monkeypatch: 
     def refused(device: str | None) -> str:
         with pytest.raises(UsageError) as error:
             make_appearances(
-                session=OwnSession(stage), names=(), reporter=Silent(), cancel=threading.Event(), device=device
+                AppearanceOrder(names=(), device=device),
+                session=OwnSession(stage),
+                reporter=Silent(),
+                cancel=threading.Event(),
             )
         return error.value.code
 
@@ -134,8 +139,10 @@ def test_what_solves_is_as_typed_or_as_the_stage_says(stage: Path, monkeypatch: 
 def test_playing_without_a_bundle_is_refused_before_any_device_is_opened(stage: Path) -> None:
     with pytest.raises(UsageError) as refused:
         play(
-            session=OwnSession(stage), names=("shine",), sequence=None, seconds=1, fade_s=0, repeat=1,
-            reporter=Silent(), cancel=threading.Event(),
-        )  # fmt: skip
+            PlayRequest(names=("shine",), sequence=None, seconds=1, fade_s=0, repeat=1),
+            session=OwnSession(stage),
+            reporter=Silent(),
+            cancel=threading.Event(),
+        )
     assert refused.value.code == "nothing-installed"
     assert not (stage / "runs").exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 
 from controller.run.progress import Reporter, Silent
-from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_refining, write_refined
-from controller.stage.rig.rig import Rig
 from controller.stage.services.refine import Refinement, refine, refinement_of
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.session import MakeSteps, StageSession
+from controller.stage.sessions.session import StageSession, StageWork
 from hal.deadline import Cancelled
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.notices import Level
@@ -43,15 +41,12 @@ class Session(StageSession):
     def locked(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
-    def run(
-        self, checked: Checked, make_steps: MakeSteps, *, name: str, reporter: Reporter, cancel: threading.Event,
-        dark: bool = False, plays: bool = False, before: Callable[[Rig], Sequence[Step]] = lambda rig: (),
-    ) -> Path:  # fmt: skip
-        assert dark, "room light would be taken for an error"
+    def run(self, checked: Checked, work: StageWork, *, reporter: Reporter, cancel: threading.Event) -> Path:
+        assert work.dark, "room light would be taken for an error"
         if self.error is not None and not self.opened:
             raise self.error
-        steps = make_steps(ModelRig(self.stage).rig, self.stage)
-        self.asked.append((name, [str(step.id) for step in steps]))
+        steps = work.make_steps(ModelRig(self.stage).rig, self.stage)
+        self.asked.append((work.name, [str(step.id) for step in steps]))
         if self.error is not None:
             raise self.error
         return self.stage

@@ -14,7 +14,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import check_stage
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, PluginError
 from hal.notices import Level, Notice
@@ -150,7 +150,9 @@ class Models:
             return [Step(StepId("work"), work)]
 
         checked = check_stage(self.folder, drivers=self.drivers)
-        return OwnSession(checked.stage.folder).run(checked, steps, name=name, reporter=self.told, cancel=self.cancel)
+        return OwnSession(checked.stage.folder).run(
+            checked, StageWork(name, steps), reporter=self.told, cancel=self.cancel
+        )
 
     def states(self) -> list[str]:
         (run,) = (self.folder / "runs").iterdir()

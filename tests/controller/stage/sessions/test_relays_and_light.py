@@ -14,7 +14,7 @@ from controller.run.step_id import StepId
 from controller.stage.rig.ambient_light import AmbientLightLimit, dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import check_stage
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceRefused
 from hal.notices import Level
@@ -87,7 +87,7 @@ class Hall(Models):
 
         checked = check_stage(self.folder, drivers=self.drivers)
         OwnSession(checked.stage.folder).run(
-            checked, steps, name="trial", reporter=self.told, cancel=self.cancel, dark=dark
+            checked, StageWork("trial", steps, dark=dark), reporter=self.told, cancel=self.cancel
         )
 
 

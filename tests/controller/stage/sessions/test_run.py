@@ -19,7 +19,7 @@ from controller.run.step_id import StepId
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.run import LOCK, unfinished_run
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 from hal.deadline import Cancelled
 from hal.errors import DeviceError, DeviceGone, DriverFault
 from hal.notices import Level
@@ -64,7 +64,7 @@ def test_what_needs_no_stable_light_is_done_while_lamps_become_stable(models: Mo
         return [Step(StepId(name), partial(noting, name), unsteady=early) for name, early in names.items()]
 
     checked = check_stage(models.folder, drivers=models.drivers)
-    OwnSession(models.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
+    OwnSession(models.folder).run(checked, StageWork("trial", steps), reporter=models.told, cancel=models.cancel)
     assert done == [("delay", "not yet"), ("first", "stable"), ("last", "stable")]
 
 
@@ -252,8 +252,10 @@ def test_the_same_step_is_not_done_twice_when_a_run_goes_on(models: Models) -> N
 
     checked = check_stage(models.folder, drivers=models.drivers)
     with pytest.raises(Cancelled):
-        OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
-    OwnSession(checked.stage.folder).run(checked, steps, name="trial", reporter=models.told, cancel=models.cancel)
+        OwnSession(checked.stage.folder).run(
+            checked, StageWork("trial", steps), reporter=models.told, cancel=models.cancel
+        )
+    OwnSession(checked.stage.folder).run(checked, StageWork("trial", steps), reporter=models.told, cancel=models.cancel)
     assert done == ["first", "second", "second"]
 
 

@@ -20,6 +20,7 @@ from controller.run.runner import Runner
 from controller.stage.artefacts.solved import Solved
 from controller.stage.steps.appearance.publishing import (
     LONGEST_PX,
+    BundleTarget,
     created_unix_s,
     hints_ms,
     kept_names,
@@ -59,7 +60,7 @@ class Heard(Silent):
 
 
 def publish(stage: Path, run: Path, *names: str, reporter: Reporter | None = None) -> Path:
-    step = publish_step(stage, OUTPUTS, names, stage="s", calibration=run.name, key=None)
+    step = publish_step(BundleTarget(stage, "s", run.name, OUTPUTS, None), names)
     with Journal(run) as journal:
         Runner([step], journal, reporter=reporter or Silent()).run("appearance", deadline=in_seconds(60))
     found = current(stage / "bundles")
@@ -134,8 +135,7 @@ def test_what_is_not_solved_is_not_published(tmp_path: Path) -> None:
     run = tmp_path / "runs" / NAMES[0]
     solve(run, "gold", 1)
     with pytest.raises(Exception, match="has not been solved"):
-        publish_solved(tmp_path / "b.vel", run, OUTPUTS, ["silver"], stage="s", calibration="c", key=None,
-                       slots=tmp_path / "bundles")  # fmt: skip
+        publish_solved(tmp_path / "b.vel", run, BundleTarget(tmp_path, "s", "c", OUTPUTS, None), ["silver"])
     assert not (tmp_path / "b.vel").exists()
 
 
