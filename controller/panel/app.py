@@ -33,9 +33,8 @@ from controller.panel.context import Panel, PanelOptions
 from controller.panel.live import Hub
 from controller.panel.mqtt.bridge import BuildingControl
 from controller.panel.pages.drawing import Drawing
-from controller.panel.pages.forms import Forms
+from controller.panel.pages.forms import Forms, Setup
 from controller.panel.pages.routes import Pages
-from controller.panel.pages.setup import Setup
 from controller.panel.uploads import Targets
 from controller.panel.words.language import COOKIE, chosen, gettext, speaking
 

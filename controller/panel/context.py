@@ -16,8 +16,7 @@ from controller.kiosk.operations.accounts import Accounts as AccountsInUse
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts
-from controller.panel.auth.refusals import Refusals
-from controller.panel.auth.sessions import LoginLimit, Sessions
+from controller.panel.auth.sessions import LoginLimit, Refusals, Sessions
 from controller.panel.live import Hub
 from controller.panel.mqtt.options import BrokerOptions
 from controller.panel.uploads import Targets, UploadLimits

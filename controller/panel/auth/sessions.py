@@ -1,4 +1,4 @@
-"""Server-side sessions, and the limit for log-in attempts."""
+"""Server-side sessions, the limit for log-in attempts, and refused ones for the event log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from controller.core.errors import VelaturaError
 from controller.core.files import read_text
@@ -154,3 +154,24 @@ class LoginLimit:
     def _level(self, key: str) -> float:
         level, then = self._used.get(key, (0.0, self._clock()))
         return max(0.0, level - (self._clock() - then) / self._refill_s)
+
+
+EVERY_S: Final = 10.0
+
+
+class Refusals:
+    """``record``: adds a line to the event log. Whoever tries many names or tokens must not push all else out of it."""
+
+    def __init__(self, record: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> None:
+        self._record, self._clock = record, clock
+        self._lock = threading.Lock()
+        self._told_s, self._untold = float("-inf"), 0
+
+    def add(self, what: str) -> None:
+        """``what`` without its full stop; one line in ``EVERY_S``, which counts those in between."""
+        with self._lock:
+            if self._clock() - self._told_s < EVERY_S:
+                self._untold += 1
+                return
+            more, self._untold, self._told_s = self._untold, 0, self._clock()
+        self._record("refused", f"{what}, and {more} before it." if more else f"{what}.", "warning")

@@ -22,8 +22,8 @@ from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor
 from controller.panel.context import Panel
 from controller.panel.pages import calendar
+from controller.panel.pages.calendar import lamp_reports
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
-from controller.panel.pages.lamp_days import lamp_reports
 from controller.panel.words.language import language, mark
 
 _CAUSES: Final = [(cause.name.lower(), name) for cause, (name, _, _) in error_causes.WORDS.items()]

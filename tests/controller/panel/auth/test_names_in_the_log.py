@@ -10,7 +10,7 @@ from controller.cli.kiosk_process import PanelAddress, _check_panel
 from controller.core.errors import UsageError
 from controller.kiosk.store.accounts import Role
 from controller.panel.api import PREFIX
-from controller.panel.auth.refusals import EVERY_S, Refusals
+from controller.panel.auth.sessions import EVERY_S, Refusals
 from controller.panel.mqtt.options import BrokerOptions, check_broker
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, Served, csrf, log_in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from controller.kiosk.interface import EventRow, Lamp, LampDay
-from controller.panel.pages.lamp_days import LampUse, lamp_reports
+from controller.panel.pages.calendar import LampUse, lamp_reports
 
 LEFT = Lamp("left", 1210.0, 90, True)
 
