@@ -59,7 +59,7 @@ WHOLE: Final = 0.95
 
 def nearness(delta_e: float, reachable_share: float | None) -> Nearness:
     """The words for a median difference over the pixels in reach, which are ``reachable_share`` of the object."""
-    words = next(words for limit, words in NEARNESS if delta_e <= limit)
+    words = next((words for limit, words in NEARNESS if delta_e <= limit), NEARNESS[-1][1])
     if reachable_share is None or reachable_share >= WHOLE:
         return Nearness(words, delta_e, "")
     return Nearness(words, delta_e, f"on {reachable_share:.0%} of the object")

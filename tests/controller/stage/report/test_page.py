@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.stage.report.page import Goal, Page, PictureRow, ReportPicture, render, write_report
+from controller.stage.report.page import Goal, Page, PictureRow, ReportPicture, nearness, render, write_report
 
 GREY = np.full((6, 8, 3), 128, np.uint8)
 EVIL = "<script>alert('x')</script><img src=x onerror=\"y\">&amp;"
@@ -22,7 +23,7 @@ def page(text: str = "plain") -> Page:
         title=text,
         summary=text,
         goals=(Goal(text, text, text, True, text), Goal("no goal", "1"), Goal("missed", "2", "1", False)),
-        rows=(PictureRow(text, ((text, text),), (picture, picture)),),
+        rows=(PictureRow(text, nearness(1.5, 0.9), ((text, text),), (picture, picture)),),
         galleries=((text, text, (picture,)),),
         steps=((text, 1.5), ("nothing", 0.0)),
         facts={text: text},
@@ -64,6 +65,22 @@ def test_every_picture_is_in_the_page_itself() -> None:
     assert len(sources) == 4
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert not re.search(r"https?:|<link|<script|@import|url\((?!data:font/ttf;base64,)", html)
+
+
+def test_pictures_and_how_near_they_are_come_before_every_figure_and_criterion() -> None:
+    first = render(page()).partition("<details")[0]
+    assert first.count("<figure>") == 2
+    assert re.search(r"Very near <b>1.5</b> <span[^>]*>on 90% of the object</span>", first)
+    assert "not reached" not in first
+    assert "not reached" in render(page())
+
+
+@pytest.mark.parametrize(
+    ("delta_e", "words"), [(0.4, "No visible difference"), (3.9, "Near"), (9.0, "Not near"), (float("nan"), "Not near")]
+)
+def test_a_difference_has_words(delta_e: float, words: str) -> None:
+    assert nearness(delta_e, 1.0).words == words
+    assert nearness(delta_e, None).part == ""
 
 
 def test_a_command_in_a_point_is_code() -> None:
