@@ -219,7 +219,7 @@ class TapeBody(EmulatedBody):
     """See ``EmulatedBody``. ``unknown``: operations that the tape does not have, refused as not supported."""
 
     def __init__(self, track: Track) -> None:
-        super().__init__(no_files, names=CameraNames("", "Camera of a tape", ""))
+        super().__init__(_no_files, names=CameraNames("", "Camera of a tape", ""))
         done = _operations(track.entries)
         self.unknown: list[int] = []
         self._replay = Replay([Exchange((one.code, one.parameters, one.sent), one) for one in done], acts=_acts)
@@ -287,7 +287,7 @@ def _objects(done: Iterable[_Done]) -> dict[int, bytes]:
     return objects
 
 
-def no_files(settings: ShotSettings) -> ShotFiles:
+def _no_files(settings: ShotSettings) -> ShotFiles:
     raise AssertionError("a tape's camera takes no pictures of its own")
 
 

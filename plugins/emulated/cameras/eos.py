@@ -51,19 +51,23 @@ _EIGHTHS: Final = {0: 0.0, 3: 1 / 3, 5: 2 / 3}
 
 
 def seconds(code: int) -> float:
+    """The exposure time of a shutter code."""
     return float(2.0 ** (7 - code // 8 - _EIGHTHS[code % 8]))
 
 
 def f_number(code: int) -> float:
+    """The f-number of an aperture code."""
     return float(2.0 ** ((code // 8 - 1 + _EIGHTHS[code % 8]) / 2))
 
 
 def record(code: int, body: bytes) -> bytes:
+    """One report: its length, its code, its body in whole words of 32 bits."""
     padded = body + bytes(-len(body) % 4)
     return struct.pack("<II", 8 + len(padded), code) + padded
 
 
 def new_object(stored: Stored, *, waiting: bool) -> bytes:
+    """The report of a new file; ``waiting``: it waits in memory for the computer, else it is on the card."""
     name = stored.name.encode("ascii") + b"\0"
     size = len(stored.data)
     if waiting:
@@ -73,10 +77,12 @@ def new_object(stored: Stored, *, waiting: bool) -> bytes:
 
 
 def format_bytes(parts: tuple[tuple[int, int, int], ...]) -> bytes:
+    """An image format as an EOS writes it: for each file its kind, size and compression."""
     return struct.pack("<I", len(parts)) + b"".join(struct.pack("<IIII", 16, *part) for part in parts)
 
 
 def read_format(data: bytes) -> tuple[tuple[int, int, int], ...]:
+    """What ``format_bytes`` wrote; () for anything else."""
     parts = struct.unpack_from("<I", data)[0]
     if parts not in (1, 2) or len(data) != 4 + 16 * parts:
         return ()

@@ -58,7 +58,7 @@ def pixel_profiles(fill_factor: float) -> tuple[Floats, Integers]:
 
 
 @dataclass(frozen=True, slots=True)
-class Lit:
+class LitSamples:
     """What a projector lights: for N samples in P camera pixels, in camera pixel order.
 
     ``starts`` (P + 1,) int32: a camera pixel's first sample; ``at_px`` (N, 2) float32: x, y in projector pixels;
@@ -99,11 +99,11 @@ class Footprints:
     offsets: npt.NDArray[np.int64]
     weights: npt.NDArray[np.uint16]
     steps: Floats
-    rest: Lit
+    rest: LitSamples
     fill_factor: float
 
     @classmethod
-    def of(cls, lit: Lit, fill_factor: float, *, most_bytes: int = KEPT_BYTES) -> Self:
+    def of(cls, lit: LitSamples, fill_factor: float, *, most_bytes: int = KEPT_BYTES) -> Self:
         """Sum the weights of as many camera pixels as ``most_bytes`` have room for."""
         profiles, radii = pixel_profiles(fill_factor)
         boxes = _boxes(lit.starts[: 1 + most_bytes // BOX_BYTES], lit.at_px, lit.gain, lit.blur, radii)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hal.runtime.jit import compiled
 from plugins.emulated.core.truth import BenchTruth, Dithering, LightTruth, ProjectorTruth
 from plugins.emulated.optics.effects import confusion_px, defocused, mean_light, veiled
-from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, Lit
+from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, LitSamples
 from plugins.emulated.optics.rays import Samples
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM
 from plugins.emulated.optics.spectra import colours
@@ -247,7 +247,7 @@ class Renderer:
         samples, projector = self._samples, self._truth.projectors[index]
         return [
             Footprints.of(
-                Lit(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
+                LitSamples(samples.starts, at_px, samples.gain[index], samples.blur[index], albedo),
                 projector.light.fill_factor,
                 most_bytes=KEPT_BYTES // len(places),
             )

@@ -19,6 +19,8 @@ FIRST_LIGHT: Final = 0.3
 
 
 class LampPhase(enum.Enum):
+    """What a lamp does: dark and cool, struck but not at full light, at full light, dark but hot."""
+
     STANDBY = "standby"
     WARMING = "warming"
     LIT = "lit"

@@ -32,7 +32,7 @@ REMEDY: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Met:
+class SurfaceHits:
     """Rays that met something: ``ray``: which; ``points``, ``normals`` towards the ray's origin (N, 3); ``faces`` (N,)
 
     and ``weights`` (N, 3) of the face's corners
@@ -65,14 +65,14 @@ class MitsubaScene:
         values.update()
         return mesh
 
-    def hit(self, origins: Floats, rays: Floats) -> Met:
+    def hit(self, origins: Floats, rays: Floats) -> SurfaceHits:
         """What rays meet first."""
         if not len(rays):
             empty = np.zeros((0, 3))
-            return Met(np.zeros(0, np.int64), empty, empty, np.zeros(0, np.int32), empty.astype(np.float32))
+            return SurfaceHits(np.zeros(0, np.int64), empty, empty, np.zeros(0, np.int32), empty.astype(np.float32))
         return self._met(self._scene.ray_intersect(self._rays(origins, rays)), rays)
 
-    def leave(self, points: Floats, normals: Floats, rays: Floats) -> Met:
+    def leave(self, points: Floats, normals: Floats, rays: Floats) -> SurfaceHits:
         """What rays meet that leave points of surfaces, on the side of ``normals``."""
         return self.hit(points + _clear(points) * normals, rays)
 
@@ -90,7 +90,7 @@ class MitsubaScene:
         o, d = ([mi.Float(axis) for axis in part] for part in columns)
         return mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*d))
 
-    def _met(self, interaction: Any, rays: Floats) -> Met:
+    def _met(self, interaction: Any, rays: Floats) -> SurfaceHits:
         import drjit
 
         parts = (
@@ -111,7 +111,7 @@ class MitsubaScene:
         normals *= np.where(np.sum(normals * outside, axis=1) < 0.0, -1.0, 1.0)[:, None]
         u, v = corners[:, ray]
         weights = np.stack((1.0 - u - v, u, v), axis=1).astype(np.float32)
-        return Met(ray, points.T[ray].astype(np.float64), normals, faces[ray].astype(np.int32), weights)
+        return SurfaceHits(ray, points.T[ray].astype(np.float64), normals, faces[ray].astype(np.int32), weights)
 
 
 def _clear(points: Floats) -> float:

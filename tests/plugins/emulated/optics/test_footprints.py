@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import erf
 
-from plugins.emulated.optics.footprints import KEPT_BYTES, SUBPIXELS, Footprints, Lit
+from plugins.emulated.optics.footprints import KEPT_BYTES, SUBPIXELS, Footprints, LitSamples
 from plugins.emulated.optics.rays import BEYOND_PX, SIGMA_STEP_PX
 
 ROWS, COLUMNS, FILL = 7, 9, 0.8
 
 
-def drawn(seed: int, pixels: int = 40) -> tuple[Lit, np.ndarray]:
+def drawn(seed: int, pixels: int = 40) -> tuple[LitSamples, np.ndarray]:
     """Samples of camera pixels in and just outside a small panel, some in shadow; and a frame."""
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[0], np.cumsum(rng.integers(0, 4, pixels))]).astype(np.int32)
@@ -22,7 +22,7 @@ def drawn(seed: int, pixels: int = 40) -> tuple[Lit, np.ndarray]:
     at_px = rng.uniform(-BEYOND_PX, (COLUMNS - 1 + BEYOND_PX, ROWS - 1 + BEYOND_PX), (n, 2)).astype(np.float32)
     gain = np.where(rng.random(n) < 0.3, 0.0, rng.uniform(0.2, 2.0, n)).astype(np.float32)
     blur = rng.integers(6, 200, n).astype(np.uint8)
-    lit = Lit(starts, at_px, gain, blur, rng.random((n, 3)).astype(np.float32))
+    lit = LitSamples(starts, at_px, gain, blur, rng.random((n, 3)).astype(np.float32))
     return lit, rng.random((ROWS, COLUMNS, 3)).astype(np.float32)
 
 
