@@ -15,7 +15,13 @@ from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.correspondence import decode as correspondence_decode
 from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces, colour_shifts, colours_apart
 from controller.optics.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
-from controller.optics.calibrate.photometry.radiometry import measure_radiometry, tell_direct_light
+from controller.optics.calibrate.photometry.colour_tiles import tile_code
+from controller.optics.calibrate.photometry.radiometry import (
+    SinusoidLight,
+    TilePhotographs,
+    measure_radiometry,
+    tell_direct_light,
+)
 from controller.optics.calibrate.photometry.separation import sinusoid_contrast
 from controller.optics.calibrate.photometry.waveform import coarse_waves
 from controller.optics.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
@@ -153,11 +159,15 @@ def _calibrated(
         return plain, fitted.mosaic
     seen = sinusoid_contrast(captures.pictures, plan, white)
     waves = coarse_waves(captures.pictures, plan, white, fitted.phase_map, correspondence.valid, radiometry.response)
+    black = captures.pictures["black"]
+    code = tile_code(captures.pictures, plan, black, captures.pictures["white"] - black)
     white = np.nan_to_num(seen.white)
     share, radiometry, _ = tell_direct_light(
-        captures.pictures, plan, seen, waves, start=radiometry, shown_with=radiometry.response, white=white,
-        projector_px=correspondence.projector_px, spread=fitted.spread,
-    )  # fmt: skip
+        TilePhotographs(captures.pictures, plan, code),
+        SinusoidLight(seen, waves, correspondence.projector_px, fitted.spread),
+        white,
+        radiometry,
+    )
     thrown = share * white
     stripes = dark_light(captures.pictures, plan, fitted.phase_map.projector_px)
     part = replace(plain, radiometry=radiometry, white=white - thrown, indirect=thrown, stripes=stripes)

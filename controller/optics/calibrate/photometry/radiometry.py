@@ -147,19 +147,36 @@ def white_segment(name: str, share: float) -> str | None:
 PASSES: Final = 2
 
 
+@dataclass(frozen=True, slots=True)
+class TilePhotographs:
+    """``captures`` and ``plan`` as for ``measure_radiometry``; ``code``: the cells of both axes, of ``tile_code``."""
+
+    captures: Captures
+    plan: PatternPlan
+    code: tuple[Cells, Cells]
+
+
+@dataclass(frozen=True, slots=True)
+class SinusoidLight:
+    """What the photographs of the sinusoids show.
+
+    ``contrast``, ``waves``: of ``sinusoid_contrast`` and ``coarse_waves``
+    ``projector_px`` (rows, columns, 2): where the camera pixels look in the projector's image, NaN where not known
+    ``spread``: of light under the surface; None where none was seen
+    """
+
+    contrast: SinusoidContrast
+    waves: tuple[Wave, ...]
+    projector_px: FloatImage
+    spread: SurfaceSpread | None = None
+
+
 def tell_direct_light(
-    captures: Captures,
-    plan: PatternPlan,
-    seen: SinusoidContrast,
-    waves: tuple[Wave, ...],
-    *,
-    start: Radiometry,
-    shown_with: Float64,
+    tiles: TilePhotographs,
+    sinusoids: SinusoidLight,
     white: FloatImage,
-    projector_px: FloatImage,
-    spread: SurfaceSpread | None = None,
-    noise: CameraNoise | None = None,
-    code: tuple[Cells, Cells] | None = None,
+    start: Radiometry,
+    *,
     advance: Callable[[float], None] = lambda share: None,
 ) -> tuple[FloatImage, Radiometry, RadiometryReport]:
     """The share (rows, columns, 3) of a projector's white that is indirect, 0 to 1, its response and mixing in direct
@@ -167,23 +184,22 @@ def tell_direct_light(
 
     Parameters
     ----------
-    captures, noise, code : as for ``measure_radiometry``
-    seen, waves : what the sinusoids show, of ``sinusoid_contrast`` and ``coarse_waves``
-    start : response and mixing in direct and indirect light together
-    shown_with : (3, 256) the response by which the sinusoids were encoded
-    white, projector_px, spread : as for ``indirect_share``
+    white : (rows, columns, 3) less the black image, NaN where not known
+    start : response and mixing in direct and indirect light together; its response encoded the sinusoids
     advance : told what part of the work is done, 0 to 1
 
     Raises what ``measure_radiometry`` raises.
     """
-    radiometry = start
+    shown_with, radiometry = start.response, start
     near: Float64 | None = None
     for number in range(PASSES):
         advance(number / PASSES)
         linearity = shown_contrast(radiometry, shown_with)
-        share = indirect_share(seen, white, projector_px, linearity=linearity, spread=spread)
-        known = KnownIndirect(share * white, radiometry)
-        tiles, report = measure_radiometry(captures, plan, indirect=known, noise=noise, code=code)
-        radiometry = held_to(waves, tiles, shown_with, share, white, near)
+        share = indirect_share(
+            sinusoids.contrast, white, sinusoids.projector_px, linearity=linearity, spread=sinusoids.spread
+        )
+        thrown = KnownIndirect(share * white, radiometry)
+        by_tiles, report = measure_radiometry(tiles.captures, tiles.plan, indirect=thrown, code=tiles.code)
+        radiometry = held_to(sinusoids.waves, by_tiles, shown_with, share, white, near)
         near = radiometry.response
     return share, radiometry, report

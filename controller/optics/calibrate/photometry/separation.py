@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import cv2
 import numba
@@ -361,23 +361,23 @@ def _smoothed(share: FloatImage, sigma: FloatImage, known: Mask, position_px: Fl
     return out
 
 
+PixelRow: TypeAlias = tuple[FloatImage, FloatImage, FloatImage, FloatImage]
+"""Pixels of a row, (columns,) each: first estimate of the share, its variance, x and y in the projector's image."""
+
+
 @compiled(fastmath=True)
 def _add_like(
-    start: FloatImage,
-    variance: FloatImage,
-    across: FloatImage,
-    down: FloatImage,
-    other: FloatImage,
-    other_variance: FloatImage,
-    other_across: FloatImage,
-    other_down: FloatImage,
+    here: PixelRow,
+    there: PixelRow,
     certain: FloatImage,
     share: FloatImage,
     limit: np.float32,
     total: FloatImage,
     weight: FloatImage,
 ) -> None:
-    """Add those of the ``other`` pixels of a row that are like ours; all (columns,)."""
+    """Add to ``total`` and ``weight`` the shares of those pixels ``there`` that are like the pixel ``here``."""
+    start, variance, across, down = here
+    other, other_variance, other_across, other_down = there
     for i in range(total.size):
         off = other[i] - start[i]
         like = off * off <= np.float32(LIKE_SIGMAS**2) * (variance[i] + other_variance[i])
@@ -414,12 +414,10 @@ def _mean_of_like(
                 limit = np.float32(STEEPEST_PX * max(abs(r - row), abs(shift)) + 1)
                 a, e = max(first, -shift), min(end, columns - shift)
                 if a < e:
-                    here, there = (row, slice(a, e)), (r, slice(a + shift, e + shift))
-                    _add_like(
-                        start[here], variance[here], across[here], down[here],
-                        start[there], variance[there], across[there], down[there],
-                        certain[there], share[there], limit, total[a:e], weight[a:e],
-                    )  # fmt: skip
+                    at, by = (row, slice(a, e)), (r, slice(a + shift, e + shift))
+                    here = start[at], variance[at], across[at], down[at]
+                    there = start[by], variance[by], across[by], down[by]
+                    _add_like(here, there, certain[by], share[by], limit, total[a:e], weight[a:e])
         for column in range(first, end):
             if known[row, column] and weight[column] > 0:
                 out[row, column] = total[column] / weight[column]

@@ -32,37 +32,44 @@ from controller.optics.capture.patterns import PERIOD_PX, PatternPlan
 
 COARSE: Final = ("phase-x", "phase-y")
 HALF: Final = PERIOD_PX // 2
+"""Projector pixels from the dark middle of a wave to the bright one."""
 ANGLES: Final[Float64] = np.pi * np.arange(HALF + 1) / HALF
 ASKED: Final[Float64] = 0.5 - 0.5 * np.cos(ANGLES)
-"""Light that a sinusoid asks of a whole pixel, from black to white."""
+"""The 13 levels of light that a sinusoid asks of a whole projector pixel, from black to white."""
 PART_PX: Final = 8
-"""Projector pixels a side of a part of the picture: the period of what harmonics do to three steps."""
+"""A part of the picture is a square with sides of so many projector pixels: the period of what harmonics do to three
+steps."""
 PIXELS: Final = 96
-"""Camera pixels of a part that are used, some twice where it has fewer."""
+"""So many camera pixels of a part are used, some of them twice where it has fewer."""
 FEWEST_PIXELS: Final = 48
-"""Of a part; one with fewer is left out."""
+"""A part with fewer camera pixels is left out."""
 MOST_PARTS: Final = 2000
 FEWEST_PARTS: Final = 60
 FRAME_PX: Final = 6
-"""Projector pixels at the frame's border that are left out: beyond it is no wave."""
+"""So many projector pixels at the frame's border are left out: there is no wave beyond it."""
 OUTLIER: Final = 5.0
+"""Light that differs from the fit by more than so many standard deviations is left out."""
 DARK_NOISE: Final = 0.03
-"""Variance of a pixel's light is that of white, times its share of white and this."""
+"""The variance of a camera pixel's light is that of white, times the sum of its share of white and this."""
 CONTRAST_LEFT: Final = 0.2, 1.5
-"""Of white; a part with another direct light is none of one surface."""
+"""A part whose direct light is not between these shares of white does not show a single surface; it is left out."""
 FLICKER: Final = 0.01
+"""Standard deviation of a lamp's strength from one photograph to the next."""
 BLUR_PX2: Final = 0.1
-"""Standard deviation of what a colour's blur has more than was measured, in projector pixels squared."""
+"""A colour's blur is larger than was measured, by this standard deviation, in projector pixels squared."""
 BEND: Final = 0.001
-"""Standard deviation of the second differences of what is added to a response from tiles, from a level to the next."""
+"""Standard deviation of the second differences, from one level to the next, of what is added to a tiles' response."""
 SIGMA: Final = 0.00045
-"""Standard deviation of a level besides noise, of white: the blur is not quite a Gaussian, and light between near
-surfaces is modulated a little."""
+"""Standard deviation of a level apart from noise, as a share of white: the blur is not quite a Gaussian, and light
+between near surfaces is modulated a little."""
 TILES_SIGMA: Final = 0.0005
+"""Standard deviation of a tiles' response, as a share of white, where no light is indirect."""
 TILES_SIGMA_OF_SHARE: Final = 0.01
-"""Standard deviation of a response from tiles, of white, and what the share of indirect light adds to it."""
+"""The share of indirect light, times this, adds to ``TILES_SIGMA``."""
 OVERSAMPLED: Final = 32
+"""Places in each projector pixel for which the levels' shares are tabulated."""
 VARIANCES_PX2: Final[Float64] = np.geomspace(0.05, 16, 40)
+"""Blurs for which they are tabulated, in projector pixels squared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +119,8 @@ def coarse_waves(
         return ()
     black = coloured(captures, "black", white.shape[:2])
     lit = lit_pixels(white) & valid & channels.finite(phase_map.projector_px)
-    at = _parts(phase_map.projector_px, lit, plan.size_px)
-    if len(at) < FEWEST_PARTS:
+    pixels = _parts(phase_map.projector_px, lit, plan.size_px)
+    if len(pixels) < FEWEST_PARTS:
         return ()
     bright = np.percentile(white[lit][::7], 99, axis=0)
     table = _table()
@@ -123,44 +130,46 @@ def coarse_waves(
     for axis, prefix in enumerate(COARSE):
         steps = plan.sinusoids(prefix)
         # One photograph after the other: all of them would be too much memory for a large camera.
-        light = np.stack([_colours(captures, step.name, black, at) for step in steps], axis=2)
-        seen = white.reshape(-1, 3)[at].astype(np.float64)
-        known = np.asarray(np.isfinite(light).all(axis=(2, 3)), np.bool_)
-        ratio = np.where(known[:, :, None, None], light / seen[:, :, None], 0)
-        weight = np.where(known[..., None], np.minimum(seen / bright, 1), 0)
-        place = phase_map.projector_px.reshape(-1, 2)[at].astype(np.float64)
+        light = np.stack([_colours(captures, step.name, black, pixels) for step in steps], axis=2)
+        full = white.reshape(-1, 3)[pixels].astype(np.float64)
+        complete = np.asarray(np.isfinite(light).all(axis=(2, 3)), np.bool_)
+        ratio = np.where(complete[:, :, None, None], light / full[:, :, None], 0)
+        weight = np.where(complete[..., None], np.minimum(full / bright, 1), 0)
+        place = phase_map.projector_px.reshape(-1, 2)[pixels].astype(np.float64)
         variance = _variance(phase_map.spread_px2, place, axis)
         shifts = [round(step.phase_rad / (2 * np.pi) * PERIOD_PX) for step in steps]
         levels, blurred = (
-            np.stack([_levels(one, place[..., axis] - shift, variance).astype(np.float32) for shift in shifts], axis=2)
-            for one in (table, change)
+            np.stack(
+                [_levels(shares, place[..., axis] - shift, variance).astype(np.float32) for shift in shifts], axis=2
+            )
+            for shares in (table, change)
         )
-        beside = 1 / OVERSAMPLED
+        apart = 1 / OVERSAMPLED
         ahead, behind = (
             np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
-            for step in (beside, -beside)
+            for step in (apart, -apart)
         )
         values = _values((device_frame(step, plan.size_px, shown_with) for step in steps), shifts, axis)
-        waves.append(Wave(ratio, weight, levels, blurred, (ahead - behind) / (2 * beside), values))
+        waves.append(Wave(ratio, weight, levels, blurred, (ahead - behind) / (2 * apart), values))
     return tuple(waves)
 
 
 def _values(frames: Iterable[ByteImage], shifts: Sequence[int], axis: int) -> Float64:
     """``Wave.values`` of the steps' frames (rows, columns, 3), of sinusoids along ``axis`` at ``shifts``."""
-    found = np.zeros((HALF + 1, 256, 3))
-    for shown, shift in zip(frames, shifts, strict=True):
-        lines = shown if axis == 1 else shown.swapaxes(0, 1)
+    counts = np.zeros((HALF + 1, 256, 3))
+    for frame, shift in zip(frames, shifts, strict=True):
+        lines = frame if axis == 1 else frame.swapaxes(0, 1)
         level = _level(np.arange(len(lines)) - shift)
         for channel in range(3):
-            at = level[:, None] * 256 + lines[..., channel]
-            found[..., channel] += np.bincount(at.ravel(), minlength=found[..., 0].size).reshape(-1, 256)
-    return np.asarray(found / found.sum(axis=1, keepdims=True), np.float64)
+            pair = level[:, None] * 256 + lines[..., channel]
+            counts[..., channel] += np.bincount(pair.ravel(), minlength=counts[..., 0].size).reshape(-1, 256)
+    return np.asarray(counts / counts.sum(axis=1, keepdims=True), np.float64)
 
 
-def _colours(captures: Captures, name: str, black: FloatImage, at: npt.NDArray[np.int64]) -> Float64:
+def _colours(captures: Captures, name: str, black: FloatImage, pixels: npt.NDArray[np.int64]) -> Float64:
     """(parts, pixels, 3) light of a photograph, less black, NaN where it is not known."""
-    picture = coloured(captures, name, black.shape[:2]).reshape(-1, 3)[at]
-    return np.asarray(picture - black.reshape(-1, 3)[at], np.float64)
+    picture = coloured(captures, name, black.shape[:2]).reshape(-1, 3)[pixels]
+    return np.asarray(picture - black.reshape(-1, 3)[pixels], np.float64)
 
 
 def held_to(
@@ -179,19 +188,20 @@ def held_to(
     radiometry : from colour tiles
     shown_with : (3, 256) the response by which the sinusoids were encoded
     share : (rows, columns, 3) of the projector's white (rows, columns, 3) that is indirect light
-    near : (3, 256) what was found before: how much each pixel counts depends on what is left of it. None: the tiles'
+    near : (3, 256) the response of an earlier pass: how much each pixel counts depends on what it leaves of the light;
+        that of the tiles if omitted
     """
     if not waves:
         return radiometry
-    found, sigma = _measured(waves, radiometry, radiometry.response if near is None else near)
+    added, sigma = _measured(waves, radiometry, radiometry.response if near is None else near)
     lit = lit_pixels(white)
     indirect = float(np.median(share[lit])) if lit.any() else 0.0
     of_tiles = TILES_SIGMA**2 + (TILES_SIGMA_OF_SHARE * indirect) ** 2
-    change = of_tiles / (of_tiles + SIGMA**2 + sigma**2) * found
+    change = of_tiles / (of_tiles + SIGMA**2 + sigma**2) * added
     change[:, [0, -1]] = 0
     curves = [
-        rising(own + _between(off, np.arccos(np.clip(1 - 2 * used, -1, 1))))
-        for own, off, used in zip(radiometry.response, change, shown_with, strict=True)
+        rising(curve + _between(at_levels, np.arccos(np.clip(1 - 2 * encoded, -1, 1))))
+        for curve, at_levels, encoded in zip(radiometry.response, change, shown_with, strict=True)
     ]
     return dataclasses.replace(radiometry, response=np.stack(curves))
 
@@ -208,84 +218,90 @@ def _measured(waves: tuple[Wave, ...], radiometry: Radiometry, near: Float64) ->
 
     ``near``: (3, 256) a response near to the one that is sought
     """
-    inner = HALF - 1
+    inner = HALF - 1  # unknown levels: black and white are fixed
     bend = np.diff(np.eye(HALF + 1), 2, axis=0)[:, 1:-1] / BEND
-    whole = np.kron(np.eye(3), bend.T @ bend)
-    shown, nearer = (
+    # normal equations of the unknown levels of red, green and blue in turn, (33, 33) and (33,)
+    matrix = np.kron(np.eye(3), bend.T @ bend)
+    by_tiles, by_near = (
         [radiometry.emitted(wave.light(response)).T for wave in waves] for response in (radiometry.response, near)
     )
-    mean = np.mean(shown, axis=0)
-    added, sigma = np.mean(nearer, axis=0) - mean, np.zeros((3, HALF + 1))
-    wanted = -whole @ added[:, 1:-1].ravel()
-    for wave, light in zip(waves, shown, strict=True):
-        for channel, (matrix, value) in enumerate(_normals(wave, radiometry.mixing @ (light + added))):
+    mean = np.mean(by_tiles, axis=0)
+    added, sigma = np.mean(by_near, axis=0) - mean, np.zeros((3, HALF + 1))
+    right = -matrix @ added[:, 1:-1].ravel()
+    for wave, light in zip(waves, by_tiles, strict=True):
+        for channel, (of_camera, value) in enumerate(_normals(wave, radiometry.mixing @ (light + added))):
+            # (11, 33): a camera channel sees each level as the mixture of the projector's three
             to_camera = np.kron(radiometry.mixing[channel], np.eye(inner))
-            whole += to_camera.T @ matrix @ to_camera
-            wanted += to_camera.T @ value
-    covariance = np.linalg.inv(whole)
-    added[:, 1:-1] += (covariance @ wanted).reshape(3, inner)
+            matrix += to_camera.T @ of_camera @ to_camera
+            right += to_camera.T @ value
+    covariance = np.linalg.inv(matrix)
+    added[:, 1:-1] += (covariance @ right).reshape(3, inner)
     sigma[:, 1:-1] = np.sqrt(np.diag(covariance)).reshape(3, inner)
     return (radiometry.channels((mean + added).T) - radiometry.channels(mean.T)).T, sigma
 
 
-def _normals(wave: Wave, seen: Float64) -> Iterator[tuple[Float64, Float64]]:
-    """Of each camera channel: normal matrix (11, 11) and right side of what is to be added to the levels ``seen``.
+def _normals(wave: Wave, expected: Float64) -> Iterator[tuple[Float64, Float64]]:
+    """Of each camera channel: normal matrix (11, 11) and right side of what is to be added to the ``expected`` levels.
 
-    In each part, light that is not modulated, direct light, and a shift of the wave are free, and over all parts
-    the lamp's strength in each photograph, and the blur.
+    ``expected`` (3, 13). In each part, light that is not modulated, direct light, and a shift of the wave are free, and
+    over all parts the lamp's strength in each photograph, and the blur.
     """
     parts, pixels, steps, _ = wave.levels.shape
-    inner = wave.levels[..., 1:-1].reshape(parts, pixels * steps, -1)
+    rows = pixels * steps
+    inner = wave.levels[..., 1:-1].reshape(parts, rows, -1)
     photograph = np.tile(np.eye(steps), (pixels, 1))
-    expected = np.array([FLICKER] * steps + [BLUR_PX2])
-    moved = wave.moved.reshape(parts, -1)
+    common_sigma = np.array([FLICKER] * steps + [BLUR_PX2])
+    moved = wave.moved.reshape(parts, rows)
     for channel in range(3):
-        model, blurred = ((one @ seen[channel]).reshape(parts, -1) for one in (wave.levels, wave.blurred))
-        light = wave.ratio[..., channel].reshape(parts, -1)
-        own = np.stack([np.ones_like(model), model, moved], axis=2)
+        model, blurred = ((shares @ expected[channel]).reshape(parts, rows) for shares in (wave.levels, wave.blurred))
+        light = wave.ratio[..., channel].reshape(parts, rows)
+        free = np.stack([np.ones_like(model), model, moved], axis=2)
         weight = np.repeat(wave.weight[..., channel], steps, axis=1) / (DARK_NOISE + np.clip(model, 0, 1))
-        solve, residual = _fitted(own, weight, light)
-        off = np.abs(residual) * np.sqrt(weight)
-        weight *= off < OUTLIER * 1.4826 * np.median(off, axis=1, keepdims=True) + 1e-12
-        solve, residual = _fitted(own, weight, light)
-        fitted, direct = light - residual, solve(light[..., None])[:, 1, 0]
-        good = (direct > CONTRAST_LEFT[0]) & (direct < CONTRAST_LEFT[1])
-        of_blur = (blurred * direct[:, None])[..., None]
-        columns = np.concatenate([inner * direct[:, None, None], fitted[..., None] * photograph, of_blur], axis=2)
-        columns -= own @ solve(columns)
-        count = np.maximum(np.count_nonzero(weight, axis=1) - own.shape[2], 1)
+        fit = _PartFit(free, weight)
+        deviation = np.abs(fit.residual(light)) * np.sqrt(weight)
+        weight *= deviation < OUTLIER * 1.4826 * np.median(deviation, axis=1, keepdims=True) + 1e-12
+        fit = _PartFit(free, weight)
+        residual = fit.residual(light)
+        direct = fit.solved(light[..., None])[:, 1, 0]
+        usable = (direct > CONTRAST_LEFT[0]) & (direct < CONTRAST_LEFT[1])
+        # unknowns: the levels, the strength of each photograph, and the blur; less what the free ones explain
+        strength = (light - residual)[..., None] * photograph
+        blur = (blurred * direct[:, None])[..., None]
+        columns = np.concatenate([inner * direct[:, None, None], strength, blur], axis=2)
+        columns -= free @ fit.solved(columns)
+        count = np.maximum(np.count_nonzero(weight, axis=1) - free.shape[2], 1)
         variance = np.maximum(np.sum(weight * residual**2, axis=1) / count, 1e-12)
-        weight *= (good / variance)[:, None]
-        weighted = (columns * weight[..., None]).reshape(parts * pixels * steps, -1)
+        weight *= (usable / variance)[:, None]
+        weighted = (columns * weight[..., None]).reshape(parts * rows, -1)
         matrix = weighted.T @ columns.reshape(weighted.shape)
-        value = weighted.T @ residual.ravel()
-        yield _without(expected, matrix, value)
+        right = weighted.T @ residual.ravel()
+        yield _without(common_sigma, matrix, right)
 
 
-class _Solver:
-    """Least squares in every part: (parts, n, k) of what is ``own``, (parts, rows, n), for values (parts, rows, k)."""
+class _PartFit:
+    """Weighted least squares in every part by the columns ``free`` (parts, rows, n); ``weight`` (parts, rows)."""
 
-    def __init__(self, own: Float64, weight: Float64) -> None:
-        self._weighted = np.swapaxes(own * weight[..., None], 1, 2)
-        self._matrix = self._weighted @ own + 1e-9 * np.eye(own.shape[2])
+    def __init__(self, free: Float64, weight: Float64) -> None:
+        self._free = free
+        self._weighted = np.swapaxes(free * weight[..., None], 1, 2)
+        self._matrix = self._weighted @ free + 1e-9 * np.eye(free.shape[2])
 
-    def __call__(self, values: Float64) -> Float64:
+    def solved(self, values: Float64) -> Float64:
+        """(parts, n, k): how much of each column there is in values (parts, rows, k)."""
         return np.asarray(np.linalg.solve(self._matrix, self._weighted @ values), np.float64)
 
-
-def _fitted(own: Float64, weight: Float64, light: Float64) -> tuple[_Solver, Float64]:
-    """What fits ``own`` to ``light`` (parts, rows), and what that leaves of the light."""
-    solve = _Solver(own, weight)
-    return solve, np.asarray(light - (own @ solve(light[..., None]))[..., 0], np.float64)
+    def residual(self, light: Float64) -> Float64:
+        """(parts, rows): what the columns leave of the light (parts, rows)."""
+        return np.asarray(light - (self._free @ self.solved(light[..., None]))[..., 0], np.float64)
 
 
-def _without(sigma: Float64, matrix: Float64, value: Float64) -> tuple[Float64, Float64]:
+def _without(sigma: Float64, matrix: Float64, right: Float64) -> tuple[Float64, Float64]:
     """Normal equations without their last unknowns, which are 0 with standard deviations ``sigma``."""
-    left = len(value) - len(sigma)
-    others = matrix[left:, left:] + np.diag(1 / sigma**2)
-    away = np.linalg.solve(others, np.column_stack([matrix[left:, :left], value[left:]]))
-    across = matrix[:left, left:]
-    return matrix[:left, :left] - across @ away[:, :-1], value[:left] - across @ away[:, -1]
+    first = len(right) - len(sigma)
+    last = matrix[first:, first:] + np.diag(1 / sigma**2)
+    eliminated = np.linalg.solve(last, np.column_stack([matrix[first:, :first], right[first:]]))
+    across = matrix[:first, first:]
+    return matrix[:first, :first] - across @ eliminated[:, :-1], right[:first] - across @ eliminated[:, -1]
 
 
 def _parts(place_px: FloatImage, used: Mask, size_px: tuple[int, int]) -> npt.NDArray[np.int64]:
@@ -293,8 +309,8 @@ def _parts(place_px: FloatImage, used: Mask, size_px: tuple[int, int]) -> npt.ND
     edge = np.array(size_px) - 1 - FRAME_PX
     with np.errstate(invalid="ignore"):
         inside = used & np.all((place_px >= FRAME_PX) & (place_px <= edge), axis=2)
-    at = np.flatnonzero(inside)
-    column, row = (place_px.reshape(-1, 2)[at] // PART_PX).astype(np.int64).T
+    pixels = np.flatnonzero(inside)
+    column, row = (place_px.reshape(-1, 2)[pixels] // PART_PX).astype(np.int64).T
     part = row * (size_px[0] // PART_PX + 1) + column
     order = np.argsort(part, kind="stable")
     _, first, count = np.unique(part[order], return_index=True, return_counts=True)
@@ -302,32 +318,32 @@ def _parts(place_px: FloatImage, used: Mask, size_px: tuple[int, int]) -> npt.ND
     if full.size > MOST_PARTS:
         full = full[np.arange(MOST_PARTS) * full.size // MOST_PARTS]
     taken = (np.arange(PIXELS) * count[full, None]) // PIXELS
-    return np.asarray(at[order[first[full, None] + taken]], np.int64)
+    return np.asarray(pixels[order[first[full, None] + taken]], np.int64)
 
 
 def _variance(spread_px2: FloatImage, place: Float64, axis: int) -> Float64:
     """Blur along an axis at places (..., 2) of the projector's image, in projector pixels squared."""
     rows, columns = spread_px2.shape[:2]
-    own = spread_px2[..., 2 * axis].astype(np.float64)
-    known = own[np.isfinite(own)]
-    usual = float(np.median(known)) if known.size else float(VARIANCES_PX2[0])
+    variance = spread_px2[..., 2 * axis].astype(np.float64)
+    finite = variance[np.isfinite(variance)]
+    usual = float(np.median(finite)) if finite.size else float(VARIANCES_PX2[0])
     column = np.clip(np.rint(place[..., 0]), 0, columns - 1).astype(np.int64)
     row = np.clip(np.rint(place[..., 1]), 0, rows - 1).astype(np.int64)
-    return np.asarray(np.where(np.isfinite(own), own, usual)[row, column], np.float64)
+    return np.asarray(np.where(np.isfinite(variance), variance, usual)[row, column], np.float64)
 
 
 def _table() -> Float64:
     """(variances, places, 13): share of each level in the light at a place of a period, for each blur."""
     place = np.arange(PERIOD_PX * OVERSAMPLED) / OVERSAMPLED
-    found = np.zeros((VARIANCES_PX2.size, place.size, HALF + 1))
+    shares = np.zeros((VARIANCES_PX2.size, place.size, HALF + 1))
     for number, variance in enumerate(VARIANCES_PX2):
         reach = int(np.ceil(4.5 * np.sqrt(variance))) + 1
         pixel = np.arange(-reach, PERIOD_PX + reach + 1)
         kernel = np.exp(-((place[:, None] - pixel) ** 2) / (2 * variance))
         kernel[np.abs(place[:, None] - pixel) > reach] = 0
         kernel /= kernel.sum(axis=1, keepdims=True)
-        found[number] = kernel @ np.eye(HALF + 1)[_level(pixel)]
-    return found
+        shares[number] = kernel @ np.eye(HALF + 1)[_level(pixel)]
+    return shares
 
 
 def _changes(table: Float64) -> Float64:
@@ -343,12 +359,12 @@ def _level(pixel: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def _levels(table: Float64, place_px: Float64, variance: Float64) -> Float64:
     """(..., n) of ``table`` (variances, places, n), as ``_table``, at places and variances (...)."""
-    at = np.rint(place_px * OVERSAMPLED).astype(np.int64) % table.shape[1]
+    place = np.rint(place_px * OVERSAMPLED).astype(np.int64) % table.shape[1]
     log = np.log(np.clip(variance, VARIANCES_PX2[0], VARIANCES_PX2[-1]))
     number = np.interp(log, np.log(VARIANCES_PX2), np.arange(VARIANCES_PX2.size))
     below = np.minimum(number.astype(np.int64), VARIANCES_PX2.size - 2)
     above = (number - below)[..., None]
-    return np.asarray(table[below, at] * (1 - above) + table[below + 1, at] * above, np.float64)
+    return np.asarray(table[below, place] * (1 - above) + table[below + 1, place] * above, np.float64)
 
 
 __all__ = ["Wave", "coarse_waves", "held_to"]

@@ -12,7 +12,7 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import TroubleCode
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.photometry.colour_tiles import tile_code
-from controller.optics.calibrate.photometry.radiometry import painted, tell_direct_light
+from controller.optics.calibrate.photometry.radiometry import SinusoidLight, TilePhotographs, painted, tell_direct_light
 from controller.optics.calibrate.photometry.separation import (
     indirect_figures,
     lamp_flicker,
@@ -62,20 +62,19 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     seen = sinusoid_contrast(captures, plan, light.white, noise=noise)
     white = seen.white
     code = tile_code(captures, plan, light.black, light.white, known_px=known_px, noise=noise)
-    known = pixels.phase_map
+    phase_map = pixels.phase_map
     waves: tuple[Wave, ...] = ()
-    if known is not None:
-        waves = coarse_waves(captures, plan, light.white, known, pixels.seen, light.response)
-    share, radiometry, report = tell_direct_light(
-        captures, plan, seen, waves, start=light.radiometry, shown_with=light.response, white=white,
-        projector_px=pixels.projector_px, spread=pixels.surface_spread, noise=noise, code=code, advance=context.advance,
-    )  # fmt: skip
+    if phase_map is not None:
+        waves = coarse_waves(captures, plan, light.white, phase_map, pixels.seen, light.response)
+    sinusoids = SinusoidLight(seen, waves, pixels.projector_px, pixels.surface_spread)
+    tiles = TilePhotographs(captures, plan, code)
+    share, radiometry, report = tell_direct_light(tiles, sinusoids, white, light.radiometry, advance=context.advance)
     median, p95 = indirect_figures(share, white)
     change = radiometry.response[:, TOLD_AT] / np.maximum(light.response[:, TOLD_AT], 1e-9) - 1
     flicker = lamp_flicker(seen.strengths)
     figures = IndirectFigures(median, p95, tuple(float(value) for value in change), flicker)
     segment = np.array([radiometry.segment]) if radiometry.segment else None
-    stripes = None if known is None else dark_light(captures, plan, known.projector_px)
+    stripes = None if phase_map is None else dark_light(captures, plan, phase_map.projector_px)
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
     troubles = {
