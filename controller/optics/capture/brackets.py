@@ -207,9 +207,8 @@ def choose_exposure(
     available_s: Sequence[float],
     *,
     lit: Mask | None = None,
-    target: float = TARGET,
 ) -> ExposureChoice:
-    """The exposure at which white's brightest lit pixels reach ``target`` of full scale and none much more.
+    """The exposure at which white's brightest lit pixels reach ``TARGET`` of full scale and none much more.
 
     Parameters
     ----------
@@ -219,7 +218,7 @@ def choose_exposure(
 
     Returns
     -------
-    the longest available exposure that keeps the 99.5th percentile below ``target`` plus 7 %, settled when the image
+    the longest available exposure that keeps the 99.5th percentile below ``TARGET`` plus 7 %, settled when the image
     shows that percentile unsaturated and not lost in noise
     """
     exposures = _ascending(available_s)
@@ -229,7 +228,7 @@ def choose_exposure(
     if brightest < TOO_DARK:
         longer = _at_most(exposures, exposure_s * min(16.0, 0.5 / max(brightest, 1e-3)))
         return ExposureChoice(longer, longer <= exposure_s)
-    return ExposureChoice(_at_most(exposures, exposure_s * target * 1.07 / brightest), True)
+    return ExposureChoice(_at_most(exposures, exposure_s * TARGET * 1.07 / brightest), True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,10 +239,10 @@ class BracketChoice:
     settled: bool
 
 
-def minimum_level(noise: CameraNoise, relative: float = RELATIVE_NOISE) -> float:
-    """The full-scale value from which noise is below ``relative`` of it: (relative v)^2 = shot v + read^2."""
-    root = math.sqrt(noise.shot**2 + 4 * relative**2 * noise.read**2)
-    return (noise.shot + root) / (2 * relative**2)
+def minimum_level(noise: CameraNoise) -> float:
+    """The full-scale value from which noise is below ``RELATIVE_NOISE`` r of it: (r v)^2 = shot v + read^2."""
+    root = math.sqrt(noise.shot**2 + 4 * RELATIVE_NOISE**2 * noise.read**2)
+    return (noise.shot + root) / (2 * RELATIVE_NOISE**2)
 
 
 def choose_brackets(

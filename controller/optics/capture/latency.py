@@ -190,9 +190,9 @@ def fingerprint(path: Path, exposure_s: float) -> Fingerprint:
     return Fingerprint(samples.astype(np.float32), 1 / exposure_s)
 
 
-def same_picture(one: Fingerprint, other: Fingerprint, *, noise: CameraNoise | None = None) -> bool:
+def same_picture(one: Fingerprint, other: Fingerprint) -> bool:
     """Whether two photographs show the same picture, as far as noise, flicker and clipping let one see."""
-    noise = noise or CameraNoise()
+    noise = CameraNoise()
     if one.samples.shape != other.samples.shape:
         return False
     ceiling = 0.9 * min(one.full_scale, other.full_scale)

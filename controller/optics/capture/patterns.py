@@ -134,20 +134,17 @@ class PatternPlan:
         return len(self.sinusoids(prefix)) > 2
 
 
-def plan_patterns(
-    size_px: tuple[int, int], *, few: bool = False, code: Code = Code.GRAY, random_patterns: int = 1
-) -> PatternPlan:
+def plan_patterns(size_px: tuple[int, int], *, few: bool = False, code: Code = Code.GRAY) -> PatternPlan:
     """The plan for a projector of ``size_px`` (width, height).
 
     Names: ``black white``, ``gray-x-0``.., ``gray-y-0``.., ``mosaic-0``.., ``phase-x-0..2``, ``phase-y-0..2``,
-    ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``...
+    ``blur-x-0..2``, ``blur-y-0..2``, ``blur-d-0..2``, ``random-0``.
 
     Parameters
     ----------
     few : two steps of each sinusoid, a quarter of a period apart, and one of the diagonal one; the opposites are
         computed. One picture of tiles less
     code : ``COLOURS``: ``gray-rgb-0``.. with three bits each; ``KNOWN``: no code
-
 
     Raises UsageError("projector-too-small") below 2 cells a side.
     """
@@ -174,7 +171,7 @@ def plan_patterns(
             computed += [_opposite(pattern, prefix, len(shown) + n) for n, pattern in enumerate(shown)]
         else:
             patterns += _steps(prefix, frequency, PHASE_STEPS if prefix.startswith("phase") else BLUR_STEPS)
-    patterns += [Pattern(f"random-{n}", PatternKind.RANDOM, seed=n, coarse=True) for n in range(random_patterns)]
+    patterns.append(Pattern("random-0", PatternKind.RANDOM, coarse=True))
     return PatternPlan(size_px, tuple(patterns), tuple(computed), code)
 
 

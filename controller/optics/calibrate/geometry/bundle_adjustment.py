@@ -8,7 +8,6 @@ Camera parameters: log f, cx, cy, k1. Projector parameters: log f, cx, cy, k1, r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,17 +168,14 @@ def adjust(
     *,
     iterations: int = 40,
     tolerance: float = 1e-8,
-    tick: Callable[[], None] | None = None,
 ) -> Adjusted:
     """Levenberg-Marquardt with the Schur complement over the points.
 
-    ``tolerance``: stops when an iteration lowers the cost by a smaller share; ``tick`` is called once an iteration.
+    ``tolerance``: stops when an iteration lowers the cost by a smaller share.
     """
     state = normalised(state)
     cost, damping = cost_of(problem, state), 1e-3
     for _ in range(iterations):
-        if tick is not None:
-            tick()
         normal = _normal_equations(problem, state)
         before = cost
         while damping < 1e9:

@@ -7,7 +7,7 @@ little more: a depth-reversed one can look better in one pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,14 +32,12 @@ _SEEDS = 8
 
 @dataclass(frozen=True, slots=True)
 class PairStart:
-    """A projector that may explain one fundamental matrix: baseline of length 1; ``in_front``: share of points before
-    camera and projector."""
+    """A projector that may explain one fundamental matrix: baseline of length 1."""
 
     focal_px: float
     principal_px: tuple[float, float]
     rotation: Float64
     centre: Float64
-    in_front: float
 
 
 def fundamental(camera_px: Float64, projector_px: Float64) -> tuple[Float64, Mask] | None:
@@ -118,8 +116,8 @@ def candidates(
     starts: list[PairStart] = []
     for essential, own_f, own_cy in zip(_essential(matrix, camera_matrix, f, cy, width), f, cy, strict=True):
         principal = ((width - 1) / 2, float(own_cy))
-        rotation, centre, share = _pose(essential, rays, (projector_px - principal) / own_f)
-        starts.append(PairStart(float(own_f), principal, rotation, centre, share))
+        rotation, centre = _pose(essential, rays, (projector_px - principal) / own_f)
+        starts.append(PairStart(float(own_f), principal, rotation, centre))
     return starts
 
 
@@ -145,20 +143,18 @@ def inverse_depths(rays: Float64, seen: Float64, rotation: Float64, centre: Floa
     return np.asarray(np.sum(left * right, axis=1) / np.maximum(np.sum(right * right, axis=1), 1e-12))
 
 
-def _pose(essential: Float64, rays: Float64, seen: Float64) -> tuple[Float64, Float64, float]:
-    """The one of four decompositions with the most points in front of both."""
+def _pose(essential: Float64, rays: Float64, seen: Float64) -> tuple[Float64, Float64]:
+    """Rotation and centre by the one of four decompositions with the most points in front of both."""
     first, second, translation = cv2.decomposeEssentialMat(essential)
-    best: tuple[Float64, Float64, float] | None = None
+    poses: list[tuple[float, Float64, Float64]] = []
     for rotation in (first.astype(np.float64), second.astype(np.float64)):
         for sign in (1.0, -1.0):
             centre = np.asarray(-sign * rotation.T @ translation.ravel(), dtype=np.float64)
             inverse = inverse_depths(rays, seen, rotation, centre)
             ahead = (_homogeneous(rays) - inverse[:, None] * centre) @ rotation[2]
-            share = float(np.mean((inverse > 0) & (ahead > 0)))
-            if best is None or share > best[2]:
-                best = (np.asarray(rotation), np.asarray(centre), share)
-    assert best is not None
-    return best
+            poses.append((float(np.mean((inverse > 0) & (ahead > 0))), rotation, centre))
+    _, rotation, centre = max(poses, key=lambda pose: pose[0])
+    return rotation, centre
 
 
 def _homogeneous(px: Float64) -> Float64:
@@ -207,9 +203,7 @@ def sample_pixels(correspondences: Sequence[Correspondence], most: int) -> tuple
     return np.stack([columns, rows], axis=1).astype(np.float64), observed, seen
 
 
-def solve_pair(
-    problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, int], tick: Callable[[], None]
-) -> Pair | None:
+def solve_pair(problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, int]) -> Pair | None:
     """Candidates for one projector from its correspondences alone; None where no epipolar geometry fits them."""
     seen = np.flatnonzero(problem.seen[:, index])
     camera_px, observed = problem.camera_px[seen], problem.projector_px[seen, index]
@@ -232,7 +226,7 @@ def solve_pair(
     small = replace(restricted(problem, chosen, [index]), noise_px=max(noise, 0.02))
     solved = []
     for start in starts:
-        adjusted = ba.adjust(small, _from_start(small, start), tolerance=1e-5, tick=tick)
+        adjusted = ba.adjust(small, _from_start(small, start), tolerance=1e-5)
         ahead = float(np.mean(adjusted.state.inverse_depth > 0))
         if ahead > 0.95:
             solved.append((adjusted.state, adjusted.cost))

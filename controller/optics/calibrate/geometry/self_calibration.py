@@ -13,10 +13,9 @@ import numpy as np
 
 from controller.core import channels
 from controller.core.arrays import Float64
-from controller.core.errors import CalibrationError, UsageError, WorkError
+from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
-from controller.optics.calibrate.geometry import pose_initialisation as hypotheses
 from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
 from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction, parameter_names
 from controller.optics.calibrate.values import Correspondence
@@ -70,7 +69,6 @@ def no_position(
     problem: ba.AdjustmentProblem,
     sizes_px: Sequence[tuple[int, int]],
     missing: Sequence[int],
-    tick: Callable[[], None],
 ) -> CalibrationError:
     """The error where no position was found for the projectors ``missing``: the focal length, if another one gives any.
 
@@ -82,7 +80,7 @@ def no_position(
         prior, sigma = problem.camera_prior.copy(), problem.camera_sigma.copy()
         prior[0], sigma[0] = np.log(factor * focal), _ANY_FOCAL_SIGMA
         other = replace(problem, camera_prior=prior, camera_sigma=sigma)
-        pairs = (hypotheses.solve_pair(other, n, sizes_px[n], tick) for n in missing)
+        pairs = (pose_initialisation.solve_pair(other, n, sizes_px[n]) for n in missing)
         if all(pair is not None and pair.candidates for pair in pairs):
             return CalibrationError(
                 "camera-prior-contradicted",
@@ -96,8 +94,6 @@ def no_position(
         remedy="Let each projector see more of the object's depth, or move it farther from the camera's view axis.",
     )
 
-
-__all__ = ["CameraPrior", "Reconstruction", "parameter_names", "reconstruct"]
 
 _SAMPLES = 4000
 _TRIAL_POINTS = 600
@@ -114,9 +110,7 @@ def reconstruct(
     projector_sizes: Sequence[tuple[int, int]],
     prior: CameraPrior,
     *,
-    smoothing_px: int = 2,
     progress: Callable[[float], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
 ) -> Reconstruction:
     """Recover poses, intrinsics and the object from what each camera pixel sees of each projector.
 
@@ -124,10 +118,7 @@ def reconstruct(
     ----------
     correspondences : one per projector, each of the camera's (rows, columns)
     camera_size, projector_sizes : (width, height) in pixels
-    smoothing_px : points come from curved patches through (2 smoothing_px + 1) pixels squared, at least 2; normals from
-        planes one pixel wider
     progress : called with the share done, 0 to 1
-    cancelled : asked often; when it says True, WorkError("cancelled") is raised
 
     Raises
     ------
@@ -139,22 +130,17 @@ def reconstruct(
     """
     _check(correspondences, camera_size, projector_sizes, prior)
     report = progress or (lambda share: None)
-
-    def tick() -> None:
-        if cancelled is not None and cancelled():
-            raise WorkError("cancelled", what="The reconstruction was stopped.", remedy="Start it again to continue.")
-
     problem = _problem(correspondences, camera_size, projector_sizes, prior)
-    problem, pairs = _solve_pairs(problem, correspondences, projector_sizes, tick, lambda share: report(0.4 * share))
-    trial, tried, margin = _best_stage(problem, pairs, tick)
+    problem, pairs = _solve_pairs(problem, correspondences, projector_sizes, lambda share: report(0.4 * share))
+    trial, margin = _best_stage(problem, pairs)
     report(0.6)
-    problem, adjusted, kept_share = _refine(problem, correspondences, trial, tick)
+    problem, adjusted, kept_share = _refine(problem, correspondences, trial)
     report(0.8)
     _refuse_if_contradicted(problem, adjusted.state)
     shape_sigma = _shape_sigma(problem, adjusted)
     _refuse_if_uncertain(shape_sigma, margin, pairs)
     stage = AdjustedStage(adjusted.state, problem.noise_px, shape_sigma, camera_size, projector_sizes)
-    points = object_points(stage, correspondences, prior, smoothing_px)
+    points = object_points(stage, correspondences, prior)
     report(1.0)
     return Reconstruction(
         geometry=points.geometry,
@@ -163,7 +149,6 @@ def reconstruct(
         noise_px=problem.noise_px,
         shape_rel_sigma=shape_sigma,
         scale_rel_sigma=points.unit_rel_sigma,
-        stages_tried=tried,
         margin=margin,
         inlier_share=kept_share,
         sigma_m=points.sigma_m,
@@ -238,13 +223,12 @@ def _solve_pairs(
     problem: ba.AdjustmentProblem,
     correspondences: Sequence[Correspondence],
     projector_sizes: Sequence[tuple[int, int]],
-    tick: Callable[[], None],
     report: Callable[[float], None],
 ) -> tuple[ba.AdjustmentProblem, list[pose_initialisation.Pair]]:
     """Candidates for every projector; the problem without the correspondences that no epipolar geometry fits."""
     pairs, seen = [], problem.seen.copy()
     for n, size in enumerate(projector_sizes):
-        pair = pose_initialisation.solve_pair(problem, n, size, tick)
+        pair = pose_initialisation.solve_pair(problem, n, size)
         if pair is None or pair.inliers.sum() < 0.5 * problem.seen[:, n].sum():
             raise inconsistent(correspondences[n], f"What the camera saw of projector {n + 1} fits no position of it.")
         pairs.append(pair)
@@ -254,7 +238,7 @@ def _solve_pairs(
         raise _flat(max(pair.parallax_px for pair in pairs))
     if not all(pair.candidates for pair in pairs):
         missing = [n for n, pair in enumerate(pairs) if not pair.candidates]
-        raise no_position(problem, projector_sizes, missing, tick)
+        raise no_position(problem, projector_sizes, missing)
     noise = float(np.median([pair.noise_px for pair in pairs]))
     joined = seen.sum(axis=1) >= 2
     pairs = [replace(pair, inliers=pair.inliers[joined]) for pair in pairs]
@@ -275,9 +259,9 @@ def _flat(parallax_px: float) -> CalibrationError:
 
 
 def _best_stage(
-    problem: ba.AdjustmentProblem, pairs: Sequence[pose_initialisation.Pair], tick: Callable[[], None]
-) -> tuple[ba.AdjustmentState, int, float]:
-    """The cheapest of all chained stages, how many were tried, and its margin over any of another shape."""
+    problem: ba.AdjustmentProblem, pairs: Sequence[pose_initialisation.Pair]
+) -> tuple[ba.AdjustmentState, float]:
+    """The cheapest of all chained stages, and its margin over any of another shape."""
     everyone = range(len(pairs))
     chosen = np.arange(0, len(problem.seen), max(1, len(problem.seen) // _TRIAL_POINTS))
     small = pose_initialisation.restricted(problem, chosen, everyone)
@@ -288,12 +272,12 @@ def _best_stage(
             what="The projectors' light overlaps too little on the object to locate all of them together.",
             remedy="Turn the projectors so that each one's light overlaps another's.",
         )
-    solved = [ba.adjust(small, start, tolerance=1e-5, tick=tick) for start in starts]
+    solved = [ba.adjust(small, start, tolerance=1e-5) for start in starts]
     solved = [s for s in solved if np.mean(s.state.inverse_depth > 0) > 0.95] or solved
     solved.sort(key=lambda s: s.cost)
     best = solved[0]
     others = [s.cost - best.cost for s in solved[1:] if _differs(s.state, best.state)]
-    return best.state, len(starts), min(others, default=float("inf"))
+    return best.state, min(others, default=float("inf"))
 
 
 def _differs(one: ba.AdjustmentState, other: ba.AdjustmentState) -> bool:
@@ -306,13 +290,12 @@ def _refine(
     problem: ba.AdjustmentProblem,
     correspondences: Sequence[Correspondence],
     state: ba.AdjustmentState,
-    tick: Callable[[], None],
 ) -> tuple[ba.AdjustmentProblem, ba.Adjusted, float]:
     """Adjust over all points, trim what does not fit, adjust again; the share of correspondences that were kept."""
     everything = int(problem.seen.sum())
     state = replace(state, inverse_depth=pose_initialisation.triangulated(problem, state))
     for _ in range(2):
-        adjusted = ba.adjust(problem, state, tick=tick)
+        adjusted = ba.adjust(problem, state)
         distance = channels.length(ba.residuals(problem, adjusted.state))
         noise = _noise_px(problem, distance)
         seen = problem.seen & (distance < 5.0 * noise)
@@ -327,7 +310,7 @@ def _refine(
         raise inconsistent(
             worst, f"Only {share:.0%} of what the camera saw fits one position of camera and projectors."
         )
-    return problem, ba.adjust(problem, state, tick=tick), share
+    return problem, ba.adjust(problem, state), share
 
 
 def _noise_px(problem: ba.AdjustmentProblem, distance: Float64) -> float:

@@ -29,6 +29,8 @@ SAME_SURFACE: Final = 0.02
 STEEPEST: Final = 10.0
 """Relative step of inverse depth over two pixels, in pixel widths: beyond it (79 degrees from head-on) both pixels may
 see two surfaces at once."""
+SMOOTHING_PX: Final = 2
+"""Points come from patches with sides of 2 * 2 + 1 pixels, normals from planes one pixel wider on each side."""
 TERMS: Final = 6
 LANES: Final = 256
 """Pixels of a row whose patches are fitted together."""
@@ -254,9 +256,7 @@ class AdjustedStage:
     projector_sizes: Sequence[tuple[int, int]]
 
 
-def object_points(
-    stage: AdjustedStage, correspondences: Sequence[Correspondence], prior: CameraPrior, smoothing_px: int
-) -> ObjectPoints:
+def object_points(stage: AdjustedStage, correspondences: Sequence[Correspondence], prior: CameraPrior) -> ObjectPoints:
     """Triangulate every camera pixel and set the scale by what ``prior`` says was measured.
 
     Without a measured distance the nearest object point is put at 1 m. Pixels whose projectors disagree, and pixels
@@ -280,7 +280,7 @@ def object_points(
         noise_px,
     )
     raw = np.where(raw > 0, raw, np.float32(np.nan))
-    smooth, normals = _surface(raw, rays, float(np.exp(state.camera[0])), smoothing_px)
+    smooth, normals = _surface(raw, rays, float(np.exp(state.camera[0])))
     known = np.isfinite(smooth)
     if not known.any():
         raise CalibrationError(
@@ -307,11 +307,11 @@ def object_points(
     return ObjectPoints(geometry, unit_m, unit_rel_sigma, sigma_m)
 
 
-def _surface(raw: FloatImage, rays: FloatImage, focal_px: float, smoothing_px: int) -> tuple[FloatImage, FloatImage]:
+def _surface(raw: FloatImage, rays: FloatImage, focal_px: float) -> tuple[FloatImage, FloatImage]:
     """Inverse depths from curved patches, and normals from planes one pixel wider; NaN unless both are known."""
     whole = whole_pixels(raw, focal_px)
-    smooth = fit_patches(raw, whole, smoothing_px)
-    _, normals = fit_planes(smooth, rays, smoothing_px + 1)
+    smooth = fit_patches(raw, whole, SMOOTHING_PX)
+    _, normals = fit_planes(smooth, rays, SMOOTHING_PX + 1)
     smooth[~np.isfinite(normals[..., 0])] = np.nan
     return smooth, normals
 

@@ -162,8 +162,8 @@ class Reconstruction:
     ``scale_rel_sigma`` by the measured distances; infinite where none was given
     ``sigma_m`` (rows, columns) float32: standard deviation of each point along the camera's ray, at a fixed scale; NaN
     where unknown
-    ``stages_tried`` starting points that were adjusted as a whole; ``margin`` by which the best beat the next shape, in
-    halved chi-square, infinite where all led to the same
+    ``margin`` by which the best starting point, adjusted as a whole, beat the next shape, in halved chi-square;
+    infinite where all led to the same
     ``inlier_share`` of the sampled correspondences
     """
 
@@ -173,7 +173,6 @@ class Reconstruction:
     noise_px: float
     shape_rel_sigma: float
     scale_rel_sigma: float
-    stages_tried: int
     margin: float
     inlier_share: float
     sigma_m: FloatImage

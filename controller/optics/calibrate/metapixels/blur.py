@@ -59,35 +59,19 @@ class BlurContrasts:
     coarse_variance: FloatImage
 
 
-def measure_blur(
-    captures: Captures,
-    plan: PatternPlan,
-    correspondence: Correspondence,
-    colours: ColourPlaces | None = None,
-    spread: SurfaceSpread | None = None,
-) -> tuple[FloatImage, Mask]:
-    """Blur covariance S of each projector pixel.
+def measure_contrasts(
+    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
+) -> BlurContrasts:
+    """What ``blur_of`` needs.
 
     Parameters
     ----------
     captures : needs ``black``, ``phase-*`` and ``blur-*``, ``completed``; linear, in one unit
     correspondence : of the same projector
-    colours : where the projector's colours lie apart; S is then the blur of one colour
-    spread : how light spreads under the surface, where it does
-
-    Returns
-    -------
-    (rows, columns, 3) float32 of the projector's image: xx, xy, yy in projector pixels squared; and where it is valid
+    colours : where the projector's colours lie apart; the blur is then that of one colour
 
     Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
     """
-    return blur_of(measure_contrasts(captures, plan, correspondence, colours), spread)
-
-
-def measure_contrasts(
-    captures: Captures, plan: PatternPlan, correspondence: Correspondence, colours: ColourPlaces | None = None
-) -> BlurContrasts:
-    """What ``blur_of`` needs; parameters and errors as ``measure_blur``."""
     cells = cells_of(correspondence, plan.size_px)
     view = _CameraView(grey(captures, "black"), correspondence.projector_px, cells)
 
@@ -101,7 +85,11 @@ def measure_contrasts(
 
 
 def blur_of(seen: BlurContrasts, spread: SurfaceSpread | None = None) -> tuple[FloatImage, Mask]:
-    """As ``measure_blur``, from contrasts that were measured."""
+    """Blur covariance S of each projector pixel.
+
+    ``spread``: how light spreads under the surface, where it does. Returns (rows, columns, 3) float32 of the
+    projector's image: xx, xy, yy in projector pixels squared; and where it is valid.
+    """
     left = [contrast_left(spread, float(np.hypot(*frequency))) for frequency in BLUR_FREQUENCIES.values()]
     fine = seen.fine / np.array(left, np.float32)[:, None, None]
     coarse_x, coarse_y = seen.coarse / np.float32(contrast_left(spread, 1 / PERIOD_PX))

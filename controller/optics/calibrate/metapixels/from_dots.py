@@ -39,18 +39,15 @@ GRAZING: Final = 0.1
 def initial_metapixels(
     correspondence: Correspondence,
     size_px: tuple[int, int],
-    *,
-    pixel_sigma_px: float = PIXEL_SIGMA_PX,
-    camera_sigma_px: float = CAMERA_SIGMA_PX,
 ) -> Metapixels:
     """Centres from the inverse of the map, sizes from its slope and an assumed blur.
 
-    ``size_px`` (width, height) of the projector; ``pixel_sigma_px`` in projector, ``camera_sigma_px`` in camera pixels.
+    ``size_px`` (width, height) of the projector.
     """
     inverse = invert_map(correspondence, size_px)
     round_px2 = np.array([1, 0, 1], np.float32)
-    blur = np.broadcast_to(np.float32(pixel_sigma_px**2) * round_px2, (*inverse.valid.shape, 3))
-    covariance = carry_covariance(inverse.jacobian, blur) + np.float32(camera_sigma_px**2) * round_px2
+    blur = np.broadcast_to(np.float32(PIXEL_SIGMA_PX**2) * round_px2, (*inverse.valid.shape, 3))
+    covariance = carry_covariance(inverse.jacobian, blur) + np.float32(CAMERA_SIGMA_PX**2) * round_px2
     return Metapixels(inverse.centre_px, covariance, inverse.valid)
 
 

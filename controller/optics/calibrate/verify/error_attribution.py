@@ -34,6 +34,7 @@ INDIRECT_SHARE = 0.15
 """More indirect light than this share of what is seen, and an error no larger than it, is taken for the reason."""
 UNDECODED_SHARE = 0.02
 """Of the brightest white: light without shares beyond it is missed."""
+MOST_REASONS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,8 +185,8 @@ def _explained(
     return np.asarray(moved, np.float32), np.asarray(dimmed, np.float32)
 
 
-def ranked(why: ErrorAttribution, *, most: int = 5) -> list[dict[str, Any]]:
-    """The reasons by how much of the squared error they carry; ``sentence`` is for the technician."""
+def ranked(why: ErrorAttribution) -> list[dict[str, Any]]:
+    """The most important reasons by how much of the squared error they carry; ``sentence`` is for the technician."""
     total, pixels = max(float(why.error.sum(dtype=np.float64)), 1e-30), max(int(np.count_nonzero(why.lit)), 1)
     rows: list[tuple[float, dict[str, Any]]] = []
     for reason, (name, what, remedy) in WORDS.items():
@@ -202,7 +203,7 @@ def ranked(why: ErrorAttribution, *, most: int = 5) -> list[dict[str, Any]]:
         )
         row = {"reason": name, "error_share": of_error, "area_share": of_area, "sentence": sentence}
         rows.append((max(of_error, of_area), row))
-    return [row for _, row in sorted(rows, key=lambda one: one[0], reverse=True)[:most]]
+    return [row for _, row in sorted(rows, key=lambda one: one[0], reverse=True)[:MOST_REASONS]]
 
 
 def _where(here: Mask, lit: Mask) -> str:

@@ -60,14 +60,13 @@ class Motion:
         return self.found and self.rms_px > max(least_px, 3 * self.sigma_px)
 
 
-def register(reference: FloatImage, seen: FloatImage, weight: FloatImage, *, search: bool = True) -> Motion:
+def register(reference: FloatImage, seen: FloatImage, weight: FloatImage) -> Motion:
     """Find the homography by which ``seen`` lies elsewhere than ``reference``.
 
     Parameters
     ----------
     reference, seen : (rows, columns, channels) float32; where ``weight`` is 0 anything, NaN included
     weight : (rows, columns) float32, >= 0: how well a pixel of both is known
-    search : look for large shifts first; without it, only motions of a few pixels are found
 
     Returns
     -------
@@ -80,7 +79,7 @@ def register(reference: FloatImage, seen: FloatImage, weight: FloatImage, *, sea
     reference = np.where(known[:, :, None], reference, 0).astype(np.float32)
     seen = np.where(known[:, :, None], seen, 0).astype(np.float32)
     frame = _Frame(weight)
-    start = _first_shift(reference, seen, weight) if search else np.zeros(2)
+    start = _first_shift(reference, seen, weight)
     parameters = np.zeros(8)
     parameters[[2, 5]] = start / frame.half
     for blur_px in BLURS_PX:
@@ -88,15 +87,14 @@ def register(reference: FloatImage, seen: FloatImage, weight: FloatImage, *, sea
     return _motion(frame, parameters, fit, reference.shape[2])
 
 
-def warp(image: FloatImage, matrix: Float64, *, nearest: bool = False) -> FloatImage:
+def warp(image: FloatImage, matrix: Float64) -> FloatImage:
     """``image(H v)`` at each pixel v; NaN beyond its border. (rows, columns[, channels]) float32."""
     rows, columns = image.shape[:2]
     y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
     at = _mapped(matrix, x, y)
-    flags = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
     return np.asarray(
         cv2.remap(
-            np.asarray(image, np.float32), at[0].astype(np.float32), at[1].astype(np.float32), flags,
+            np.asarray(image, np.float32), at[0].astype(np.float32), at[1].astype(np.float32), cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT, borderValue=(math.nan,) * 4,
         ),
         np.float32,

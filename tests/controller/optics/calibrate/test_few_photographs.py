@@ -18,7 +18,7 @@ from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.correspondence.gray_code import decode_cells, decode_colours
 from controller.optics.calibrate.correspondence.known_map import check_map
-from controller.optics.calibrate.metapixels.blur import measure_blur
+from controller.optics.calibrate.metapixels.blur import blur_of, measure_contrasts
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry
 from controller.optics.calibrate.photometry.separation import indirect_share, sinusoid_contrast
 from controller.optics.calibrate.values import Correspondence, Radiometry
@@ -191,8 +191,8 @@ def test_blur_is_measured_as_with_all_photographs() -> None:
     full = plan_patterns(scene.projector_px)
     all_of_them = Stage(scene).captures(full)
     few, plan = completed(photographed(scene), plan_of(scene)), plan_of(scene)
-    wanted, there = measure_blur(all_of_them, full, decode(all_of_them, full))
-    found, here = measure_blur(few, plan, decoded(scene))
+    wanted, there = blur_of(measure_contrasts(all_of_them, full, decode(all_of_them, full)))
+    found, here = blur_of(measure_contrasts(few, plan, decoded(scene)))
     both = there & here
     assert both.sum() > 0.95 * there.sum()
     assert np.median(np.abs(found - wanted)[both]) < 0.02

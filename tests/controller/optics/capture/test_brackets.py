@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.optics.capture.brackets import (
+    RELATIVE_NOISE,
     CameraNoise,
     choose_brackets,
     choose_exposure,
@@ -182,8 +183,8 @@ def test_two_exposures_are_enough_for_a_camera_as_the_papers(decades: float, cou
 
 
 def test_the_least_level_is_where_noise_is_the_share_asked_for() -> None:
-    level = minimum_level(NOISE, 0.05)
-    assert np.sqrt(NOISE.shot * level + NOISE.read**2) == pytest.approx(0.05 * level)
+    level = minimum_level(NOISE)
+    assert np.sqrt(NOISE.shot * level + NOISE.read**2) == pytest.approx(RELATIVE_NOISE * level)
 
 
 def test_a_camera_without_exposures_is_explained() -> None:

@@ -9,12 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from controller.core.errors import CalibrationError, UsageError, WorkError
-from controller.optics.calibrate.geometry.self_calibration import (
-    CameraPrior,
-    Reconstruction,
-    parameter_names,
-    reconstruct,
-)
+from controller.optics.calibrate.geometry.self_calibration import reconstruct
+from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction, parameter_names
 from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Correspondence
 
@@ -356,17 +352,13 @@ def test_wrong_sizes_and_impossible_priors_are_refused_before_work(stage: Stage)
         CameraPrior(600.0, distance_m=-1.0)
 
 
-def test_it_stops_when_asked_and_says_how_far_it_is(stage: Stage) -> None:
+def test_it_says_how_far_it_is_and_a_caller_can_stop_it_there(stage: Stage) -> None:
     shares: list[float] = []
-    prior = CameraPrior(stage.focal_px)
-    with pytest.raises(WorkError) as stopped:
-        reconstruct(
-            stage.correspondences,
-            CAMERA,
-            [PROJECTOR] * 3,
-            prior,
-            progress=shares.append,
-            cancelled=lambda: bool(shares),
-        )
-    assert stopped.value.code == "cancelled"
+
+    def stopped(share: float) -> None:
+        shares.append(share)
+        raise WorkError("cancelled", what="It was stopped.", remedy="Start it again.")
+
+    with pytest.raises(WorkError):
+        reconstruct(stage.correspondences, CAMERA, [PROJECTOR] * 3, CameraPrior(stage.focal_px), progress=stopped)
     assert 0.0 < shares[0] < 1.0

@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 from scipy.special import k0
 
 from controller.core.arrays import Float64, FloatImage
-from controller.optics.calibrate.metapixels.blur import measure_blur
+from controller.optics.calibrate.metapixels.blur import blur_of, measure_contrasts
 from controller.optics.calibrate.photometry.separation import indirect_share, sinusoid_contrast
 from controller.optics.calibrate.photometry.surface_spread import (
     contrast_left,
@@ -111,7 +111,7 @@ class Marble:
         return measure_spread(made, PLAN, self.position_px, white, blur_px=self.shown_blur(made))
 
     def shown_blur(self, made: dict[str, FloatImage]) -> float:
-        covariance, valid = measure_blur(made, PLAN, self.correspondence)
+        covariance, valid = blur_of(measure_contrasts(made, PLAN, self.correspondence))
         return float(np.sqrt(np.nanmedian(covariance[valid][:, [0, 2]])))
 
 
@@ -154,7 +154,7 @@ def test_blur_and_indirect_light_are_those_of_a_surface_without_it(share: float)
     marble = Marble(share, 3.0, 0.6, indirect=0.1, noise=1e-5)
     made = marble.captures()
     known = SurfaceSpread(share, 3.0 / SCALE, 3.0)
-    covariance, valid = measure_blur(made, PLAN, marble.correspondence, spread=known)
+    covariance, valid = blur_of(measure_contrasts(made, PLAN, marble.correspondence), known)
     middle = np.s_[20:-20, 20:-20]
     # The pixel's own square is a twelfth of a pixel squared.
     np.testing.assert_allclose(covariance[middle][valid[middle]][:, 0], 0.6**2 + 1 / 12, atol=0.05)
