@@ -154,7 +154,7 @@ def write_glb(
         doubleSided=True,
     )
     uv = np.stack([across[:, 0], 1.0 - across[:, 1]], axis=1)
-    whole = trimesh.Trimesh(
+    model = trimesh.Trimesh(
         vertices=mesh.vertices_m * turned,
         faces=mesh.triangles,
         vertex_normals=mesh.normals * turned,
@@ -162,7 +162,7 @@ def write_glb(
         process=False,
     )
     scene = trimesh.Scene()
-    scene.add_geometry(whole, node_name=OBJECT, geom_name=OBJECT)
+    scene.add_geometry(model, node_name=OBJECT, geom_name=OBJECT)
     for view in views:
         scene.graph.update(frame_to=view.name, matrix=view.matrix, metadata=dict(view.extras))
     data: bytes = scene.export(file_type="glb", include_normals=True)

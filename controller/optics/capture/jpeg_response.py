@@ -209,8 +209,8 @@ def _solve(meetings: Sequence[Sequence[tuple[Float64, float]]], bases: Sequence[
     _couple_channels(normal, right, np.diff(bases, axis=1))
     factor = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal)))
     shifted = right - normal @ np.full(3 * steps, SMALLEST_STEP)
-    found, _ = nnls(factor.T, solve_triangular(factor, shifted, lower=True), maxiter=30 * steps)
-    return [to_curve @ (found[c * steps : (c + 1) * steps] + SMALLEST_STEP) for c in range(3)]
+    solution, _ = nnls(factor.T, solve_triangular(factor, shifted, lower=True), maxiter=30 * steps)
+    return [to_curve @ (solution[c * steps : (c + 1) * steps] + SMALLEST_STEP) for c in range(3)]
 
 
 def _couple_channels(normal: Float64, right: Float64, base_steps: Float64) -> None:

@@ -61,15 +61,15 @@ def read_exr(path: Path) -> FloatImage:
             low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
             check_pixels(path, (int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)))
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            found = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+            planes_by_name = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except OSError as error:
         raise Unreadable(f"it can't be read: {error.strerror or printable(str(error))}") from error
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise Unreadable(f"it could not be decoded ({printable(str(error))})") from error
-    names = ["R", "G", "B"] if "R" in found else ["Y", "Y", "Y"]
-    if not set(names) <= set(found):
-        raise Unreadable(f"it has the channels {', '.join(sorted(found))}, not R, G and B")
-    planes = [found[name] for name in names + (["A"] if "A" in found else [])]
+    names = ["R", "G", "B"] if "R" in planes_by_name else ["Y", "Y", "Y"]
+    if not set(names) <= set(planes_by_name):
+        raise Unreadable(f"it has the channels {', '.join(sorted(planes_by_name))}, not R, G and B")
+    planes = [planes_by_name[name] for name in names + (["A"] if "A" in planes_by_name else [])]
     if any(plane.shape != planes[0].shape for plane in planes):
         raise Unreadable("its channels differ in size")
     return np.stack(planes, axis=2).astype(np.float32)
@@ -80,8 +80,8 @@ def exr_chromaticities(path: Path) -> tuple[float, ...] | None:
     import OpenEXR
 
     with OpenEXR.File(str(path), header_only=True) as file:
-        said = file.header().get("chromaticities")
-    return None if said is None else tuple(float(one) for one in said)
+        coordinates = file.header().get("chromaticities")
+    return None if coordinates is None else tuple(float(one) for one in coordinates)
 
 
 def exr_bytes(planes: Mapping[str, npt.NDArray[Any]], *, half: bool = False) -> bytes:

@@ -105,8 +105,8 @@ def common_limit(limits: Sequence[Float64]) -> Float64:
 
     The highest: a sensor's limit is the same every time, and what something else made look like one is lower.
     """
-    found = np.stack([np.full((2, 2), -np.inf), *(np.where(np.isfinite(one), one, -np.inf) for one in limits)])
-    highest = found.max(axis=0)
+    lowest = np.stack([np.full((2, 2), -np.inf), *(np.where(np.isfinite(one), one, -np.inf) for one in limits)])
+    highest = lowest.max(axis=0)
     return np.where(np.isfinite(highest), highest, np.inf)
 
 
@@ -150,16 +150,16 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
     reported = sorted({value for exposures, _ in measured for value in exposures})
     if len(reported) < 2:
         return np.empty((0, 2))
-    rows, wanted = [], []
+    rows, values = [], []
     for exposures, ratios in measured:
         for (a, b), (x, y) in zip(itertools.pairwise(exposures), itertools.pairwise(ratios), strict=True):
             row = np.zeros(len(reported))
             row[reported.index(b)] += 1
             row[reported.index(a)] -= 1
             rows.append(row)
-            wanted.append(np.log(y / x) - np.log(b / a))
-    correction, _, rank, _ = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)
-    if np.ptp(correction) < SMALLEST_CORRECTION or _by_chance(np.array(rows) @ correction, np.array(wanted), rank):
+            values.append(np.log(y / x) - np.log(b / a))
+    correction, _, rank, _ = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)
+    if np.ptp(correction) < SMALLEST_CORRECTION or _by_chance(np.array(rows) @ correction, np.array(values), rank):
         return np.empty((0, 2))
     return np.stack((np.array(reported), np.array(reported) * np.exp(correction)), axis=1)
 
@@ -178,20 +178,20 @@ def _by_chance(explained: Float64, measured: Float64, parameters: int) -> bool:
 
 def camera_faults(exposures: Float64, hot: int, samples: int, spread: float = 0.0) -> Mapping[TroubleCode, str]:
     """What a technician should know of ``true_exposures``, of ``hot`` of all samples, and of ``response_spread``."""
-    found = {}
+    faults = {}
     if len(exposures):
         off = float(np.ptp(np.log(exposures[:, 1] / exposures[:, 0])))
-        found[TroubleCode.EXPOSURE_TIMES] = (
+        faults[TroubleCode.EXPOSURE_TIMES] = (
             "Exposure times of the camera differ from what it reports, "
             f"by {100 * off:.1f} % between two of them. {_KNOWN}"
         )
     if hot > NAMED_HOT * samples:
-        found[TroubleCode.HOT_PIXELS] = f"{hot} pixels of the camera are hot. {_KNOWN}"
+        faults[TroubleCode.HOT_PIXELS] = f"{hot} pixels of the camera are hot. {_KNOWN}"
     if spread > NAMED_SPREAD:
-        found[TroubleCode.PIXEL_RESPONSE] = (
+        faults[TroubleCode.PIXEL_RESPONSE] = (
             f"The response of the camera's pixels differs by {100 * spread:.1f} % (standard deviation). {_KNOWN}"
         )
-    return found
+    return faults
 
 
 def _limits(shorter: RawExposure, longer: RawExposure, levels: SensorLevels, ratio: float) -> tuple[Float64, float]:
@@ -230,8 +230,8 @@ def _limit(
     behind = list(itertools.takewhile(lambda one: one[1] < -TOLERANCE and one[0] >= BENDS_FROM, reversed(bins)))
     bent = behind[-1][0] if len(behind) >= FEWEST_BENT else None
     worst = max((abs(deviation) for level, deviation in bins if bent is None or level < bent), default=0.0)
-    found = [level for level in (ceiling, bent) if level is not None]
-    return (min(found) * (1 - TOLERANCE / 2) if found else None), worst
+    levels = [level for level in (ceiling, bent) if level is not None]
+    return (min(levels) * (1 - TOLERANCE / 2) if levels else None), worst
 
 
 def _deviations(
@@ -288,7 +288,7 @@ def find_hot(series: Sequence[RawExposure], levels: SensorLevels) -> npt.NDArray
 
 def _outliers(samples: Samples, levels: SensorLevels) -> npt.NDArray[np.bool_]:
     """Above the brightest of the eight neighbours of its own site, and above their median by many deviations."""
-    found = np.zeros(samples.shape, np.bool_)
+    outliers = np.zeros(samples.shape, np.bool_)
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
     for row, column in np.ndindex(2, 2):
@@ -299,5 +299,5 @@ def _outliers(samples: Samples, levels: SensorLevels) -> npt.NDArray[np.bool_]:
         spread = max(1.4826 * float(np.median(np.abs(above))), 1.0)
         shot = np.sqrt(np.maximum(middle - np.float32(levels.black[row, column]), 0))
         threshold = np.float32(HOT_SIGMAS) * (np.float32(spread) + shot)
-        found[row::2, column::2] = (above > threshold) & (site > brightest + 0.5 * threshold)
-    return found
+        outliers[row::2, column::2] = (above > threshold) & (site > brightest + 0.5 * threshold)
+    return outliers

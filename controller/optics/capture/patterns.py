@@ -123,11 +123,11 @@ class PatternPlan:
 
     def sinusoids(self, prefix: str) -> tuple[Pattern, ...]:
         """The steps of one sinusoid; ``prefix`` is e.g. ``"phase-x"`` or ``"blur-d"``. An opposite follows its own."""
-        found = []
+        steps = []
         for pattern in self.of_kind(PatternKind.SINUSOID):
             if pattern.name.rpartition("-")[0] == prefix:
-                found += [pattern, *(other for other in self.computed if other.opposite == pattern.name)]
-        return tuple(found)
+                steps += [pattern, *(other for other in self.computed if other.opposite == pattern.name)]
+        return tuple(steps)
 
     def measures_phase(self, prefix: str) -> bool:
         """Whether the steps of a sinusoid give its phase; one picture and its opposite only give its strength."""

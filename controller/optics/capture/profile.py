@@ -151,8 +151,8 @@ def measure_noise(pairs: Sequence[tuple[FloatImage, FloatImage]]) -> NoiseReport
     -------
     None where there are too few whole blocks, or nothing but darkness, to separate shot noise from read noise
     """
-    found = [_blocks(first[r::2, c::2], second[r::2, c::2]) for first, second in pairs for r, c in np.ndindex(2, 2)]
-    rows = np.concatenate(found) if found else np.empty((0, 3))
+    blocks = [_blocks(first[r::2, c::2], second[r::2, c::2]) for first, second in pairs for r, c in np.ndindex(2, 2)]
+    rows = np.concatenate(blocks) if blocks else np.empty((0, 3))
     if len(rows) < FEWEST_BLOCKS:
         return None
     shot, read2, kept = _fit(rows)

@@ -204,9 +204,9 @@ def _camera_to_xyz(raw: Any) -> Float64 | None:
 
     LibRaw keeps a DNG's matrix only as balanced camera RGB to sRGB, with the daylight balance beside it.
     """
-    known = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
-    if abs(np.linalg.det(known)) > SINGULAR:
-        return np.asarray(np.linalg.inv(known), np.float64)
+    to_camera = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
+    if abs(np.linalg.det(to_camera)) > SINGULAR:
+        return np.asarray(np.linalg.inv(to_camera), np.float64)
     to_srgb = np.asarray(raw.color_matrix, np.float64)[:, :3] * np.asarray(raw.daylight_whitebalance[:3], np.float64)
     return SRGB_TO_XYZ @ to_srgb if abs(np.linalg.det(to_srgb)) > SINGULAR else None
 

@@ -161,11 +161,11 @@ def _middle(contrast: Float64) -> Float64:
         return np.asarray(np.clip(contrast.mean(axis=1), -MOST_FLICKER, MOST_FLICKER), np.float64)
     square = (contrast**2).sum(axis=0)
     equations = np.stack([2 * contrast[0], 2 * contrast[1], np.ones_like(square)])
-    found = np.array([0.0, 0.0, float(np.median(square))])
+    circle = np.array([0.0, 0.0, float(np.median(square))])
     for _ in range(ROUNDS):
-        off = np.abs(square - found @ equations)
+        off = np.abs(square - circle @ equations)
         # at the frame's border, and where two surfaces are seen, contrasts are off by far
         weight = np.clip(1 - (off / (OUTLIER * np.median(off) + 1e-9)) ** 2, 0, None)
         normal = (weight * equations) @ equations.T
-        found = np.linalg.lstsq(normal, equations @ (weight * square), rcond=None)[0]
-    return np.asarray(np.clip(found[:2], -MOST_FLICKER, MOST_FLICKER), np.float64)
+        circle = np.linalg.lstsq(normal, equations @ (weight * square), rcond=None)[0]
+    return np.asarray(np.clip(circle[:2], -MOST_FLICKER, MOST_FLICKER), np.float64)

@@ -61,28 +61,28 @@ class ColourPlaces:
         """
         for rows in strips(len(self.white)):
             light = np.asarray(self.white[rows] @ self.mixing, np.float32)
-            whole = channels.total(light)
-            known = np.isfinite(whole) & (whole > 0)
+            total = channels.total(light)
+            known = np.isfinite(total) & (total > 0)
             with np.errstate(invalid="ignore", divide="ignore"):
-                light /= whole[..., None]
+                light /= total[..., None]
             light[~known] = self.typical
             yield rows, light
 
     def to_green_px(self) -> FloatImage:
         """(rows, columns, 2): what the place of a fine grey sinusoid lacks to be that of green."""
-        found = np.empty((*self.white.shape[:2], 2), np.float32)
+        offset_px = np.empty((*self.white.shape[:2], 2), np.float32)
         waves = np.exp(2j * np.pi / FRINGE_PX * self.shifts_px).astype(np.complex64)
         for rows, share in self.shares():
-            found[rows] = np.angle(share @ waves) * np.float32(FRINGE_PX / (2 * np.pi))
-        return found
+            offset_px[rows] = np.angle(share @ waves) * np.float32(FRINGE_PX / (2 * np.pi))
+        return offset_px
 
     def contrast(self, frequency: tuple[float, float]) -> FloatImage:
         """(rows, columns): what is left of a grey sinusoid's contrast at green's phase; cycles a projector pixel."""
-        found = np.empty(self.white.shape[:2], np.float32)
+        contrasts = np.empty(self.white.shape[:2], np.float32)
         waves = np.cos(2 * np.pi * self.shifts_px @ np.array(frequency)).astype(np.float32)
         for rows, share in self.shares():
-            found[rows] = share @ waves
-        return found
+            contrasts[rows] = share @ waves
+        return contrasts
 
 
 FINE: Final = ("blur-x", "blur-y")
@@ -153,31 +153,31 @@ def colours_apart(captures: Captures, plan: PatternPlan, white: FloatImage, mixi
     at = np.flatnonzero(light > FAINTEST * np.nanpercentile(light, 99))
     at = at[:: max(1, at.size // SOME_PIXELS)]
     black, own_white = (image.reshape(-1, 3)[at] for image in (coloured(captures, "black", white.shape[:2]), white))
-    found = np.full((2, at.size, 3), np.nan)
+    apart_px = np.full((2, at.size, 3), np.nan)
     for axis, prefix in enumerate(FINE):
         steps = plan.sinusoids(prefix)
         seen = np.zeros((at.size, 3), np.complex128)
         for step in steps:
             image = coloured(captures, step.name, white.shape[:2]).reshape(-1, 3)[at] - black
             seen += (2 / len(steps)) * np.exp(-1j * step.phase_rad) * image
-        own = np.linalg.solve(mixing, (2 * seen / own_white).T).T
+        by_colour = np.linalg.solve(mixing, (2 * seen / own_white).T).T
         # what is not a number in one of the steps is left out, too
-        use = every(np.abs(own) > LEAST_CONTRAST)
-        own = own[use]
-        found[axis, use] = np.angle(own * np.conj(own[:, 1:2])) * FRINGE_PX / (2 * np.pi)
-    return ColoursApart(at, found)
+        use = every(np.abs(by_colour) > LEAST_CONTRAST)
+        by_colour = by_colour[use]
+        apart_px[axis, use] = np.angle(by_colour * np.conj(by_colour[:, 1:2])) * FRINGE_PX / (2 * np.pi)
+    return ColoursApart(at, apart_px)
 
 
 def colour_shifts(apart: ColoursApart) -> ColourShifts:
     """How far the colours of a projector lie apart."""
-    found, errors = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
+    shifts, errors = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
     for axis in range(2):
         seen = apart.px[axis][finite(apart.px[axis])]
         if len(seen) >= FEWEST_PIXELS:
-            found[:, axis] = np.median(seen, axis=0)
+            shifts[:, axis] = np.median(seen, axis=0)
             parts = [np.median(part, axis=0) for part in np.array_split(seen, PARTS)]
             errors[:, axis] = np.std(parts, axis=0, ddof=1) / np.sqrt(PARTS)
-    return ColourShifts(found, errors)
+    return ColourShifts(shifts, errors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

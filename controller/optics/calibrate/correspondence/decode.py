@@ -109,8 +109,8 @@ def decode(
     modulation, state = np.zeros(black.shape, np.float32), np.zeros(black.shape, np.uint8)
     seen = lit | _bright(sums, half)
     # A dark pixel among bright ones can be as dark under the patterns as without them; its contrast has no meaning.
-    wanted = seen & sure & (half > 0)
-    _locate(sums.waves, near[0], near[1], wanted, half, sums.noise, position, modulation, state)
+    usable = seen & sure & (half > 0)
+    _locate(sums.waves, near[0], near[1], usable, half, sums.noise, position, modulation, state)
     _check_order(seen, lit, state, position, WITHOUT_DIAGONAL if plan.computed else LEAST_UNCONTRADICTED)
     valid = lit & ((state & CODED) > 0) & ((state & CONTRADICTED) == 0)
     del sums, near
@@ -225,12 +225,12 @@ def _locate(
             if not wanted[row, column]:
                 continue
             x, y, light = near_x[row, column], near_y[row, column], half[row, column]
-            found = locate_pixel(waves, row, column, x, y, light, noise[row, column], work)
-            state[row, column] = found
+            outcome = locate_pixel(waves, row, column, x, y, light, noise[row, column], work)
+            state[row, column] = outcome
             position[row, column, 0], position[row, column, 1] = work[0, 0], work[0, 1]
             fine = _contrast(waves, 4, row, column) / light
             # A pixel may have been found by the diagonal wave alone where one along an axis is saturated.
-            if found & FINE and np.isfinite(fine):
+            if outcome & FINE and np.isfinite(fine):
                 modulation[row, column] = min(fine, 1.0) ** FINE_TO_COARSE
             else:
                 modulation[row, column] = _contrast(waves, 0, row, column) / light

@@ -139,7 +139,7 @@ def _unsure(
 
     Where hardly anything comes back, one pixel's white may look like light by its noise, but not those around.
     """
-    found = np.empty(white.shape, np.bool_)
+    unsure = np.empty(white.shape, np.bool_)
     squares = separate * separate
     for row in numba.prange(white.shape[0]):
         variance = np.empty(3, np.float32)
@@ -151,8 +151,8 @@ def _unsure(
                 variance[c] = noise / (light * light) if light > 0 else np.float32(np.inf)
             for c in range(3):
                 spread = squares[c, 0] * variance[0] + squares[c, 1] * variance[1] + squares[c, 2] * variance[2]
-                found[row, column, c] = not np.sqrt(spread) < np.float32(MOST_NOISE)
-    return found
+                unsure[row, column, c] = not np.sqrt(spread) < np.float32(MOST_NOISE)
+    return unsure
 
 
 @compiled(parallel=True)
@@ -177,8 +177,8 @@ def _read_bits(
                 axis = axes[c]
                 if axis < 0:
                     continue
-                own = separate[c, 0] * seen[0] + separate[c, 1] * seen[1] + separate[c, 2] * seen[2]
-                above = own - np.float32(0.5)
+                colour = separate[c, 0] * seen[0] + separate[c, 1] * seen[1] + separate[c, 2] * seen[2]
+                above = colour - np.float32(0.5)
                 bit[axis, row, column] ^= above > 0
                 cell[axis, row, column] = 2 * cell[axis, row, column] + bit[axis, row, column]
                 # a bit near its threshold is a border of cells, of which there may be one; a dark colour tells nothing

@@ -72,7 +72,7 @@ def check_map(
     lit = lit_pixels(white)
     known: Mask = channels.finite(known_px)
     covered = float(np.mean(known[lit])) if lit.any() else 0.0
-    agreeing, asked = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
+    agreeing, compared = np.zeros(lit.shape, np.float32), np.zeros(lit.shape, np.float32)
     for pattern in plan.of_kind(PatternKind.COLOUR_TILES):
         side = pattern.tile_cells * CELL_PX
         at = np.nan_to_num(known_px) + np.float32(0.5)
@@ -90,8 +90,8 @@ def check_map(
             off = channels.largest(np.abs((coloured(captures, pattern.name, lit.shape) - black) / white - expected))
         use &= np.isfinite(off)
         agreeing += use & (off < WORST_OFF)
-        asked += use
-    return _judged(agreeing, asked, covered)
+        compared += use
+    return _judged(agreeing, compared, covered)
 
 
 def _judged(agreeing: FloatImage, asked: FloatImage, covered: float) -> MapCheck:

@@ -291,8 +291,8 @@ def make_phase_map(
     """
     slope, known = _slopes(inverse)
     taken = float(np.average(INTERPOLATION_PX2, weights=light)) if interpolated else 0.0
-    own = _without_interpolation(blur_px2.astype(np.float64), slope, taken)
-    spread = _nearest(own.astype(np.float32), blur_valid & known)
+    blur = _without_interpolation(blur_px2.astype(np.float64), slope, taken)
+    spread = _nearest(blur.astype(np.float32), blur_valid & known)
     for k in range(3) if (blur_valid & known).any() else ():
         spread[..., k] = cv2.medianBlur(np.ascontiguousarray(spread[..., k]), STEADY_PX)
     if white is not None and correspondence.as_seen_px is not None:
@@ -334,9 +334,9 @@ def _labels(known: Mask) -> tuple[npt.NDArray[np.int64], FloatImage]:
 
 def _nearest(values: FloatImage, known: Mask) -> FloatImage:
     at, _ = _labels(known)
-    found: FloatImage = values.reshape(-1, 3)[np.maximum(at, 0)]
-    found[at < 0] = np.nan
-    return found
+    nearest: FloatImage = values.reshape(-1, 3)[np.maximum(at, 0)]
+    nearest[at < 0] = np.nan
+    return nearest
 
 
 def _nearest_pixel(
@@ -362,6 +362,6 @@ def _continued(correspondence: Correspondence, slope: Float64, known: Mask) -> F
     dx, dy = column - source % width, row - source // width
     from_px = position.reshape(-1, 2)[source]
     a, b, c, d = np.moveaxis(slope[_nearest_pixel(from_px, known.shape)], -1, 0)
-    whole = np.where(correspondence.valid[..., None], position, np.float32(np.nan))
-    whole[missing] = from_px + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
-    return np.asarray(whole, np.float32)
+    continued = np.where(correspondence.valid[..., None], position, np.float32(np.nan))
+    continued[missing] = from_px + np.stack([a * dx + b * dy, c * dx + d * dy], axis=-1)
+    return np.asarray(continued, np.float32)

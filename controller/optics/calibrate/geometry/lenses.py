@@ -65,8 +65,8 @@ def find_corners(photograph: Grey) -> BoardView | None:
     corners, ids, _, _ = cv2.aruco.CharucoDetector(_board()).detectBoard(photograph)
     if ids is None or corners is None or len(ids) < FEWEST_CORNERS:
         return None
-    known = np.asarray(_board().getChessboardCorners(), dtype=np.float32)[np.asarray(ids).ravel()]
-    return BoardView(known, np.asarray(corners, dtype=np.float32).reshape(-1, 2))
+    board = np.asarray(_board().getChessboardCorners(), dtype=np.float32)[np.asarray(ids).ravel()]
+    return BoardView(board, np.asarray(corners, dtype=np.float32).reshape(-1, 2))
 
 
 def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> CameraIntrinsics:
@@ -173,8 +173,8 @@ def _fit(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
         ) from error
     off = []
     for view, turn, move in zip(views, turns, moves, strict=True):
-        found, _ = cv2.projectPoints(view.board, turn, move, matrix, distortion)
-        off.append(np.asarray(found.reshape(-1, 2) - view.seen_px, dtype=np.float64))
+        corners, _ = cv2.projectPoints(view.board, turn, move, matrix, distortion)
+        off.append(np.asarray(corners.reshape(-1, 2) - view.seen_px, dtype=np.float64))
     lens = np.asarray(distortion, dtype=np.float64).ravel()
     return _LensFit(
         views,

@@ -47,10 +47,10 @@ def fundamental(camera_px: Float64, projector_px: Float64) -> tuple[Float64, Mas
     """
     if len(camera_px) < _FEWEST:
         return None
-    found, inliers = _sought(camera_px, projector_px)
-    if found is None or found.shape != (3, 3) or inliers is None or int(inliers.sum()) < _FEWEST:
+    matrix, inliers = _sought(camera_px, projector_px)
+    if matrix is None or matrix.shape != (3, 3) or inliers is None or int(inliers.sum()) < _FEWEST:
         return None
-    return found.astype(np.float64), inliers.ravel().astype(bool)
+    return matrix.astype(np.float64), inliers.ravel().astype(bool)
 
 
 def _sought(camera_px: Float64, projector_px: Float64) -> tuple[Any, Any]:
@@ -210,10 +210,10 @@ def solve_pair(problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, in
     focal = float(np.exp(problem.camera_prior[0]))
     # MAGSAC measures in both images with one threshold: bring the camera's pixels to the projector's size
     shrink = float(np.sqrt(_spread(observed) / max(_spread(camera_px), 1e-9)))
-    found = fundamental(camera_px * shrink, observed)
-    if found is None:
+    fit = fundamental(camera_px * shrink, observed)
+    if fit is None:
         return None
-    matrix, fits = found[0] @ np.diag([shrink, shrink, 1.0]), found[1]
+    matrix, fits = fit[0] @ np.diag([shrink, shrink, 1.0]), fit[1]
     noise = 1.4826 * float(np.median(epipolar_distance_px(matrix, camera_px[fits], observed[fits])))
     inliers = np.zeros(len(problem.seen), dtype=np.bool_)
     inliers[seen[fits]] = True
@@ -271,9 +271,9 @@ def triangulated(problem: ba.AdjustmentProblem, state: ba.AdjustmentState) -> Fl
     total, weight = np.zeros(len(xy)), np.zeros(len(xy))
     for n in range(problem.seen.shape[1]):
         rays = ba.undistorted(state.intrinsics[n], problem.projector_px[:, n])
-        own = inverse_depths(xy, rays, state.rotations[n], state.centres[n])
+        by_projector = inverse_depths(xy, rays, state.rotations[n], state.centres[n])
         usable = np.where(problem.seen[:, n], np.sum(state.centres[n] ** 2), 0.0)
-        total, weight = total + usable * own, weight + usable
+        total, weight = total + usable * by_projector, weight + usable
     return np.asarray(np.where(weight > 0, total / np.maximum(weight, 1e-300), np.nan))
 
 

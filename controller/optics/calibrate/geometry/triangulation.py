@@ -74,8 +74,8 @@ def inverse_depth_map(
     for row in numba.prange(rows):
         for column in range(columns):
             ray, here = rays[row, column], (slopes[:, row, column], seen[:, row, column])
-            found = _inverse_depth(ray, here, focal_px, rotations, turned, noise_px)
-            inverse[row, column], residual[row, column], leverage[row, column] = found
+            fit = _inverse_depth(ray, here, focal_px, rotations, turned, noise_px)
+            inverse[row, column], residual[row, column], leverage[row, column] = fit
     return inverse, residual, leverage
 
 

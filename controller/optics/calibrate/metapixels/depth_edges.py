@@ -156,16 +156,16 @@ def _owners(position: FloatImage, near: npt.NDArray[np.int32]) -> npt.NDArray[np
     for row in range(rows):
         for column in range(columns):
             own[row, column] = _looked_up(position[row, column, 0], position[row, column, 1], near)
-    found = own.copy()
+    widened = own.copy()
     for row in range(rows):
         for column in range(columns):
             if own[row, column] < 0:
                 continue
             for r in range(max(row - BESIDE_PX, 0), min(row + BESIDE_PX + 1, rows)):
                 for c in range(max(column - BESIDE_PX, 0), min(column + BESIDE_PX + 1, columns)):
-                    if found[r, c] < 0 and not np.isfinite(position[r, c, 0]):
-                        found[r, c] = own[row, column]
-    return found
+                    if widened[r, c] < 0 and not np.isfinite(position[r, c, 0]):
+                        widened[r, c] = own[row, column]
+    return widened
 
 
 @compiled()

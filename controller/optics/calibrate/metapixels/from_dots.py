@@ -268,8 +268,8 @@ def fit_picture(
         quality = fit_gaussian(image, black, white, at, size, at, size, cut, fit)
         if quality >= 0 and _changed(at, size, fit):
             near = np.array([fit[0], fit[1]], np.float32)
-            found = np.array([fit[2], fit[3], fit[4]], np.float32)
-            quality = fit_gaussian(image, black, white, at, size, near, found, cut, fit)
+            fitted_px2 = np.array([fit[2], fit[3], fit[4]], np.float32)
+            quality = fit_gaussian(image, black, white, at, size, near, fitted_px2, cut, fit)
         if quality >= 0:
             status[row, column] = _FITTED
             centre[row, column, 0], centre[row, column, 1] = fit[0], fit[1]

@@ -285,8 +285,8 @@ def _add_row(
         p, q = (d * x[k] - b * y) / area, (a * y - c * x[k]) / area
         u, v = across[k] - column, down[k] - row
         near = abs(u - p) + abs(v - q) <= MOST_OFF_PX + MOST_OFF_SHARE * (abs(p) + abs(q))
-        found = seen[k] & near
-        u, v = u if found else p, v if found else q
+        measured = seen[k] & near
+        u, v = u if measured else p, v if measured else q
         far = pp * u * u + 2 * pq * u * v + qq * v * v
         # exp(-far / 2) as (exp(-far / 128))^64, by a series that is good to 1e-13
         t = -far / 128
@@ -297,7 +297,7 @@ def _add_row(
         one += share
         of_x += share * x[k]
         of_xx += share * x[k] * x[k]
-        missing += 0.0 if found else share
+        missing += 0.0 if measured else share
     return one, of_x, of_xx, missing
 
 

@@ -41,13 +41,13 @@ def pixel_status(metapixels: Metapixels, white: FloatImage) -> npt.NDArray[np.ui
     ``white`` (camera rows, columns, 3): the projector's white image, NaN where every exposure was saturated
     """
     valid = metapixels.valid
-    found = np.full(valid.shape, PixelStatus.OUTSIDE, np.uint8)
-    found[~valid & _between(valid)] = PixelStatus.SHADOW
-    found[valid] = PixelStatus.GOOD
-    found[valid & (_slant(metapixels) > STEEPEST)] = PixelStatus.GRAZING
+    status = np.full(valid.shape, PixelStatus.OUTSIDE, np.uint8)
+    status[~valid & _between(valid)] = PixelStatus.SHADOW
+    status[valid] = PixelStatus.GOOD
+    status[valid & (_slant(metapixels) > STEEPEST)] = PixelStatus.GRAZING
     unknown: Mask = np.asarray(~channels.finite(white))
-    found[_on(fill_holes(metapixels), unknown)] = PixelStatus.SATURATED
-    return found
+    status[_on(fill_holes(metapixels), unknown)] = PixelStatus.SATURATED
+    return status
 
 
 def status_counts(found: npt.NDArray[np.uint8]) -> dict[str, int]:

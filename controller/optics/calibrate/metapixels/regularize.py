@@ -141,12 +141,12 @@ def fill_holes(metapixels: Metapixels, *, widest: int = REACH) -> Metapixels:
 def _regularize(centre: Float64, valid: Mask, limit: float, least_gain: float, most_moves: int) -> int:
     rows, columns = valid.shape
     beta = np.full(rows * columns, -np.inf)
-    found = np.empty((8, 3))
+    around_px = np.empty((8, 3))
     near = np.empty(8, np.int64)
     for row in range(rows):
         for column in range(columns):
-            if valid[row, column] and _neighbours(centre, valid, row, column, limit, found, near):
-                beta[row * columns + column] = _gain(centre[row, column], found)
+            if valid[row, column] and _neighbours(centre, valid, row, column, limit, around_px, near):
+                beta[row * columns + column] = _gain(centre[row, column], around_px)
     heap, place = rebuild(beta)
     moves = 0
     while heap[0] > 0 and moves < most_moves:
@@ -154,17 +154,17 @@ def _regularize(centre: Float64, valid: Mask, limit: float, least_gain: float, m
         if beta[pixel] <= least_gain:
             break
         row, column = pixel // columns, pixel % columns
-        if not _neighbours(centre, valid, row, column, limit, found, near):
+        if not _neighbours(centre, valid, row, column, limit, around_px, near):
             continue
-        centre[row, column] = _mean(found)
+        centre[row, column] = _mean(around_px)
         moves += 1
         around = near.copy()
-        beta[pixel] = _gain(centre[row, column], found)
+        beta[pixel] = _gain(centre[row, column], around_px)
         update(heap, place, beta, pixel)
         for other in around:
             r, c = other // columns, other % columns
-            if _neighbours(centre, valid, r, c, limit, found, near):
-                beta[other] = _gain(centre[r, c], found)
+            if _neighbours(centre, valid, r, c, limit, around_px, near):
+                beta[other] = _gain(centre[r, c], around_px)
                 update(heap, place, beta, int(other))
     return moves
 

@@ -112,9 +112,9 @@ def measure_tiles(
         light = coloured(captures, pattern.name, black.shape[:2])[inside] - black[inside]
         away = np.zeros((number, 3))
         if indirect is not None:
-            known = indirect.of(shown)[inside]
-            light -= known
-            away = _sums(known, which, number)
+            thrown_light = indirect.of(shown)[inside]
+            light -= thrown_light
+            away = _sums(thrown_light, which, number)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = (_sums(light, which, number) / total)[used]
             variance = NOISE * (np.maximum(ratio, 0) + ratio**2 + 0.02) * full / total[used] + SYSTEMATIC**2

@@ -93,21 +93,21 @@ def _shares(indirect: FloatImage, paint: FloatImage, veil: FloatImage, known: Ma
     """
     images = [cv2.blur(np.where(known[..., None], one, 0).astype(np.float32), (3, 3)) for one in (indirect, paint)]
     inside = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    found = []
+    shares = []
     for row in range(0, known.shape[0] - BLOCK_PX + 1, BLOCK_PX):
         for column in range(0, known.shape[1] - BLOCK_PX + 1, BLOCK_PX):
             here = np.s_[row : row + BLOCK_PX, column : column + BLOCK_PX]
             use = inside[here]
             if use.mean() < WHOLE:
                 continue
-            light, own = (image[here][use].astype(np.float64) for image in images)
-            middle = own.mean(axis=0)
-            varied = own - middle
+            light, reflectance = (image[here][use].astype(np.float64) for image in images)
+            middle = reflectance.mean(axis=0)
+            varied = reflectance - middle
             slope = np.sum(varied * light, axis=0) / np.maximum(np.sum(varied**2, axis=0), 1e-30)
             bare = light.mean(axis=0) - slope * middle
             contrast = varied.std(axis=0) > LEAST_CONTRAST * middle
-            found.append((bare / np.maximum(veil[here][use].mean(axis=0), 1e-30))[contrast])
-    return np.concatenate(found) if found else np.zeros(0)
+            shares.append((bare / np.maximum(veil[here][use].mean(axis=0), 1e-30))[contrast])
+    return np.concatenate(shares) if shares else np.zeros(0)
 
 
 __all__ = ["spread_by_lens", "veiled", "veiling_glare"]

@@ -116,7 +116,7 @@ def _groups(
 ) -> Sequence[Sequence[tuple[float, float]]]:
     """What the blocks of each group say, as ``_agreed``."""
     brightness = [_brightness(white) for white in whites]
-    found = defaultdict[tuple[int, int], list[tuple[float, float]]](list)
+    groups = defaultdict[tuple[int, int], list[tuple[float, float]]](list)
     for here in _on_one_surface(depth_m):
         own = brightness[n][here]
         if not _may_be_an_edge(own):
@@ -127,8 +127,8 @@ def _groups(
         others = [m for m in range(len(whites)) if m != n and _shows_an_edge(own, brightness[m][here])]
         sums = [each for m in others for each in _sums(whites[n][here], whites[m][here], own > UNLIT, parts, here)]
         if len(sums) > 1 and (agreed := _agreed(sums)) is not None:
-            found[here[0].start // GROUP_PX, here[1].start // GROUP_PX].append(agreed)
-    return list(found.values())
+            groups[here[0].start // GROUP_PX, here[1].start // GROUP_PX].append(agreed)
+    return list(groups.values())
 
 
 def _agreed(sums: Sequence[tuple[Float64, Float64]]) -> tuple[float, float] | None:

@@ -43,8 +43,8 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
     known = mask & (channels.smallest(falling) > FAINTEST * float(np.median(falling[mask]) if mask.any() else 1.0))
     if not known.any():
         return np.full(calibration.black.shape, np.nan, np.float32)
-    found = np.divide(light, falling, out=np.full(light.shape, np.nan, np.float32), where=known[..., None])
-    return np.asarray(found / np.percentile(found[known], WHITEST), np.float32)
+    reflectance = np.divide(light, falling, out=np.full(light.shape, np.nan, np.float32), where=known[..., None])
+    return np.asarray(reflectance / np.percentile(reflectance[known], WHITEST), np.float32)
 
 
 def falling_light(geometry: Geometry) -> list[FloatImage]:
@@ -114,8 +114,8 @@ def gloss_strength(calibration: Calibration, geometry: Geometry | None) -> float
     # a median: most pixels mirror no projector
     seen /= np.median(seen / seen[:1], axis=1, keepdims=True)
     seen = channels.mean(seen / np.percentile(seen.mean(axis=0), 99, axis=0))
-    found = [_along(_against(lobes, n), _against(seen, n)) for n in range(len(parts))]
-    strength, correlation = np.median(found, axis=0)
+    fits = [_along(_against(lobes, n), _against(seen, n)) for n in range(len(parts))]
+    strength, correlation = np.median(fits, axis=0)
     if correlation < LEAST_CORRELATION:
         return 0.0
     return float(max(strength * 8 / (SHARPNESS + 8), 0.0))
@@ -145,12 +145,12 @@ def _mirrored(geometry: Geometry, use: Mask) -> Float64:
     """(projectors, pixels) cosine between the normal and the middle of the directions to lens and camera."""
     points, normals = geometry.points_m[use].astype(np.float64), geometry.normals[use].astype(np.float64)
     seen = -points / np.linalg.norm(points, axis=1, keepdims=True)
-    found = []
+    cosines = []
     for projector in geometry.projectors:
         towards = -projector.rotation.T @ projector.translation_m - points
         between = towards / np.linalg.norm(towards, axis=1, keepdims=True) + seen
-        found.append(np.abs(np.sum(between * normals, axis=1)) / np.linalg.norm(between, axis=1))
-    return np.asarray(np.clip(found, 0, 1), np.float64)
+        cosines.append(np.abs(np.sum(between * normals, axis=1)) / np.linalg.norm(between, axis=1))
+    return np.asarray(np.clip(cosines, 0, 1), np.float64)
 
 
 def _against(values: Float64, n: int) -> Float64:

@@ -229,11 +229,11 @@ def shown_contrast(radiometry: Radiometry, encoded_with: Float64) -> Float64:
     ``radiometry``: the projector as it is; ``encoded_with`` (3, 256): the response by which device values were chosen
     """
     angle = 2 * np.pi * np.arange(720) / 720
-    asked = 0.5 + 0.5 * np.cos(angle)
+    wave = 0.5 + 0.5 * np.cos(angle)
     levels = np.arange(256.0)
     light = np.stack(
         [
-            np.interp(np.interp(asked, used, levels), levels, true)
+            np.interp(np.interp(wave, used, levels), levels, true)
             for used, true in zip(encoded_with, radiometry.response, strict=True)
         ]
     )
@@ -308,12 +308,12 @@ def _light_around(image: FloatImage) -> FloatImage:
 
 def _amplitude(images: Iterable[FloatImage], steps: Sequence[Pattern]) -> tuple[FloatImage, FloatImage]:
     """Cosine and sine part of a sinusoid's steps."""
-    found: list[FloatImage] = []
+    parts: list[FloatImage] = []
     for image, step in zip(images, steps, strict=True):
-        found = found or [np.zeros(image.shape, np.float32) for _ in range(2)]
+        parts = parts or [np.zeros(image.shape, np.float32) for _ in range(2)]
         by = np.float32(2 / len(steps) * np.cos(step.phase_rad)), np.float32(-2 / len(steps) * np.sin(step.phase_rad))
-        _add_wave(image.reshape(-1), *by, *(part.reshape(-1) for part in found))
-    along, across = found
+        _add_wave(image.reshape(-1), *by, *(part.reshape(-1) for part in parts))
+    along, across = parts
     return along, across
 
 
@@ -333,8 +333,8 @@ def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
     if at.size < 10 * len(images):
         return np.ones(len(images))
     at = at[:: max(1, at.size // SOME_PIXELS)]
-    wanted = white.reshape(-1, 3)[at].astype(np.float64)
-    equations = np.stack([(i.reshape(-1, 3)[at] / wanted).ravel() for i in images], axis=1)
+    full = white.reshape(-1, 3)[at].astype(np.float64)
+    equations = np.stack([(i.reshape(-1, 3)[at] / full).ravel() for i in images], axis=1)
     return np.asarray(np.linalg.lstsq(equations, np.full(equations.shape[0], len(images) / 2), rcond=None)[0])
 
 

@@ -92,10 +92,10 @@ def measure_spread(
     use = finite(position_px) & (light > FAINTEST * np.percentile(light, 99))
     if not use.any() or not blur_px > 0:
         return None
-    found = list(_evidence(captures, plan, position_px, light, use, blur_px))
-    if len(found) < FEWEST:
+    evidence = list(_evidence(captures, plan, position_px, light, use, blur_px))
+    if len(evidence) < FEWEST:
         return None
-    agreed = _agreed(found)
+    agreed = _agreed(evidence)
     distance_px = float(DISTANCES_PX[agreed.best])
     inside = 0 < agreed.best < len(DISTANCES_PX) - 1 and distance_px > STEEPEST * blur_px
     if not inside or agreed.share < SURE * agreed.error or agreed.varied > MOST_VARIED * agreed.share:
@@ -137,22 +137,22 @@ def _weighted_median(values: Float64, weights: Float64) -> float:
 
 def _without_blur(share: float, distance_px: float, shown_px: float) -> float:
     """The share whose slope, widened by the blur, is that of ``share``; ``shown_px``: blur with the spread in it."""
-    found = share
+    narrow = share
     for _ in range(ROUNDS):
-        spread = SurfaceSpread(min(found, 1.0), distance_px, distance_px)
+        spread = SurfaceSpread(min(narrow, 1.0), distance_px, distance_px)
         fine, coarse = FINE_FREQUENCY, 1 / PERIOD_PX
         lost = np.log(contrast_left(spread, coarse) / contrast_left(spread, fine))
         variance = max(shown_px**2 - lost / (2 * np.pi**2 * (fine**2 - coarse**2)), 0.0)
-        found = share * float(np.exp(-variance / (2 * distance_px**2)))
-    return found
+        narrow = share * float(np.exp(-variance / (2 * distance_px**2)))
+    return narrow
 
 
-def typical_spread(found: Sequence[SurfaceSpread | None]) -> SurfaceSpread | None:
+def typical_spread(by_projector: Sequence[SurfaceSpread | None]) -> SurfaceSpread | None:
     """Of the surface, from what each projector shows of it; None unless most of them do."""
-    known = [one for one in found if one is not None]
-    if 2 * len(known) <= len(found):
+    measured = [one for one in by_projector if one is not None]
+    if 2 * len(measured) <= len(by_projector):
         return None
-    share, camera, projector = np.median([astuple(one) for one in known], axis=0)
+    share, camera, projector = np.median([astuple(one) for one in measured], axis=0)
     return SurfaceSpread(float(share), float(camera), float(projector))
 
 

@@ -53,13 +53,13 @@ def uneven_light(tiles: TileMeasurements, residual: Float64, weight: Float64) ->
 
     ``weight`` (tiles, 3): inverse variance of each tile's own part; 0 for what does not count
     """
-    found = np.zeros_like(residual)
+    shared_light = np.zeros_like(residual)
     for photograph in range(int(tiles.photograph.max(initial=-1)) + 1):
-        own = np.flatnonzero(tiles.photograph == photograph)
-        variance = 1 / np.maximum(weight[own], LEAST_KEPT * tiles.weight[own])
-        shared = _Shared(tiles.place[own], UNEVEN * tiles.indirect[own])
-        found[own] = shared.times(_solved(shared, variance, residual[own]))
-    return found
+        rows = np.flatnonzero(tiles.photograph == photograph)
+        variance = 1 / np.maximum(weight[rows], LEAST_KEPT * tiles.weight[rows])
+        shared = _Shared(tiles.place[rows], UNEVEN * tiles.indirect[rows])
+        shared_light[rows] = shared.times(_solved(shared, variance, residual[rows]))
+    return shared_light
 
 
 class _Shared:
@@ -91,14 +91,14 @@ def _solved(shared: _Shared, variance: Float64, residual: Float64) -> Float64:
         values = x.reshape(shape)
         return (shared.times(values) + variance * values).ravel()
 
-    found, _ = cg(
+    solution, _ = cg(
         LinearOperator((size, size), matvec=whole, dtype=np.float64),
         residual.ravel(),
         rtol=UNEVEN_CONVERGED,
         maxiter=MOST_TURNS,
         M=LinearOperator((size, size), matvec=lambda x: scale * x, dtype=np.float64),
     )
-    return np.asarray(found.reshape(shape), np.float64)
+    return np.asarray(solution.reshape(shape), np.float64)
 
 
 LIKELY: Final = 0.3
@@ -127,7 +127,7 @@ def fit_paint_mixing(tiles: TileMeasurements, shown: Float64, weight: Float64, m
     mixing : (3, 3) of all paints together, which B is near to where nothing else is known
     """
     quotient = colour_of(tiles.white)
-    found = np.zeros((3, 3, 3))
+    paint = np.zeros((3, 3, 3))
     others = shown[:, :2] - shown[:, 2:]
     for channel in range(3):
         root = np.sqrt(weight[:, channel])
@@ -139,9 +139,9 @@ def fit_paint_mixing(tiles: TileMeasurements, shown: Float64, weight: Float64, m
         prior = np.eye(6) * np.sqrt(weight[:, channel].mean()) * LIKELY_NOISE / LIKELY
         solved = np.linalg.lstsq(np.concatenate([equations, prior]), np.concatenate([left, np.zeros(6)]), rcond=None)[0]
         two = (before + solved).reshape(3, 2).T  # projector channel, channel of white
-        found[channel, :2] = two
-        found[channel, 2] = (np.arange(3) == channel) - two.sum(axis=0)
-    return found
+        paint[channel, :2] = two
+        paint[channel, 2] = (np.arange(3) == channel) - two.sum(axis=0)
+    return paint
 
 
 def paint_light(tiles: TileMeasurements, shown: Float64, paint: Float64) -> Float64:
@@ -317,8 +317,8 @@ def _fit_segment(tiles: TileMeasurements, weight: Float64, fit: RadiometryFit) -
     common = own.min(axis=1, keepdims=True) - own @ fit.mixing.T
     around = (fit.mixing @ _shown(tiles, fit).mean(axis=0)) * fit.stray
     off = (tiles.ratio - around) / (1 - fit.stray) - own @ fit.mixing.T
-    found = float(np.sum(weight * common * off) / np.sum(weight * common**2))
-    fit.segment = float(np.clip(found, 0.0, MOST_SEGMENT))
+    segment = float(np.sum(weight * common * off) / np.sum(weight * common**2))
+    fit.segment = float(np.clip(segment, 0.0, MOST_SEGMENT))
 
 
 def _fit_mixing(tiles: TileMeasurements, weight: Float64, fit: RadiometryFit, *, with_stray: bool) -> None:
@@ -409,12 +409,12 @@ def _basis(power: float) -> Float64:
 def _gamma_of(response: Float64) -> Float64:
     """The power that each response is nearest to."""
     x = np.arange(256) / 255
-    found = np.full(3, FIRST_GAMMA)
+    gamma = np.full(3, FIRST_GAMMA)
     for channel, curve in enumerate(response):
         middle = (curve > 0.02) & (curve < 0.98)
         if middle.any():
-            found[channel] = np.clip(np.median(np.log(curve[middle]) / np.log(x[middle])), 0.5, 4)
-    return found
+            gamma[channel] = np.clip(np.median(np.log(curve[middle]) / np.log(x[middle])), 0.5, 4)
+    return gamma
 
 
 def _scatter(residual: Float64) -> float:

@@ -125,7 +125,7 @@ def coarse_waves(
     bright = np.percentile(white[lit][::7], 99, axis=0)
     table = _table()
     change = _changes(table)
-    asked = table @ ASKED[:, None]
+    sine = table @ ASKED[:, None]
     waves = []
     for axis, prefix in enumerate(COARSE):
         steps = plan.sinusoids(prefix)
@@ -146,7 +146,7 @@ def coarse_waves(
         )
         apart = 1 / OVERSAMPLED
         ahead, behind = (
-            np.stack([_levels(asked, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
+            np.stack([_levels(sine, place[..., axis] - shift + step, variance) for shift in shifts], axis=2)[..., 0]
             for step in (apart, -apart)
         )
         values = _values((device_frame(step, plan.size_px, shown_with) for step in steps), shifts, axis)

@@ -114,8 +114,8 @@ def aim_overview(picture: FloatImage, aim: Aim) -> ByteImage:
     wide = max(1, round(max(image.shape) / 400))
     for number, part in enumerate(aim.lit):
         square = np.ones((4 * wide + 1, 4 * wide + 1), np.uint8)
-        whole = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_CLOSE, square)
-        lines, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        closed = cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_CLOSE, square)
+        lines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(image, lines, -1, EDGES[number % len(EDGES)], wide)
     return image
 

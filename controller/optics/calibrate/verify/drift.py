@@ -161,17 +161,17 @@ def find_drift(
     black = np.where(np.isfinite(seen.black), seen.black, calibration.black).astype(np.float32)
     patterns = [seen.patterns[name] - black for name in names]
     parts = list(zip(range(len(names)), calibration.projectors, frames, strict=True))
-    found = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
-    camera = _camera(calibration, found, seen)
+    drifts = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
+    camera = _camera(calibration, drifts, seen)
     culprit = DriftCause.NONE if camera.found else DriftCause.UNKNOWN
-    if camera.moved(STILL_PX) and not _explained_by_projectors(camera, found):
+    if camera.moved(STILL_PX) and not _explained_by_projectors(camera, drifts):
         back = np.asarray(np.linalg.inv(camera.matrix), np.float64)
         patterns = [warp(pattern, back) for pattern in patterns]
-        found = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
-        camera = _camera(calibration, found, seen)
-        culprit = _culprit(camera, found, light, calibration)
+        drifts = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
+        camera = _camera(calibration, drifts, seen)
+        culprit = _culprit(camera, drifts, light, calibration)
     share, ratio = _ambient(calibration, seen)
-    return Drift(tuple(found), _backwards(camera), culprit, share, ratio)
+    return Drift(tuple(drifts), _backwards(camera), culprit, share, ratio)
 
 
 def _explained_by_projectors(camera: Motion, found: Sequence[ProjectorDrift]) -> bool:
@@ -298,8 +298,8 @@ def _camera(calibration: Calibration, found: Sequence[ProjectorDrift], seen: Dri
     near = cv2.dilate(calibration.object_mask.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     known = near & finite(seen.white)
     pictures = [np.where(known[:, :, None], image, 0).astype(np.float32) for image in (expected, seen.white)]
-    whole = _shrunk(known.astype(np.float32), factor) > 0.99
-    motion = register(_shrunk(pictures[0], factor), _shrunk(pictures[1], factor), whole.astype(np.float32))
+    inside = _shrunk(known.astype(np.float32), factor) > 0.99
+    motion = register(_shrunk(pictures[0], factor), _shrunk(pictures[1], factor), inside.astype(np.float32))
     return motion if factor == 1 else _enlarged(motion, factor)
 
 
@@ -317,8 +317,8 @@ def _backwards(motion: Motion) -> Motion:
 
 def _shrunk(image: FloatImage, factor: int) -> FloatImage:
     rows, columns = (length // factor for length in image.shape[:2])
-    whole = image[: rows * factor, : columns * factor]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+    cropped = image[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _enlarged(motion: Motion, factor: int) -> Motion:
@@ -365,18 +365,18 @@ def update_positions(arrays: Arrays, matrix: Float64) -> dict[str, npt.NDArray[A
     back = np.linalg.inv(matrix)
     x, y = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
     before = _mapped(np.asarray(back, np.float64), np.stack([x, y], axis=2))
-    found = {}
+    updated = {}
     for name, array in arrays.items():
         if name in ON_PROJECTOR:
-            found[name] = _mapped(matrix, array.astype(np.float64)).astype(array.dtype)
+            updated[name] = _mapped(matrix, array.astype(np.float64)).astype(array.dtype)
         elif array.shape[:2] == (rows, columns):
-            found[name] = _taken(array, before, extend=name == "centre_px")
+            updated[name] = _taken(array, before, extend=name == "centre_px")
         else:
-            found[name] = array
-    if "valid" in found:
-        known = channels.finite(found["centre_px"])
-        found["valid"] = found["valid"] & known
-    return found
+            updated[name] = array
+    if "valid" in updated:
+        known = channels.finite(updated["centre_px"])
+        updated["valid"] = updated["valid"] & known
+    return updated
 
 
 def _mapped(matrix: Float64, at: Float64) -> Float64:

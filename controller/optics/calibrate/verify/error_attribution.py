@@ -98,8 +98,8 @@ def attribute_error(
     if indirect is not None:
         near_indirect = _near(np.where(lit, channels.total(indirect * indirect), 0))
         much = near_indirect > INDIRECT_SHARE**2 * near_power
-        own = _near(_without_lamp(light_seen, predicted, lit & measured)) > EXPLAINED * near_error
-        label(ErrorCause.INDIRECT, much & own & (near_error < near_indirect), bad & (labels != ErrorCause.DARK))
+        by_lamp = _near(_without_lamp(light_seen, predicted, lit & measured)) > EXPLAINED * near_error
+        label(ErrorCause.INDIRECT, much & by_lamp & (near_error < near_indirect), bad & (labels != ErrorCause.DARK))
     label(ErrorCause.MOVED, (moved > EXPLAINED) & (moved > dimmed), bad)
     label(ErrorCause.EDGE, _edges(x, y, lit), bad)
     bright = channels.smallest(part.white) > UNDECODED_SHARE * float(np.percentile(part.white, 99.9))
@@ -134,9 +134,9 @@ def _places(light: TransportModel, n: int, shape: tuple[int, ...]) -> tuple[Floa
     across, down = (axis / max(rows, columns) for axis in np.meshgrid(np.arange(columns), np.arange(rows)))
     ramps = np.stack([across, down, across**2 + down**2], axis=2).astype(np.float32)
     sums = [channels.total(light.forward_part(n, np.repeat(ramps[:, :, k : k + 1], 3, axis=2))) for k in range(3)]
-    whole = channels.total(light.forward_part(n, np.ones((rows, columns, 3), np.float32)))
+    white = channels.total(light.forward_part(n, np.ones((rows, columns, 3), np.float32)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        x, y, both = (np.where(whole > 0, one / whole, np.nan) * max(rows, columns) ** power
+        x, y, both = (np.where(white > 0, one / white, np.nan) * max(rows, columns) ** power
                       for one, power in zip(sums, (1, 1, 2), strict=True))  # fmt: skip
     spread = np.sqrt(np.maximum(np.nan_to_num(both - x**2 - y**2), 0) / 2)
     return x.astype(np.float32), y.astype(np.float32), spread.astype(np.float32)

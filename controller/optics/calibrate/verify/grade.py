@@ -76,12 +76,15 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
             what="The photograph of the random pattern shows no light where the calibration expects it.",
             remedy="Check that lamps and shutters are open and that the pattern was shown, and verify again.",
         )
-    both, own = channels.products(seen, light_predicted), channels.products(light_predicted, light_predicted)
-    gain = both / np.maximum(own, 1e-30)
+    both, predicted_square = (
+        channels.products(seen, light_predicted),
+        channels.products(light_predicted, light_predicted),
+    )
+    gain = both / np.maximum(predicted_square, 1e-30)
     off = light_predicted - seen
     error = channels.total(np.multiply(off, off, out=off))
     relative = float(np.sqrt(error.sum() / light))
-    without = float(np.sqrt(max(float(np.sum(gain * gain * own - 2 * gain * both)) + light, 0.0) / light))
+    without = float(np.sqrt(max(float(np.sum(gain * gain * predicted_square - 2 * gain * both)) + light, 0.0) / light))
     red, green, blue = (float(value) for value in gain)
     error_map = _error_map(error, per_pixel, use)
     return Verification(relative, (red, green, blue), without, error_map, grade_of(relative))

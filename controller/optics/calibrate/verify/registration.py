@@ -124,8 +124,8 @@ class _Frame:
         """H in pixels."""
         to = np.array([[1 / self.half, 0, -self.middle[0] / self.half], [0, 1 / self.half, -self.middle[1] / self.half],
                        [0, 0, 1]])  # fmt: skip
-        found = np.linalg.inv(to) @ _small(p) @ to
-        return np.asarray(found / found[2, 2])
+        scaled = np.linalg.inv(to) @ _small(p) @ to
+        return np.asarray(scaled / scaled[2, 2])
 
 
 def _small(p: Float64) -> Float64:
