@@ -115,6 +115,7 @@ class PatternPlan:
         return len(self.patterns)
 
     def of_kind(self, kind: PatternKind) -> tuple[Pattern, ...]:
+        """The patterns of one kind, in the order in which they are shown."""
         return tuple(pattern for pattern in self.patterns if pattern.kind is kind)
 
     def gray(self, axis: int) -> tuple[Pattern, ...]:

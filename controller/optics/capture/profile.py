@@ -203,7 +203,7 @@ def _fit(rows: Float64) -> tuple[float, float, np.ndarray[tuple[int], np.dtype[n
         model = np.maximum(shot * rows[:, 0] + read2 * rows[:, 1], SMALLEST)
         kept = np.abs(rows[:, 2] / model - 1) < OUTLIER * spread
         if np.count_nonzero(kept) < FEWEST_BLOCKS:
-            # The model is still far off: take the typical block as a scale and go on with all of them.
+            # The model is still far off: take the typical block as a scale and continue with all of them.
             kept[:] = True
             model *= max(float(np.median(rows[:, 2] / model)), SMALLEST)
     return shot, read2, kept

@@ -45,6 +45,7 @@ class MapCheck:
 
     @property
     def holds(self) -> bool:
+        """Whether the map may still stand for a code."""
         return self.agreeing >= LEAST_AGREEING and self.astray <= MOST_ASTRAY and self.covered >= LEAST_COVERED
 
 

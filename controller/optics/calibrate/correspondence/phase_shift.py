@@ -25,7 +25,7 @@ DARK, CODED, FINE, CONTRADICTED = 0, 1, 2, 4
 """States of a pixel, added up: nothing; coarse phase and Gray code agree; fine phases used; fine phases disagree."""
 
 COARSE_SYSTEMATIC_PX = 0.35
-"""Systematic error of the coarse phase besides noise (light from elsewhere, response), for the choice of a fringe."""
+"""Error of the coarse phase apart from noise (light from elsewhere, response), for the choice of a fringe."""
 COARSE_FLOOR_PX = 0.10
 """The same error in the final weights, after the choice."""
 FINE_SYSTEMATIC_PX = 0.12

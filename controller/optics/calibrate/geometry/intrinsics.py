@@ -52,7 +52,7 @@ class CameraIntrinsics:
         distance_rel_sigma: float = 0.01,
         distances: tuple[MeasuredDistance, ...] = (),
     ) -> CameraPrior:
-        """What the geometry starts from, with what was measured besides."""
+        """What the geometry starts from, and what else was measured."""
         focal, cx, cy, k1 = (float(sigma) for sigma in self.sigmas)
         return CameraPrior(
             focal_length_px=self.focal_px,

@@ -57,7 +57,7 @@ def _sought(camera_px: Float64, projector_px: Float64) -> tuple[Any, Any]:
     """What OpenCV finds; None where it finds nothing.
 
     Its MAGSAC++ (4.14) stops with an internal error when a random sample gives no model, on sound points, too; with
-    another sample it goes on. Where none helps, RANSAC, which has no such fault, says what there is.
+    another sample it continues. Where none helps, RANSAC, which has no such fault, says what there is.
     """
     for seed in range(_SEEDS):
         try:

@@ -24,7 +24,7 @@ NOISE = 1e-4
 DOUBT = 0.1
 """Standard deviation of a tile's indirect light, relative: dark tiles count where little of their light is indirect."""
 SYSTEMATIC = 0.002
-"""Of full scale: differences from tile to tile besides noise."""
+"""Standard deviation of tiles apart from noise, of full scale."""
 
 
 @dataclass(frozen=True, slots=True)

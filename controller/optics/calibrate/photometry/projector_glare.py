@@ -30,7 +30,7 @@ SHADOW: Final = 0.25
 LEAST_LIT: Final = 0.15
 """Of a projector's brightest white: the other projector lights the whole block."""
 UNLIT: Final = 0.02
-"""Of a projector's brightest white: below it a pixel is in the shadow, whose place in the picture nobody knows."""
+"""Of a projector's brightest white: below it a pixel is in the shadow, whose place in the picture is not known."""
 EDGE_PERCENT: Final = (5, 95)
 WIDEST_EDGE: Final = 0.3
 """Of a block: pixels between a quarter and three quarters of the edge's light. Where a surface turns away from the

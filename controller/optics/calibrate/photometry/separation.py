@@ -119,7 +119,7 @@ AROUND: Final = (15, 15)
 """Out of focus the fine contrast is below a pixel's noise, but blur changes slowly there."""
 NOISE_WINDOW: Final = (7, 7)
 FLOOR: Final = 0.004
-"""Standard deviation of a pixel's share besides noise."""
+"""Standard deviation of a pixel's share apart from noise."""
 RADIUS_PX: Final = 4
 LIKE_SIGMAS: Final = 3.0
 """Neighbours whose shares differ by more than so many standard deviations see other light."""

@@ -196,6 +196,7 @@ class RadiometryFit:
 
     @property
     def scatter(self) -> float:
+        """Standard deviation of the tiles from the fit, of full scale, by the median of the deviations."""
         return _scatter(self.residual)
 
     @property
@@ -418,7 +419,7 @@ def _gamma_of(response: Float64) -> Float64:
 
 
 def _scatter(residual: Float64) -> float:
-    """Its standard deviation, of what is not far off."""
+    """Standard deviation, by the median of the deviations."""
     return float(1.4826 * np.median(np.abs(residual)))
 
 

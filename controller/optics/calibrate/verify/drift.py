@@ -47,11 +47,17 @@ class TransportModel(Protocol):
     """The part of the light transport that the drift check needs."""
 
     @property
-    def lit(self) -> Mask: ...
+    def lit(self) -> Mask:
+        """(projectors, rows, columns): where each projector's light is known."""
+        ...
 
-    def forward_part(self, n: int, p: FloatImage) -> FloatImage: ...
+    def forward_part(self, n: int, p: FloatImage) -> FloatImage:
+        """(rows, columns, 3) light of projector ``n`` alone that shows ``p``."""
+        ...
 
-    def gaussian_mean(self, image: FloatImage, n: int) -> FloatImage: ...
+    def gaussian_mean(self, image: FloatImage, n: int) -> FloatImage:
+        """The mean of a camera ``image`` over the light of each of projector ``n``'s pixels."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +96,7 @@ class ProjectorDrift:
 
     @property
     def moved(self) -> bool:
+        """Whether its picture lies elsewhere than before."""
         return self.motion.moved(STILL_PX)
 
     @property
@@ -135,10 +142,12 @@ class Drift:
 
     @property
     def dimmed(self) -> tuple[str, ...]:
+        """Projectors whose light has changed."""
         return tuple(one.name for one in self.projectors if one.dimmed)
 
     @property
     def ambient_changed(self) -> bool:
+        """Whether other light in the room has changed."""
         return abs(self.ambient_share) > AMBIENT_SHARE
 
     @property
