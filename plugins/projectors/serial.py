@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -71,9 +72,8 @@ class SerialProjector:
         self._talk = SerialConversation(
             self._opened,
             name=name,
-            profile=profile,
-            table=table,
-            address=checked_address(table, address),
+            timing=profile.timing,
+            table=replace(table, address=checked_address(table, address)),
             notice=self._noticed,
             slow=self._may_be_starting,
             check=check,

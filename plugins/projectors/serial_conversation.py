@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from hal.codecs.projectors.profiles import ProjectorProfile
+from hal.codecs.projectors.profiles import Timing
 from hal.codecs.projectors.serial_protocol import (
     OBJECT_END,
     Answer,
@@ -79,9 +79,8 @@ class SerialConversation:
         open_link: Callable[[Deadline], ByteLink],
         *,
         name: str,
-        profile: ProjectorProfile,
+        timing: Timing,
         table: SerialTable,
-        address: str,
         notice: Callable[[UnaskedMessage], None],
         slow: Callable[[], bool],
         check: str = SERIAL_CHECK,
@@ -89,9 +88,8 @@ class SerialConversation:
         self._check_what = check
         self._open_link = open_link
         self._name = name
-        self._timing = profile.timing
+        self._timing = timing
         self._table = table
-        self._address = address
         self._notice = notice
         self._slow = slow
         self._link: ByteLink | None = None
@@ -137,7 +135,7 @@ class SerialConversation:
                 else:
                     self._settled(deadline)
                     settled = True
-                self._say(query_bytes(self._table, query, self._address, self._number), deadline)
+                self._say(query_bytes(self._table, query, self._table.address, self._number), deadline)
                 reply = self._listen(query, deadline.within(self._timing.answer_s))
             except DeviceGone:
                 self._hang_up()
@@ -155,7 +153,7 @@ class SerialConversation:
         """Send a command once; None if no reply came. Never sent again: the caller must check its effect."""
         self._settled(deadline)
         try:
-            self._say(command_bytes(self._table, command, self._address, self._number), deadline)
+            self._say(command_bytes(self._table, command, self._table.address, self._number), deadline)
             reply = self._listen(None, deadline.within(self._timing.command_s))
         except DeviceGone:
             self._hang_up()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from hal.codecs.ptp.datasets import ObjectInfo, StorageInfo
@@ -21,6 +22,27 @@ LARGEST_PICTURE: Final = 1 << 30
 _EVERY_STORE: Final = 0xFFFF_FFFF
 _LITTLE_SPACE: Final = 1 << 30
 _LOW_BATTERY: Final = 25
+
+
+@dataclass(frozen=True, slots=True)
+class PictureStorage:
+    """Where a camera stores pictures, and which: what a ``[camera]`` table says.
+
+    ``to_card``: a Canon EOS stores on its card instead of sending straight to this computer; ``keep_on_card``: pictures
+    stay on the card after they are safe here; ``both``: a JPEG with each RAW file, if the camera can.
+    """
+
+    to_card: bool = False
+    keep_on_card: bool = False
+    both: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Download:
+    """Where the data of an answer go: ``sink`` gets them in pieces; more than ``most_bytes`` are refused."""
+
+    sink: Sink
+    most_bytes: int
 
 
 class Channel:
@@ -59,22 +81,20 @@ class Channel:
         doing: str,
         deadline: Deadline,
         data: bytes | None = None,
-        sink: Sink | None = None,
-        most: int | None = None,
+        into: Download | None = None,
         patience_s: float | None = None,
         meanwhile: Callable[[], object] | None = None,
     ) -> Reply:
         """Do an operation until it succeeds; a busy camera is asked again, at growing intervals, for ``busy_s``.
 
+        ``data`` is sent with it; what the camera sends goes ``into`` a download, without one into the reply.
         ``doing`` completes "The camera refused to ..."; ``meanwhile`` runs between two attempts. Raises DeviceBusy,
         DeviceRefused, and what the link raises.
         """
         give_up = self.patience(deadline)
         pause_s = 0.01
         while True:
-            reply = self.once(
-                operation, *parameters, deadline=deadline, data=data, sink=sink, most=most, patience_s=patience_s
-            )
+            reply = self.once(operation, *parameters, deadline=deadline, data=data, into=into, patience_s=patience_s)
             if reply.ok:
                 return reply
             if not reply.busy:
@@ -92,17 +112,15 @@ class Channel:
         *parameters: int,
         deadline: Deadline,
         data: bytes | None = None,
-        sink: Sink | None = None,
-        most: int | None = None,
+        into: Download | None = None,
         patience_s: float | None = None,
         note_busy: bool = True,
     ) -> Reply:
         """Do an operation once and return the camera's answer. ``note_busy``: a busy camera is worth a note."""
         until = deadline.within(self.timing.answer_s if patience_s is None else patience_s)
         began_s = time.monotonic()
-        reply = self.link.transact(
-            operation, *parameters, data=data, sink=sink, most=MOST_IN_MEMORY if most is None else most, deadline=until
-        )
+        sink, most = (None, MOST_IN_MEMORY) if into is None else (into.sink, into.most_bytes)
+        reply = self.link.transact(operation, *parameters, data=data, sink=sink, most=most, deadline=until)
         took_s = time.monotonic() - began_s
         if took_s > self.timing.slow_s and sink is None:
             self.diary.add("camera-slow", f"The camera took {took_s:.1f} s to answer operation 0x{operation:04x}.")
@@ -166,8 +184,7 @@ class Channel:
                 Operation.GET_OBJECT,
                 picture.handle,
                 doing="send a picture",
-                sink=file.write,
-                most=picture.size,
+                into=Download(file.write, picture.size),
                 patience_s=deadline.left_s(),
                 deadline=deadline,
             )
@@ -179,8 +196,7 @@ class Channel:
                 start,
                 count,
                 doing="send a picture",
-                sink=file.write,
-                most=count,
+                into=Download(file.write, count),
                 deadline=deadline,
             )
             if not start < file.size <= start + count:

@@ -16,6 +16,7 @@ from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.registry import Driver, OpenContext
 from hal.transcript import Transcript
+from plugins.ptp.body import PictureStorage
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, PtpLink, Reply, Sink
 from plugins.ptp.shot import Timing
@@ -86,15 +87,13 @@ def _container(kind: int, code: int, number: int, parameters: tuple[int, ...]) -
 LONGEST_PICTURE_S: Final = 600.0
 
 
-def _settings(settings: Mapping[str, Any]) -> tuple[str, bool, bool, bool, Timing]:
-    """Address, whether pictures go to the card first, whether they stay there, RAW and JPEG, and time limits.
-
-    Raises PluginError.
-    """
+def _settings(settings: Mapping[str, Any]) -> tuple[str, PictureStorage, Timing]:
+    """Address, where pictures are stored, and time limits. Raises PluginError."""
     address = str(settings["address"])
     _way(address, None)
     to_card = _choice(settings, "target", "computer", "card") == "card"
-    return address, to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg"), _timing(settings)
+    storage = PictureStorage(to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg"))
+    return address, storage, _timing(settings)
 
 
 def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
@@ -104,7 +103,7 @@ def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
-    address, to_card, keep_on_card, both, timing = _settings(settings)  # a wrong address leaves no file
+    address, storage, timing = _settings(settings)  # a wrong address leaves no file
     transcript = context.transcript(TRACK, _named(address), keep=1000)
     connect = _way(address, None if context.tape is not None else transcript)
     if context.tape is not None and transcript is not None:
@@ -112,9 +111,7 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
     return PtpCamera(
         connect,
         serial=str(settings.get("serial", "")),
-        to_card=to_card,
-        keep_on_card=keep_on_card,
-        both=both,
+        storage=storage,
         timing=timing,
         transcript=transcript,
         deadline=deadline,

@@ -9,7 +9,7 @@ from hal.codecs.ptp.values import RAW_FORMATS, Answer, EventCode, Format, Operat
 from hal.deadline import Deadline
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.camera_files import PendingFile
-from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
+from plugins.ptp.body import Channel, PictureStorage, nearest, no_live_view, no_such_file, still_waiting
 from plugins.ptp.link import LinkEvent, Reply, camera_busy, card_full, refused
 from plugins.ptp.shot import Picture, Shot
 
@@ -26,10 +26,10 @@ _STEPS: Final = {Property.EXPOSURE_TIME: 1e-4, Property.EXPOSURE_INDEX: 1.0, Pro
 class GenericBody:
     """See ``plugins.ptp.body.Body``."""
 
-    def __init__(self, channel: Channel, info: DeviceInfo, *, keep_on_card: bool) -> None:
+    def __init__(self, channel: Channel, info: DeviceInfo, storage: PictureStorage) -> None:
         self._channel = channel
         self._info = info
-        self._keep = keep_on_card
+        self._keep = storage.keep_on_card
         self._settings: dict[Property, PropertyDescription] = {}
         self._raw_format = next((code for code in info.capture_formats if code in RAW_FORMATS), None)
         self._jpeg = Format.JPEG in info.capture_formats or self._raw_format is None

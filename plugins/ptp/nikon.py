@@ -12,7 +12,7 @@ from hal.codecs.ptp.values import Operation, Property
 from hal.deadline import Deadline
 from hal.errors import DeviceTimeout
 from hal.values import CameraCapabilities, ExposureSettings
-from plugins.ptp.body import Channel, no_live_view, no_such_file
+from plugins.ptp.body import Channel, PictureStorage, no_live_view, no_such_file
 from plugins.ptp.generic import GenericBody
 from plugins.ptp.link import LinkEvent, Reply, refused
 from plugins.ptp.shot import Shot
@@ -24,11 +24,11 @@ _VIEW: Final = frozenset({Operation.NIKON_START_VIEW, Operation.NIKON_GET_VIEW, 
 
 
 class NikonBody(GenericBody):
-    """See ``plugins.ptp.body.Body``. Pictures go to the card. ``both``: a JPEG beside each RAW."""
+    """See ``plugins.ptp.body.Body``. Pictures go to the card."""
 
-    def __init__(self, channel: Channel, info: DeviceInfo, *, keep_on_card: bool, both: bool) -> None:
-        super().__init__(channel, info, keep_on_card=keep_on_card)
-        self._both = both
+    def __init__(self, channel: Channel, info: DeviceInfo, storage: PictureStorage) -> None:
+        super().__init__(channel, info, storage)
+        self._both = storage.both
         self._formats: PropertyDescription | None = None
         self._shutter: PropertyDescription | None = None
         self._viewing = False

@@ -16,7 +16,7 @@ from hal.deadline import Deadline, in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.camera_files import PendingFile, kind_of
-from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
+from plugins.ptp.body import Channel, Download, nearest, no_live_view, no_such_file, still_waiting
 from plugins.ptp.link import Reply, camera_busy, refused
 from plugins.ptp.shot import Picture, Shot
 
@@ -166,9 +166,13 @@ class SonyBody:
                 return
             self._picture(deadline)
             self._channel.request(
-                Operation.GET_OBJECT, makers.SONY_MEMORY_HANDLE, doing="forget an old picture", sink=len, most=1 << 30,
-                patience_s=deadline.left_s(), deadline=deadline,
-            )  # fmt: skip
+                Operation.GET_OBJECT,
+                makers.SONY_MEMORY_HANDLE,
+                doing="forget an old picture",
+                into=Download(len, 1 << 30),
+                patience_s=deadline.left_s(),
+                deadline=deadline,
+            )
         raise camera_busy("forget its old pictures")
 
     def _press(self, shot: Shot, deadline: Deadline) -> Reply:

@@ -22,7 +22,7 @@ from hal.notices import Notice
 from hal.transcript import Transcript
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.camera_files import PendingFile, commit_all, kind_of
-from plugins.ptp.body import Body, Channel
+from plugins.ptp.body import Body, Channel, PictureStorage
 from plugins.ptp.canon.body import EosBody
 from plugins.ptp.generic import GenericBody
 from plugins.ptp.link import Diary, PtpLink, refused
@@ -33,18 +33,18 @@ from plugins.ptp.sony import SonyBody
 _SONY: Final = frozenset({Operation.SONY_CONNECT, Operation.SONY_PRESS, Operation.SONY_GET_ALL_PROPERTIES})
 
 
-def choose_body(channel: Channel, info: DeviceInfo, *, to_card: bool, keep_on_card: bool, both: bool) -> Body:
-    """The options are those of ``ptp_still.PtpCamera``. Raises DeviceRefused("camera-no-remote-release")."""
+def choose_body(channel: Channel, info: DeviceInfo, storage: PictureStorage) -> Body:
+    """What releases the camera. Raises DeviceRefused("camera-no-remote-release")."""
     eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
     if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
-        return EosBody(channel, to_card=to_card, keep_on_card=keep_on_card, both=both)
+        return EosBody(channel, storage)
     if info.vendor_extension == Vendor.NIKON and Operation.NIKON_GET_EVENT in info.operations:
-        return NikonBody(channel, info, keep_on_card=keep_on_card, both=both)
+        return NikonBody(channel, info, storage)
     # On the network they call themselves MTP devices.
     if (info.vendor_extension == Vendor.SONY or info.manufacturer.startswith("Sony")) and info.operations >= _SONY:
         return SonyBody(channel)
     if Operation.INITIATE_CAPTURE in info.operations:
-        return GenericBody(channel, info, keep_on_card=keep_on_card)
+        return GenericBody(channel, info, storage)
     raise DeviceRefused(
         "camera-no-remote-release",
         what=f"The {info.model or 'camera'} can't be released over its cable.",
@@ -76,9 +76,7 @@ class PtpCamera:
     Parameters
     ----------
     serial : the camera must have this serial number; "" uses the first that answers and keeps to it
-    to_card : let a Canon EOS store on its card instead of sending straight to this computer
-    keep_on_card : leave pictures on the card after they are safe here
-    both : get a JPEG with each RAW file, if the camera can
+    storage : where the camera stores pictures, and which
     transcript : closed with the camera; the opener of a link records its bytes
     """
 
@@ -87,9 +85,7 @@ class PtpCamera:
         connect: Connect,
         *,
         serial: str = "",
-        to_card: bool = False,
-        keep_on_card: bool = False,
-        both: bool = False,
+        storage: PictureStorage | None = None,
         timing: Timing | None = None,
         transcript: Transcript | None = None,
         deadline: Deadline,
@@ -97,9 +93,7 @@ class PtpCamera:
         self._connect = connect
         self._transcript = transcript
         self._serial = serial
-        self._to_card = to_card
-        self._keep = keep_on_card
-        self._both = both
+        self._storage = storage or PictureStorage()
         self._timing = timing or Timing()
         self._channel: Channel | None = None
         self._body: Body | None = None
@@ -323,7 +317,7 @@ class PtpCamera:
                 link, self._timing, self._diary, operations=info.operations, properties=info.properties
             )
             self._channel.exposing_until_s = self._exposing_until_s
-            body = choose_body(self._channel, info, to_card=self._to_card, keep_on_card=self._keep, both=self._both)
+            body = choose_body(self._channel, info, self._storage)
             body.prepare(deadline=deadline)
             if self._settings is not None:
                 body.configure(self._settings, deadline=deadline)

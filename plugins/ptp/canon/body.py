@@ -16,7 +16,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceRefused, DeviceTimeout
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.camera_files import PendingFile, kind_of
-from plugins.ptp.body import Channel, nearest, no_live_view, no_such_file, still_waiting
+from plugins.ptp.body import Channel, PictureStorage, nearest, no_live_view, no_such_file, still_waiting
 from plugins.ptp.canon.conversation import EosTalk
 from plugins.ptp.canon.shutter import EosShutter, not_released, released
 from plugins.ptp.link import Reply, camera_busy, refused
@@ -81,20 +81,17 @@ _FULL: Final = 7
 
 
 class EosBody:
-    """See ``plugins.ptp.body.Body``.
+    """See ``plugins.ptp.body.Body``."""
 
-    ``to_card``: let pictures go to the card instead of straight to this computer; ``both``: a JPEG beside each RAW
-    """
-
-    def __init__(self, channel: Channel, *, to_card: bool, keep_on_card: bool, both: bool) -> None:
+    def __init__(self, channel: Channel, storage: PictureStorage) -> None:
         self._channel = channel
         self._talk = EosTalk(channel)
         self._state = self._talk.state
         self._shutter = EosShutter(self._talk)
         self._view = EosView(self._talk)
-        self._to_card = to_card
-        self._keep = keep_on_card
-        self._both = both
+        self._to_card = storage.to_card
+        self._keep = storage.keep_on_card
+        self._both = storage.both
         self._bulb_s: float | None = None
         self._target_changed = False
         self._space_refused = False

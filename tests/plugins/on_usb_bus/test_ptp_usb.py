@@ -11,6 +11,7 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceRefused
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
 from plugins.emulated.usb.process import UsbBusProcess
+from plugins.ptp.body import PictureStorage
 from plugins.ptp.camera import open_camera
 from plugins.ptp.usb.bus import UsbAddress, UsbFinder, usb_cameras
 from tests.plugins.on_usb_bus.camera_rig import SIZE, Rig, bus, lasting_bus, rig, running
@@ -104,7 +105,7 @@ def test_a_camera_that_another_program_left_unready_is_reset(bus: UsbBusProcess)
 
 
 def test_raw_and_jpeg_of_one_shot_come_together(bus: UsbBusProcess, tmp_path: Path) -> None:
-    with running(bus, "eos-new", both=True) as rig:
+    with running(bus, "eos-new", storage=PictureStorage(both=True)) as rig:
         rig.driver.configure(ExposureSettings(0.125, 200, raw=True), deadline=in_seconds(20))
         rig.fault("camera_faults.lost_events", 1)
         for number in range(3):

@@ -15,6 +15,7 @@ from hal.deadline import in_seconds
 from hal.values import ExposureSettings
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
+from plugins.ptp.body import PictureStorage
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
@@ -95,7 +96,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 
 @pytest.fixture(params=["eos-new", "eos-old"])
 def card_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with running(request.param, to_card=True) as rig:
+    with running(request.param, storage=PictureStorage(to_card=True)) as rig:
         yield rig
 
 

@@ -19,6 +19,7 @@ from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
+from plugins.ptp.body import PictureStorage
 from plugins.ptp.camera import DRIVER, open_camera
 from plugins.ptp.ip import PtpIpAddress
 from plugins.ptp.still import PtpCamera
@@ -85,7 +86,7 @@ def test_an_eos_can_shoot_to_its_card(card_rig: Rig, tmp_path: Path) -> None:
 
 
 def test_pictures_stay_on_the_card_where_that_is_wanted(tmp_path: Path) -> None:
-    with running("generic", keep_on_card=True) as rig:
+    with running("generic", storage=PictureStorage(keep_on_card=True)) as rig:
         rig.capture(tmp_path, "one")
         assert rig.capture(tmp_path, "two") == rig.latest()
         assert rig.emulator.body.pictures_on_card == 2
