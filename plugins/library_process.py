@@ -1,5 +1,5 @@
-"""Libraries in C that may crash or hang, in a process of their own: the controller's side, and the process' loop
-with a worker that keeps one device open.
+"""Libraries in C that may crash or hang, in a process of their own: the camera on the controller's side, and the
+process' loop with a worker that keeps one device open.
 
 A request is (name of a method of the worker, its arguments). The answer is ``Failed``, or (result, the device's serial
 number, seconds that the library took).
@@ -15,16 +15,19 @@ import sys
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 import hal.errors
 from hal.deadline import SLICE_S, Deadline, turn
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout
 from hal.notices import Notice
+from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 
 _END_S: Final = 0.7
 CRASHED: Final = "camera-library-ended"
@@ -258,3 +261,75 @@ class DeviceWorker(ABC, Generic[Device]):
                 raise
             self._device = device
         return self._device
+
+
+_MOST_NOTICES: Final = 1000
+_MARGIN_S: Final = 1.0
+
+
+class LibraryCamera:
+    """``hal.interfaces.WatchedCamera`` on a ``LibraryProcess``.
+
+    The worker has the methods ``capabilities``, ``identity``, ``configure`` and ``capture``, and sets its exposure
+    again when it opens the camera again. ``module``, ``library``, ``start``, ``serial``: as for ``LibraryProcess``.
+    """
+
+    def __init__(self, module: str, library: str, *, start: tuple[Any, ...], serial: str, deadline: Deadline) -> None:
+        self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
+        self.process = LibraryProcess(
+            module,
+            library,
+            start=start,
+            serial=serial,
+            note=self._notices.append,
+        )
+        self._settings: ExposureSettings | None = None
+        self._configured: int | None = None
+        """The process that has these settings."""
+        try:
+            self._capabilities: CameraCapabilities = self.process.request("capabilities", deadline=deadline)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        return self._capabilities
+
+    def identity(self, *, deadline: Deadline) -> DeviceIdentity:
+        identity: DeviceIdentity = self.process.request("identity", deadline=deadline)
+        return identity
+
+    def status(self, *, deadline: Deadline) -> CameraStatus:
+        """It has neither battery nor card; raises DeviceGone where it is not there."""
+        self.identity(deadline=deadline)
+        return CameraStatus()
+
+    def notices(self) -> list[Notice]:
+        return [self._notices.popleft() for _ in range(len(self._notices))]
+
+    def configure(self, settings: ExposureSettings, *, deadline: Deadline) -> ExposureSettings:
+        confirmed: ExposureSettings = self.process.request("configure", settings, deadline=deadline)
+        self._settings, self._configured = confirmed, self.process.pid
+        return confirmed
+
+    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        """See ``hal.interfaces.Camera.capture``. Raises DeviceGone("camera-shot-lost") where the process ended."""
+        try:
+            if self._settings is not None and self.process.pid != self._configured:
+                # The process was ended, perhaps also started again by another request: its exposure is forgotten.
+                self.configure(self._settings, deadline=deadline)
+            left_s = deadline.left_s()
+            # The worker ends before the caller does: it knows why there is no picture.
+            theirs_s = left_s - min(_MARGIN_S, left_s / 5)
+            files: list[CapturedFile] = self.process.request(
+                "capture", destination.absolute(), theirs_s, deadline=deadline, repeatable=False
+            )
+        except DeviceGone as error:
+            if error.code != CRASHED:
+                raise
+            raise shot_lost(error) from error
+        return files
+
+    def close(self) -> None:
+        self.process.close()

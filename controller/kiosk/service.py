@@ -35,8 +35,7 @@ from controller.kiosk.supervisors.light_records import LampHistory
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import Thread, World
-from controller.play.control.attached import AttachedPlayer
-from controller.play.control.launch import PlayerSettings
+from controller.play.control.launch import AttachedPlayer, PlayerSettings
 from controller.run.state_machine import State
 from controller.stage.sessions.calibrations import finished_calibrations, stage_trust
 from controller.stage.sessions.check import Checked

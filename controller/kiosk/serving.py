@@ -21,8 +21,7 @@ from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.settings import checked_settings, last_good
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.kiosk.world import World
-from controller.play.control.attached import AttachedPlayer
-from controller.play.control.launch import PlayerSettings
+from controller.play.control.launch import AttachedPlayer, PlayerSettings
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Stop

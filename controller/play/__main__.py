@@ -15,10 +15,9 @@ from typing import Any
 from controller.bundle.install import CURRENT, CountedStart
 from controller.bundle.signing import Trust, load_public_key
 from controller.core.errors import UsageError, VelaturaError
-from controller.play.control.commands import SUFFIX, Commands, SavedRequest
+from controller.play.control.commands import SUFFIX, Commands, SavedRequest, Server
 from controller.play.control.notify import log
 from controller.play.control.protocol import MAX_RATE_HZ, Suggested
-from controller.play.control.server import Server
 from controller.play.display.outputs import MemoryOutput, Output
 from controller.play.frames import FrameFile, OutputSize, parse_outputs, parse_where
 from controller.play.loop import Player

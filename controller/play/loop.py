@@ -17,8 +17,7 @@ from controller.bundle.signing import Trust, unsigned_warning
 from controller.core.errors import BundleError, UsageError
 from controller.play.cache import DecodedAhead, check_fits
 from controller.play.control.notify import Notifier, log
-from controller.play.display.mixing import dimmed
-from controller.play.display.outputs import Output
+from controller.play.display.outputs import Output, dimmed
 from controller.play.frames import FrameSet, OutputSize
 from controller.play.live_stream import LiveStream, open_live
 from controller.play.presenting import Grid, PendingPresentation, Presenter, ResultCallback

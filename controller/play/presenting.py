@@ -15,8 +15,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from controller.core.errors import VelaturaError
-from controller.play.display.mixing import mix_sets
-from controller.play.display.outputs import Output
+from controller.play.display.outputs import Output, mix_sets
 from controller.play.frames import FrameSet, OutputSize
 
 _SHORTEST_S: Final = 1e-5

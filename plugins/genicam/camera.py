@@ -8,7 +8,7 @@ from typing import Any, Final
 from hal.deadline import Deadline
 from hal.errors import PluginError
 from hal.registry import Driver, OpenContext, setting
-from plugins.library_camera import LibraryCamera
+from plugins.library_process import LibraryCamera
 from plugins.raw_file import LEVEL_SETTINGS, Levels, levels_of, pixel_format
 
 

@@ -15,7 +15,7 @@ from hal.errors import DeviceRefused
 from hal.registry import Driver, OpenContext
 from hal.values import CameraStatus
 from plugins.gphoto2.library import load_library
-from plugins.library_camera import LibraryCamera
+from plugins.library_process import LibraryCamera
 
 
 class Gphoto2Camera(LibraryCamera):

@@ -16,7 +16,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.links import ByteLink
 from hal.values import Power
-from plugins.projectors.optional_answers import OptionalAnswers
+from plugins.projectors.answers import OptionalAnswers
 
 _FIELDS: Final = {
     "INST": "inputs",

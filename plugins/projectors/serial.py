@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hal.codecs.projectors.power_view import PowerView
 from hal.codecs.projectors.profiles import ProjectorProfile
 from hal.codecs.projectors.serial_protocol import Reply, UnaskedMessage, parse_hours, parse_power
 from hal.codecs.projectors.serial_table import ADJUSTMENTS
@@ -23,8 +22,8 @@ from hal.registry import Driver, OpenContext
 from hal.serial_link import SerialLink
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
+from plugins.projectors.answers import OptionalAnswers, PowerView
 from plugins.projectors.network.device_server import open_url
-from plugins.projectors.optional_answers import OptionalAnswers
 from plugins.projectors.profile_files import checked_address, read_settings, reported_powers, serial_table
 from plugins.projectors.serial_conversation import COOLS, SERIAL_CHECK, SerialConversation
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from hal.deadline import Deadline
 from hal.registry import Driver, OpenContext
-from plugins.library_camera import LibraryCamera
+from plugins.library_process import LibraryCamera
 from plugins.v4l2.formats import EXPLAINED, VideoSettings, video_settings
 
 

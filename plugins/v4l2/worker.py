@@ -2,20 +2,262 @@
 
 from __future__ import annotations
 
+import contextlib
+import mmap
+import os
+import select
 import sys
+import time
+from ctypes import c_int32
 from pathlib import Path
 from typing import Final
 
-from hal.errors import DeviceRefused, PluginError
+from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
 from hal.values import CameraCapabilities, CapturedFile, DeviceIdentity, ExposureSettings, FileKind
 from plugins.camera_files import PendingFile, commit_all
 from plugins.library_process import DeviceWorker, served
 from plugins.ptp.body import nearest, no_such_file
 from plugins.raw_file import encoded
 from plugins.v4l2 import kernel
-from plugins.v4l2.device import VideoDevice
-from plugins.v4l2.formats import VideoFormat, VideoSettings, jpeg_file, rank, video_format
-from plugins.v4l2.kernel import chosen
+from plugins.v4l2.formats import (
+    COMPRESSED,
+    VideoFormat,
+    VideoSettings,
+    code_of,
+    is_complete_jpeg,
+    jpeg_file,
+    number_of,
+    rank,
+    video_format,
+)
+from plugins.v4l2.kernel import VideoNode, chosen, identify
+
+_BUFFERS: Final = 4
+_GOING_S: Final = 0.5
+"""Linux takes a pulled camera away in this time. Closing its device meanwhile can meet a fault of the kernel (seen with
+6.1), which ends this process: ``media_device_unregister_entity`` reads a pointer before it has the lock."""
+_MOST: Final = 4096
+"""Entries of a list that are read, in case a driver's lists never end."""
+
+
+class VideoDevice:
+    """Opened for reading pictures; its methods raise DeviceGone, DeviceRefused. Close it."""
+
+    def __init__(self, path: Path) -> None:
+        self._frame_bytes = self._row_bytes = 0
+        self.size_px = (0, 0)
+        self.format = VideoFormat("")
+        self._maps: list[mmap.mmap] = []
+        try:
+            self._handle = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise kernel.device_error(error) from error
+        try:
+            found = identify(path, self._handle)
+            if found is None:
+                raise DeviceRefused(
+                    "camera-no-capture",
+                    what=f"{path} takes no pictures.",
+                    remedy="Write another video device for address in the [camera] table.",
+                )
+            self.node: VideoNode = found
+        except BaseException:
+            os.close(self._handle)
+            raise
+
+    def close(self) -> None:
+        for each in self._maps:
+            each.close()
+        self._maps.clear()
+        if self._is_gone():
+            time.sleep(_GOING_S)
+        os.close(self._handle)
+
+    def _is_gone(self) -> bool:
+        try:
+            kernel.answered(self._handle, kernel.QUERYCAP, kernel.Capability())
+        except DeviceGone:
+            return True
+        return False
+
+    def codes(self) -> list[str]:
+        """The codes of its formats."""
+        found = []
+        for index in range(_MOST):
+            one = kernel.FormatDescription(index=index, type=kernel.CAPTURE)
+            if not kernel.answered(self._handle, kernel.ENUM_FMT, one):
+                break
+            found.append(code_of(one.pixelformat))
+        return [code for code in found if code]
+
+    def largest_px(self, code: str) -> tuple[int, int]:
+        """The size with the most pixels; (0, 0) where the driver has no list."""
+        best = (0, 0)
+        for index in range(_MOST):
+            one = kernel.FrameSize(index=index, pixelformat=number_of(code))
+            if not kernel.answered(self._handle, kernel.ENUM_FRAMESIZES, one):
+                break
+            discrete = one.type == kernel.DISCRETE
+            size = (one.sides[0], one.sides[1]) if discrete else (one.sides[1], one.sides[4])
+            best = max(best, size, key=lambda sides: sides[0] * sides[1])
+            if not discrete:
+                break
+        return best
+
+    def set_format(self, video: VideoFormat, size_px: tuple[int, int]) -> None:
+        """Set format and size; ``size_px`` (0, 0) leaves the size. Raises DeviceRefused where it takes another."""
+        wanted = kernel.Format(type=kernel.CAPTURE)
+        wanted.fmt.pix.width, wanted.fmt.pix.height = size_px
+        wanted.fmt.pix.pixelformat, wanted.fmt.pix.field = number_of(video.code), kernel.DISCRETE
+        kernel.call(self._handle, kernel.S_FMT, wanted)
+        has = wanted.fmt.pix
+        if has.pixelformat != number_of(video.code) or size_px not in ((0, 0), (has.width, has.height)):
+            raise DeviceRefused(
+                "camera-format",
+                what=f"The camera has no {video.code.strip()} of {size_px[0]} x {size_px[1]};"
+                f" it takes {code_of(has.pixelformat).strip()} of {has.width} x {has.height}.",
+                remedy="Write another format or size in the [camera] table, or leave them out.",
+            )
+        self.format, self.size_px = video, (has.width, has.height)
+        self._row_bytes, self._frame_bytes = has.bytesperline, has.sizeimage
+
+    def control(self, identifier: int) -> kernel.ControlQuery | None:
+        """Range of a control that can be set; None where it has none."""
+        one = kernel.ControlQuery(id=identifier)
+        found = kernel.answered(self._handle, kernel.QUERYCTRL, one) and not one.flags & kernel.UNUSABLE
+        return one if found else None
+
+    def set_control(self, identifier: int, value: int) -> int:
+        """Set a control; return what it has then."""
+        one = kernel.Control(id=identifier, value=value)
+        kernel.call(self._handle, kernel.S_CTRL, one)
+        kernel.call(self._handle, kernel.G_CTRL, one)
+        return int(one.value)
+
+    def stop_automatics(self) -> None:
+        """Exposure, gain, white balance and the like are left as they are now."""
+        wanted = dict(kernel.AUTOMATIC)
+        if self.node.driver == "uvcvideo":
+            wanted.update([kernel.UVC_GAMMA])
+        for identifier, value in wanted.items():
+            found = self.control(identifier)
+            if found is not None and found.minimum <= value <= found.maximum:
+                # A menu need not have this entry: then it is left.
+                with contextlib.suppress(DeviceRefused):
+                    self.set_control(identifier, value)
+
+    def set_interval(self, longest_s: float) -> None:
+        """The shortest time between frames in which an exposure of ``longest_s`` has room, or the longest."""
+        intervals = self._intervals()
+        if not intervals:
+            return
+        room = [one for one in intervals if one[0] / one[1] >= longest_s]
+        by_time = sorted(room or intervals, key=lambda one: one[0] / one[1])
+        numerator, denominator = by_time[0] if room else by_time[-1]
+        wanted = kernel.Parameters(type=kernel.CAPTURE, numerator=numerator, denominator=denominator)
+        kernel.answered(self._handle, kernel.S_PARM, wanted)
+
+    def _intervals(self) -> list[tuple[int, int]]:
+        found = []
+        for index in range(_MOST):
+            one = kernel.FrameInterval(index=index, pixelformat=number_of(self.format.code))
+            one.width, one.height = self.size_px
+            if not kernel.answered(self._handle, kernel.ENUM_FRAMEINTERVALS, one):
+                break
+            pairs = [(one.parts[at], one.parts[at + 1]) for at in range(0, 2 if one.type == kernel.DISCRETE else 4, 2)]
+            found += [pair for pair in pairs if pair[0] and pair[1]]
+            if one.type != kernel.DISCRETE:
+                break
+        return found
+
+    def frame(self, skip: int, seconds: float) -> bytes:
+        """Start, pass over ``skip`` whole frames, take the next one, stop; rows are without padding.
+
+        Raises DeviceTimeout, or DeviceBusy("camera-frame-cut") where frames came and none was whole.
+        """
+        ends_s = time.monotonic() + seconds
+        self._map_buffers()
+        try:
+            for index in range(len(self._maps)):
+                kernel.call(self._handle, kernel.QBUF, self._buffer(index))
+            kernel.call(self._handle, kernel.STREAMON, c_int32(kernel.CAPTURE))
+            return self._complete_frame(skip, ends_s)
+        finally:
+            self._stop()
+
+    def _map_buffers(self) -> None:
+        wanted = kernel.Buffers(count=_BUFFERS, type=kernel.CAPTURE, memory=kernel.MMAP)
+        kernel.call(self._handle, kernel.REQBUFS, wanted)
+        for index in range(wanted.count):
+            one = self._buffer(index)
+            kernel.call(self._handle, kernel.QUERYBUF, one)
+            try:
+                self._maps.append(mmap.mmap(self._handle, one.length, offset=one.m.offset))
+            except OSError as error:
+                raise kernel.device_error(error) from error
+
+    def _buffer(self, index: int) -> kernel.Buffer:
+        return kernel.Buffer(index=index, type=kernel.CAPTURE, memory=kernel.MMAP)
+
+    def _complete_frame(self, skip: int, ends_s: float) -> bytes:
+        watch = select.poll()
+        watch.register(self._handle, select.POLLIN)
+        cut = 0
+        while True:
+            left_s = ends_s - time.monotonic()
+            if left_s <= 0 or not watch.poll(1000 * left_s):
+                raise _cut(cut) if cut else _late()
+            one = kernel.Buffer(type=kernel.CAPTURE, memory=kernel.MMAP)
+            kernel.call(self._handle, kernel.DQBUF, one)
+            data = self._maps[one.index][: one.bytesused]
+            if one.flags & kernel.BAD_FRAME or not self._is_complete(data):
+                cut += 1
+            elif skip:
+                skip -= 1
+            else:
+                return self._rows(data)
+            kernel.call(self._handle, kernel.QBUF, self._buffer(one.index))
+
+    def _is_complete(self, data: bytes) -> bool:
+        if self.format.code in COMPRESSED:
+            return is_complete_jpeg(data)
+        columns, rows = self.size_px
+        row = columns * self.format.bytes_per_pixel
+        return len(data) >= max(self._row_bytes, row) * (rows - 1) + row
+
+    def _rows(self, data: bytes) -> bytes:
+        row = self.size_px[0] * self.format.bytes_per_pixel
+        if self.format.code in COMPRESSED or self._row_bytes <= row:
+            return data
+        starts = range(0, self.size_px[1] * self._row_bytes, self._row_bytes)
+        return b"".join(data[at : at + row] for at in starts)
+
+    def _stop(self) -> None:
+        # A camera that was unplugged refuses this, and needs none.
+        with contextlib.suppress(DeviceError):
+            kernel.call(self._handle, kernel.STREAMOFF, c_int32(kernel.CAPTURE))
+        for each in self._maps:
+            each.close()
+        self._maps.clear()
+        with contextlib.suppress(DeviceError):
+            kernel.call(self._handle, kernel.REQBUFS, kernel.Buffers(count=0, type=kernel.CAPTURE, memory=kernel.MMAP))
+
+
+def _cut(count: int) -> DeviceBusy:
+    return DeviceBusy(
+        "camera-frame-cut",
+        what=f"The camera sent {count} incomplete images and no whole one.",
+        remedy="Use another USB port or a shorter cable, and no hub. A smaller size needs less bandwidth.",
+    )
+
+
+def _late() -> DeviceTimeout:
+    return DeviceTimeout(
+        "camera-no-picture",
+        what="The camera sent no image in time.",
+        remedy="Check that it is not set to wait for a trigger, and that its USB port has enough bandwidth.",
+    )
+
 
 _THIRDS: Final = tuple(2 ** (third / 3) for third in range(-48, 22))
 _ABSOLUTE_S: Final = 1e-4

@@ -30,9 +30,9 @@ from hal.values import ExposureSettings, FileKind
 from plugins.finding import video
 from plugins.raw_file import Levels, encoded
 from plugins.v4l2.camera import VideoCamera, open_camera
-from plugins.v4l2.device import VideoDevice
 from plugins.v4l2.formats import video_format
 from plugins.v4l2.kernel import identify_path, paths
+from plugins.v4l2.worker import VideoDevice
 from tests.real_kernel.usb_ip import Cable
 from tests.real_kernel.uvc_camera import BLACK, FULL, HEIGHT, INTERVAL_S, WIDTH, UvcCamera
 

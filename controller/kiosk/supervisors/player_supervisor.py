@@ -16,8 +16,7 @@ from controller.kiosk.decide.interfaces import BLACK, PlayerView, Showing
 from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
 from controller.kiosk.values import Turn
 from controller.kiosk.world import READY_S, Process, launched
-from controller.play.control.attached import AttachedPlayer
-from controller.play.control.launch import PlayerSettings
+from controller.play.control.launch import AttachedPlayer, PlayerSettings
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.notices import Level, Notice
 from hal.player import PlayerClient

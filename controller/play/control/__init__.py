@@ -1,3 +1,3 @@
-"""How others control the player: its socket (`server`, `protocol`), the requests (`commands`), and the process
-itself (`launch`).
+"""How others control the player: its socket and requests (`commands`, `protocol`), and the process itself
+(`launch`).
 """

@@ -14,8 +14,7 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
-from controller.play.control.attached import AttachedPlayer
-from controller.play.control.launch import PlayerSettings, hello
+from controller.play.control.launch import AttachedPlayer, PlayerSettings, hello
 from hal.notices import Notice
 from tests.controller.play.conftest import OUTPUTS
 from tests.controller.play.wire import Wire

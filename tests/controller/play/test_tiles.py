@@ -9,8 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.play.display.mixing import mix_sets, mixture_of
-from controller.play.display.outputs import MemoryOutput
+from controller.play.display.outputs import MemoryOutput, mix_sets, mixture_of
 from controller.play.frames import FrameSet, OutputSize, Tiles, differing
 from plugins.emulated.optics.outputs import FrameReader
 

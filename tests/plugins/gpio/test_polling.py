@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from gpiod.line import Value
 
-from plugins.gpio.lines import Lines
+from plugins.gpio.keys import Lines
 
 
 class _Request:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.codecs.projectors.power_view import PowerView
 from hal.values import LampRules, Power
+from plugins.projectors.answers import PowerView
 
 RULES = LampRules(warm_up_s=60, stable_s=900, cool_down_s=120, minimum_off_s=180)
 

@@ -16,8 +16,7 @@ from pypjlink import Projector as PyPjLink
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
-from hal.tape import Tape, read_tape
-from hal.tape_relay import ptpip_relays, stream_relay
+from hal.tape import Tape, ptpip_relays, read_tape, stream_relay
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of, quick_profile
