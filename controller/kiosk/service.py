@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from controller.config.models import StageTables
 from controller.core import kiosk_places
 from controller.core.errors import SEND_DIAGNOSTICS, WorkError
 from controller.core.storage import runtime_folder
@@ -67,59 +68,83 @@ class Service:
         self, checked: Checked, log: EventLog, problem: Notice | None = None, world: World | None = None,
         jobs: MakeJobs = JobHandlers.table,
     ) -> None:  # fmt: skip
-        stage = checked.stage
-        self._world = world = world or World()
-        self.problem = problem
+        stage, world = checked.stage, world or World()
+        self._world, self.problem = world, problem
         self.cools_at_end: tuple[str, ...] | None = None
         self.checked, self.log, self.stage = checked, log, stage.folder
         self.runtime = runtime_folder(stage.folder)
-        self.bundles = BundleStore(stage.folder, stage_trust(stage), world.monotonic)
-        self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
-        attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
-        installed = kiosk_places.is_installed(stage.folder)
-        self.player = PlayerSupervisor(
-            self.runtime, self._settings, log.add, monotonic=world.monotonic, attach=attach if installed else None,
-            launch=world.launch, channel=world.channel(),
-        )  # fmt: skip
         self.alive: Callable[[], None] = lambda: None
-        self.bundle_watch = BundleWatch(self.bundles, log.add)
-        self.devices = Devices(checked, self.runtime, self._tell, world)
-        self.devices.scene = self._scene
-        self.lamp_history = LampHistory(stage.folder, monotonic=world.monotonic)
-        handlers = JobHandlers(
-            stage.folder, self.devices.lent, missing_device=self._missing_for_work, calibrated=self._calibrated,
-            open_now=lambda: bool(self.schedule.now.rows) and self.reconciler.plan.open is True,
-        )  # fmt: skip
-        self.jobs = JobRunner(jobs(handlers), log, number=int(log.value("job") or 0), world=world)
-        safety = stage.tables.safety
-        self.reconciler = Reconciler(
-            self.devices.projectors, self.player, self.jobs, self.bundles, log,
-            Timetable(self.schedule, TrustedClock(log, world.wall, world.monotonic, world.synchronised)),
-            Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
-        )  # fmt: skip
-        self.disk = DiskSupervisor(
-            stage.folder, lambda: self.checked.stage.tables.disk, self.bundles, log,
-            busy=lambda: self.jobs.running is not None, world=world,
-        )  # fmt: skip
-        self.backups = NightlyBackup(
-            stage.folder, lambda: self.checked.stage.tables.backup, lambda: self.schedule.now.time_zone, log,
-            busy=lambda: self.jobs.running is not None, wall=world.wall,
-        )  # fmt: skip
-        self.inventories = InventoryWatch(
-            stage.folder, self.inventory, lambda: self.checked.stage.tables.calibration.worst_grade, log,
-            busy=lambda: self.jobs.running is not None, wall=world.wall,
-        )  # fmt: skip
-        self.alerts = Alerts(
-            stage.folder, lambda: self.checked.stage.tables.stage.name, lambda: self.checked.stage.tables.alerts, log,
-            monotonic=world.monotonic, wall=world.wall, ways=world.ways_out,
-        )  # fmt: skip
-        self.good_settings = GoodSettings()
         self.changed: Callable[[], None] = lambda: None
+        self.good_settings = GoodSettings()
         self._stop = world.event()
         self._threads: list[Thread] = []
-        self.keys = self._keys_supervisor()
         self._known_runs: tuple[float, bool] = (0.0, False)
-        self._asked, self._decided = self._world.event(), self._world.event()
+        self._asked, self._decided = world.event(), world.event()
+        # In this order: what is kept on disk, the devices, the jobs that use them, and what directs all of them.
+        self.bundles = BundleStore(stage.folder, stage_trust(stage), world.monotonic)
+        self.schedule = ScheduleFile(stage.folder, stage.tables.schedule)
+        self.lamp_history = LampHistory(stage.folder, monotonic=world.monotonic)
+        self.bundle_watch = BundleWatch(self.bundles, log.add)
+        self.player = self._player_supervisor(world)
+        self.devices = Devices(checked, self.runtime, self._tell, world)
+        self.devices.scene = self._scene
+        self.jobs = self._job_runner(jobs, world)
+        self.reconciler = self._reconciler(world)
+        self.keys = self._keys_supervisor()
+        self._keep_house(world)
+
+    def _player_supervisor(self, world: World) -> PlayerSupervisor:
+        attach = partial(AttachedPlayer, kiosk_places.PLAYER_SOCKET, kiosk_places.PLAYER_OPTIONS)
+        return PlayerSupervisor(
+            self.runtime, self._settings, self.log.add, monotonic=world.monotonic,
+            attach=attach if kiosk_places.is_installed(self.stage) else None,
+            launch=world.launch, channel=world.channel(),
+        )  # fmt: skip
+
+    def _job_runner(self, jobs: MakeJobs, world: World) -> JobRunner:
+        handlers = JobHandlers(
+            self.stage, self.devices.lent, missing_device=self._missing_for_work, calibrated=self._calibrated,
+            open_now=self._open_now,
+        )  # fmt: skip
+        return JobRunner(jobs(handlers), self.log, number=int(self.log.value("job") or 0), world=world)
+
+    def _reconciler(self, world: World) -> Reconciler:
+        safety = self.tables.safety
+        clock = TrustedClock(self.log, world.wall, world.monotonic, world.synchronised)
+        return Reconciler(
+            self.devices.projectors, self.player, self.jobs, self.bundles, self.log, Timetable(self.schedule, clock),
+            Limits(safety.power_up_s, max(900.0, 10 * safety.power_down_s)),
+        )  # fmt: skip
+
+    def _keep_house(self, world: World) -> None:
+        """Make what works beside the stage. Settings are asked for each time: ``use`` replaces them."""
+        stage, log = self.stage, self.log
+        self.disk = DiskSupervisor(
+            stage, lambda: self.tables.disk, self.bundles, log, busy=self._busy, world=world
+        )  # fmt: skip
+        self.backups = NightlyBackup(
+            stage, lambda: self.tables.backup, lambda: self.schedule.now.time_zone, log, busy=self._busy,
+            wall=world.wall,
+        )  # fmt: skip
+        self.inventories = InventoryWatch(
+            stage, self.inventory, lambda: self.tables.calibration.worst_grade, log, busy=self._busy, wall=world.wall,
+        )  # fmt: skip
+        self.alerts = Alerts(
+            stage, lambda: self.tables.stage.name, lambda: self.tables.alerts, log, monotonic=world.monotonic,
+            wall=world.wall, ways=world.ways_out,
+        )  # fmt: skip
+
+    @property
+    def tables(self) -> StageTables:
+        """The settings in use."""
+        return self.checked.stage.tables
+
+    def _busy(self) -> bool:
+        return self.jobs.running is not None
+
+    def _open_now(self) -> bool:
+        """Whether opening hours keep the stage open now."""
+        return bool(self.schedule.now.rows) and self.reconciler.plan.open is True
 
     def hurry(self) -> None:
         """Decide now, and let the player follow: a person waits for what was asked."""
@@ -209,7 +234,7 @@ class Service:
 
     def inventory(self, run: str = "") -> Inventory:
         """What the kiosk consists of now; ``run``: what graded well before. Seconds."""
-        return self._world.inventory(self.stage, self.checked.stage.tables, self.devices.facts(), run)
+        return self._world.inventory(self.stage, self.tables, self.devices.facts(), run)
 
     def submit(self, *requests: Request) -> None:
         self.reconciler.submit(*requests)
@@ -280,7 +305,7 @@ class Service:
         )
 
     def _wait_until_dark(self, projectors: Sequence[ProjectorSupervisor]) -> None:
-        until_s = self._world.monotonic() + self.checked.stage.tables.safety.power_down_s
+        until_s = self._world.monotonic() + self.tables.safety.power_down_s
         while any(one.may_light for one in projectors) and self._world.monotonic() < until_s:
             self.alive()
             self._world.sleep(0.1)
@@ -311,7 +336,7 @@ class Service:
         thread.start()
 
     def _keys_supervisor(self) -> KeysSupervisor | None:
-        table = self.checked.stage.tables.key_panel
+        table = self.tables.key_panel
         if table is None:
             return None
 

@@ -273,7 +273,7 @@ class StageKiosk(AttachedKiosk):
 
     @property
     def _in_use(self) -> StageTables:
-        return self.service.checked.stage.tables
+        return self.service.tables
 
     def take_over(self) -> None:
         """Use stage.toml as it is now: at once, or by a restart of what has to be opened again."""
@@ -296,7 +296,7 @@ class StageKiosk(AttachedKiosk):
         return None if self._service is None else aim.camera_picture(self._service.devices)
 
     def results(self, run: str) -> Results:
-        return runs.results(self.stage, run, self.service.checked.stage.tables.calibration.worst_grade)
+        return runs.results(self.stage, run, self.service.tables.calibration.worst_grade)
 
     def report(self, run: str) -> Path:
         return runs.report(self.stage, run, self.service.checked)

@@ -106,7 +106,7 @@ class Snapshots:
         bundle = service.bundles.bundle()
         at_s, grades = self._grades
         if self._world.monotonic() - at_s > GRADES_EVERY_S or not at_s or bundle != self._bundle:
-            grades = runs.grades(self._stage, service.checked.stage.tables.calibration.worst_grade)
+            grades = runs.grades(self._stage, service.tables.calibration.worst_grade)
             self._grades, self._bundle = (self._world.monotonic(), grades), bundle
             self._places, self._drifts = places(self._stage), runs.drifts(self._stage)
         index = service.bundles.index(bundle)
@@ -116,7 +116,7 @@ class Snapshots:
         live = service.reconciler.live
         return KioskState(
             revision=revision,
-            stage=service.checked.stage.tables.stage.name,
+            stage=service.tables.stage.name,
             state=state,
             reason=reason,
             since_unix_s=self._since[1],

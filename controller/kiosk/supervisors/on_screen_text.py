@@ -1,4 +1,7 @@
-"""Shows lines of text on a projector through the player's inbox (docs/reference/player-protocol.md, "Frame file")."""
+"""Shows lines of text on a projector through the player's inbox (docs/reference/player-protocol.md, "Frame file").
+
+A module of its own, because it only draws: ``player_supervisor`` decides when.
+"""
 
 from __future__ import annotations
 
