@@ -121,21 +121,19 @@ def _refine(
         need = refine_peak_bytes(stage_size(calibrated.calibration))
         context.reporter.say(check_memory(need, free_bytes(), f"Refining {name}"))
     solved = read_solved(calibrated.folder, name, calibrated.projectors)
-    before = _before(context.folder, solved, calibrated, name, number)
-    if not before.ended:
-        before = _Round(rig, calibrated, solved, name, options, context).after(before, number)
-    return before.write(context.folder, name, number)
-
-
-def _before(folder: Path, solved: Solved, calibrated: Calibrated, name: str, number: int) -> Refining:
     if number == 1:
-        return Refining(solved.linear, None, None)
-    return Refining.read(folder, name, number - 1, calibrated.projectors)
+        state = Refining(solved.linear, None, None)
+    else:
+        state = Refining.read(context.folder, name, number - 1, calibrated.projectors)
+    if not state.ended:
+        refinement = _Refinement(rig, calibrated, solved, name, options, context)
+        state = refinement.photograph_and_correct(state, number)
+    return state.write(context.folder, name, number)
 
 
 @dataclass(frozen=True, slots=True)
-class _Round:
-    """One photograph of an appearance, and what follows from it."""
+class _Refinement:
+    """Photographs an appearance's frames, judges the photograph, and solves the frames again."""
 
     rig: Rig
     calibrated: Calibrated
@@ -144,56 +142,72 @@ class _Round:
     options: RefineOptions
     context: Context
 
-    def after(self, now: Refining, number: int) -> Refining:
-        """Photograph ``now.frames``; judge them, and correct them."""
-        predicted = self._predicted(now.frames)
+    def photograph_and_correct(self, state: Refining, number: int) -> Refining:
+        """Take photograph ``number``, of ``state.frames``; judge it, and solve again if that is worth it.
+
+        Returns the state after it: with only one more row of figures if the photograph was refused; ended if the
+        frames are no better than those before, or if what is left is noise; else with corrected frames.
+        """
+        predicted = self._predicted(state.frames)
         mask = self.solved.reachable & self.calibrated.calibration.object_mask
         light = predicted[mask] if mask.any() else predicted.reshape(-1, 3)
-        photograph = self._photographed(now.frames, light, number)
+        photograph = self._photograph(state.frames, light, number)
         trusted = trusted_pixels(photograph, predicted, self._stage, mask)
-        refused = refusal(photograph, predicted, self._stage, mask, trusted)
-        if refused is not None:
-            self.context.reporter.say(f"A photograph of {self.name} was not used: {refused}.", Level.WARNING)
-            return replace(now, photographs=(*now.photographs, {"refused": refused}))
-        said = self._equations(now, photograph, predicted, trusted)
-        parts = self._parts(now.frames)
+        reason = refusal(photograph, predicted, self._stage, mask, trusted)
+        if reason is not None:
+            self.context.reporter.say(f"A photograph of {self.name} was not used: {reason}.", Level.WARNING)
+            return replace(state, photographs=(*state.photographs, {"refused": reason}))
+        causes = self._equations(state, photograph, predicted, trusted)
+        parts = self._parts(state.frames)
         photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
-        found = self._error(photograph.radiance, trusted)
-        row = {"delta_e00_median": found.median, "delta_e00_p95": found.p95, "delta_e00_mean": found.mean,
+        error = self._error(photograph.radiance, trusted)
+        row = {"delta_e00_median": error.median, "delta_e00_p95": error.p95, "delta_e00_mean": error.mean,
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
-        rows = (*now.photographs, row)
-        if now.best is not None and now.error is not None:
-            better = gain(now.error, found.map)
+        state = replace(state, photographs=(*state.photographs, row), equations=causes)
+        judged = self._judge(state, error)
+        if judged.ended:
+            return judged
+        seen, left = model_error(photograph, predicted, trusted), error.map
+        if state.seen is not None:
+            seen = state.seen.then(seen)
+            left = self._error(predicted + seen.light, seen.known).map
+        is_last = number == self.options.photographs
+        return self._solve_again(replace(judged, seen=None if is_last else seen), seen, left, predicted)
+
+    def _judge(self, state: Refining, error: PhotographedError) -> Refining:
+        """Keep the frames just photographed, or the better ones before them; ``error``: of the photograph."""
+        if state.best is not None and state.error is not None:
+            better = gain(state.error, error.map)
             if better.mean <= 0:
-                return Refining(now.best, now.best, now.error, (*rows[:-1], {**row, "kept": False}), WORSE, said)
+                rows = (*state.photographs[:-1], {**state.photographs[-1], "kept": False})
+                return replace(state, frames=state.best, photographs=rows, ended=WORSE, seen=None)
             if not better.worth_it:
-                return Refining(now.frames, now.frames, found.map, rows, ENOUGH, said)
-        seen, error = model_error(photograph, predicted, trusted), found.map
-        if now.seen is not None:
-            seen = now.seen.then(seen)
-            error = self._error(predicted + seen.light, seen.known).map
-        kept = seen if number < self.options.photographs else None
-        judged = Refining(now.frames, now.frames, found.map, rows, equations=said, seen=kept)
-        return self._corrected(judged, seen, error, predicted)
+                return replace(state, best=state.frames, error=error.map, ended=ENOUGH, seen=None)
+        return replace(state, best=state.frames, error=error.map)
 
-    def _equations(self, now: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask) -> Float64:
-        """What this photograph and those before it say of common causes."""
-        frames = self._in_order(now.frames)
+    def _equations(
+        self, state: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask
+    ) -> Float64:
+        """What this photograph and the earlier ones say of common causes."""
+        frames = self._in_order(state.frames)
         error = np.where(trusted[..., None], photograph.radiance - predicted, 0).astype(np.float32)
-        said = equations(self.calibrated.transport, frames, error, self._stage, trusted)
-        return said if now.equations is None else said + now.equations
+        terms = equations(self.calibrated.transport, frames, error, self._stage, trusted)
+        return terms if state.equations is None else terms + state.equations
 
-    def _corrected(self, now: Refining, seen: ModelError, error: FloatImage, predicted: FloatImage) -> Refining:
-        """With frames of a corrected target, if the transport says that these are worth it; ``error`` as ``seen``."""
+    def _solve_again(self, state: Refining, seen: ModelError, left: FloatImage, predicted: FloatImage) -> Refining:
+        """``state`` with frames of a corrected target, if the transport says that these are worth it.
+
+        ``seen``: the model's error; ``left``: the error (CIEDE2000) of the present frames where ``seen`` is known.
+        """
         self.context.advance(0.4, "solving again")
         transport, black = self.calibrated.transport, self.calibrated.calibration.black
-        aimed = corrected_target(self.solved.target, seen, self._stage)
-        indirect = predicted - black - transport.forward(self._in_order(now.frames))
+        corrected = corrected_target(self.solved.target, seen, self._stage)
+        indirect = predicted - black - transport.forward(self._in_order(state.frames))
         frames = solve_again(
             self.calibrated.light,
             self.solved.target - indirect,
-            aimed - indirect,
-            SolveSettings(self.options.smoothness, start=self._in_order(now.frames)),
+            corrected - indirect,
+            SolveSettings(self.options.smoothness, start=self._in_order(state.frames)),
             SolveContext(
                 self.calibrated.engine,
                 progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),
@@ -202,10 +216,10 @@ class _Round:
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
         expected = self._error(self._predicted(new) + seen.light, seen.known)
-        if not gain(error, expected.map).worth_it:
-            return replace(now, ended=ENOUGH)
-        row = {**now.photographs[-1], "expected_median": expected.median}
-        return replace(now, frames=new, photographs=(*now.photographs[:-1], row))
+        if not gain(left, expected.map).worth_it:
+            return replace(state, ended=ENOUGH)
+        row = {**state.photographs[-1], "expected_median": expected.median}
+        return replace(state, frames=new, photographs=(*state.photographs[:-1], row))
 
     @property
     def _stage(self) -> RefinedStage:
@@ -217,8 +231,8 @@ class _Round:
 
     @property
     def _flicker(self) -> list[float]:
-        known = [IndirectFigures.read(self.calibrated.folder, name) for name in self.calibrated.projectors]
-        return [0.0 if one is None else one.flicker for one in known]
+        measured = [IndirectFigures.read(self.calibrated.folder, name) for name in self.calibrated.projectors]
+        return [0.0 if figures is None else figures.flicker for figures in measured]
 
     def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
         matrix = self.calibrated.calibration.camera_to_xyz
@@ -237,7 +251,8 @@ class _Round:
     def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
         return [frames[projector] for projector in self.calibrated.projectors]
 
-    def _photographed(self, frames: Mapping[str, FloatImage], light: FloatImage, number: int) -> ResultPhotograph:
+    def _photograph(self, frames: Mapping[str, FloatImage], light: FloatImage, number: int) -> ResultPhotograph:
+        """Show ``frames`` and photograph them in HDR; ``light`` (pixels, 3): about what they show."""
         if self.context.folder != self.calibrated.folder:
             inherit_camera(self.calibrated.folder, self.context.folder)
         shown = device_frames(self.calibrated.calibration, self._in_order(frames))
@@ -289,9 +304,6 @@ def sentence(name: str, figures: Mapping[str, Any]) -> str:
     before, after = f"{figures['before']:.2f}", f"{figures['after']:.2f}"
     expected = "an expected " if figures["expected"] else ""
     return f"Refined {name}: {before} to {expected}{after} (CIEDE2000 median) with {photographs}."
-
-
-__all__ = ["RefineOptions", "refine_steps", "sentence"]
 
 
 def causes_step(calibrated: Calibrated, names: Sequence[str], photographs: int, *, after: Sequence[StepId]) -> Step:
