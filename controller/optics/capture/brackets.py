@@ -15,17 +15,6 @@ from controller.core.errors import UsageError
 from controller.core.jit import compiled
 from controller.optics.capture.profile import CameraNoise
 
-__all__ = [
-    "BracketChoice",
-    "CameraNoise",
-    "ExposureChoice",
-    "MergedBracket",
-    "choose_brackets",
-    "choose_exposure",
-    "merge_brackets",
-    "minimum_level",
-]
-
 TARGET = 0.75
 """Of full scale, for the brightest lit pixels of a pattern: bright enough, with room for the lamp's flicker."""
 BRIGHT_PERCENTILE = 99.5

@@ -146,6 +146,3 @@ def _block_means(products: Float64) -> Float64:
     enough = count > WHOLE * BLOCK_PX**2 / 2
     total = np.where(known, blocks, 0).sum(axis=1)
     return np.asarray(np.divide(total, count, out=np.full(len(blocks), np.nan), where=enough), np.float64)
-
-
-__all__ = ["response_spread", "some_rows"]

@@ -108,6 +108,3 @@ def _shares(indirect: FloatImage, paint: FloatImage, veil: FloatImage, known: Ma
             contrast = varied.std(axis=0) > LEAST_CONTRAST * middle
             shares.append((bare / np.maximum(veil[here][use].mean(axis=0), 1e-30))[contrast])
     return np.concatenate(shares) if shares else np.zeros(0)
-
-
-__all__ = ["spread_by_lens", "veiled", "veiling_glare"]

@@ -245,6 +245,3 @@ def _sums(
         own = veil * own[..., None]
         own -= span @ (span.transpose(0, 2, 1) @ own)
         yield np.sum(own[..., 0] * seen, axis=1), np.sum(own[..., 0] ** 2, axis=1)
-
-
-__all__ = ["DarkPart", "Glare", "lens_veils", "projector_glare"]

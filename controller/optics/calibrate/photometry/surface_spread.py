@@ -256,6 +256,3 @@ def _scale(position_px: FloatImage, use: Mask) -> float:
     (down_x, right_x), (down_y, right_y) = (np.gradient(position_px[..., axis]) for axis in (0, 1))
     area = np.abs(right_x * down_y - right_y * down_x)
     return float(np.sqrt(np.nanmedian(area[use])))
-
-
-__all__ = ["contrast_left", "measure_spread", "spreading", "typical_spread"]

@@ -365,6 +365,3 @@ def _levels(table: Float64, place_px: Float64, variance: Float64) -> Float64:
     below = np.minimum(number.astype(np.int64), VARIANCES_PX2.size - 2)
     above = (number - below)[..., None]
     return np.asarray(table[below, place] * (1 - above) + table[below + 1, place] * above, np.float64)
-
-
-__all__ = ["Wave", "coarse_waves", "held_to"]

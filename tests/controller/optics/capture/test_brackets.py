@@ -10,12 +10,12 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.optics.capture.brackets import (
     RELATIVE_NOISE,
-    CameraNoise,
     choose_brackets,
     choose_exposure,
     merge_brackets,
     minimum_level,
 )
+from controller.optics.capture.profile import CameraNoise
 
 EXPOSURES = tuple(2.0**stop for stop in np.arange(-12, 3, 1 / 3))
 NOISE = CameraNoise(shot=1 / 5000, read=8 / 5000)

@@ -136,7 +136,7 @@ def test_poses_are_found_by_projector_in_any_order(names: list[str]) -> None:
         run = Path(place)
         poses = tuple(pinhole(n) for n in range(len(names)))
         geometry = Geometry(pinhole(9), poses, image(1), image(2), 0.1, True)
-        sure = Reconstruction(geometry, np.eye(1), ("x",), 0.1, 0.1, 0.1, 1, 1.0, 0.9, np.ones((2, 3), np.float32))
+        sure = Reconstruction(geometry, np.eye(1), ("x",), 0.1, 0.1, 0.1, 1.0, 0.9, np.ones((2, 3), np.float32))
         write_geometry(run, names, sure)
         assert projectors_of(run) == names
         found = read_geometry(run, names[::-1])
