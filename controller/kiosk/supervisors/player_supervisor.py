@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -79,6 +79,31 @@ on the outputs that was not seen here.
 """
 
 
+@dataclass(slots=True)
+class PlayerRun:
+    """What is known of one run of the player, from its start to its end.
+
+    ``with_bundle``: it was started with the installed bundle; ``dark``: it has shown no picture yet; ``hello``: its
+    answer when it was ready; ``bundles``: the loaded ones by the identity that it tells; ``reached``: what was wanted
+    when it answered last, which may be nothing, in a tuple, None: it has not answered yet; ``turns``: what it was told
+    to show in turn; ``skipped``: people know that it left an appearance out; ``identified`` and ``noticed``: the names
+    of the outputs, or which output shows which lines, are on the outputs now. Times in seconds that only go up:
+    ``looked_back_s``: when an earlier bundle was looked for.
+    """
+
+    with_bundle: bool = True
+    dark: bool = True
+    started_at_s: float = 0.0
+    looked_back_s: float = 0.0
+    hello: dict[str, Any] = field(default_factory=dict)
+    bundles: dict[str, Path] = field(default_factory=dict)
+    reached: tuple[Showing | None] | None = None
+    turns: tuple[Turn, ...] | None = None
+    skipped: bool = False
+    identified: bool = False
+    noticed: tuple[int, tuple[str, ...]] | None = None
+
+
 class PlayerSupervisor:
     """The player of a stage; see ``decide.interfaces.PlayerPort``.
 
@@ -107,17 +132,9 @@ class PlayerSupervisor:
         self._process: Process | None = None
         self._channel = channel or PlayerClient()
         self._view = PlayerView()
-        self._identities: dict[str, Path] = {}
         self._patience, self._failed = Patience(), 0
-        self._reached: tuple[Showing | None] | None = None
-        """What was wanted when it answered last, which may be nothing; None: it has not answered yet."""
-        self._with_bundle, self._starts_without_picture, self._dark = True, 0, True
-        self._turns: tuple[Turn, ...] | None = None
-        self._skipped = False
-        self._start_at_s, self._started_at_s, self._looked_back_s = 0.0, 0.0, 0.0
-        self._identified = False
-        self._noticed: tuple[int, tuple[str, ...]] | None = None
-        self._hello: dict[str, Any] = {}
+        self._starts_without_picture, self._start_at_s = 0, 0.0
+        self._run = PlayerRun()
         self._closed = False
 
     @property
@@ -151,7 +168,7 @@ class PlayerSupervisor:
         except DeviceRefused as error:
             self._patience.begins()
             # It says why it can't show that, so it does answer: an end changes nothing.
-            self._reached = (self.want,)
+            self._run.reached = (self.want,)
             problem = Notice(error.code, error.what, error.remedy, Level.ERROR)
             if error.code.startswith("bundle-") and self._starts_again():
                 # Only starts are counted, and after three without a picture the player goes back to the bundle before.
@@ -175,8 +192,8 @@ class PlayerSupervisor:
     def _start(self) -> None:
         try:
             failed = self._starts_without_picture
-            self._with_bundle, self._dark = failed < STARTS_WITH_BUNDLE or failed % 2 == 0, True
-            self._process = self._player(self._settings(self._with_bundle))
+            run = self._run = PlayerRun(with_bundle=failed < STARTS_WITH_BUNDLE or failed % 2 == 0)
+            self._process = self._player(self._settings(run.with_bundle))
             if self._closed:
                 # While it was made ready: it would show its picture after the service's end.
                 self._process.terminate()
@@ -192,15 +209,12 @@ class PlayerSupervisor:
             self._trouble(Notice("player-not-started", what, remedy or "It is tried again.", Level.ERROR))
             return
         self._patience.begins()
-        self._started_at_s, self._reached, self._identified = self._monotonic(), None, False
-        self._looked_back_s = self._started_at_s
-        self._noticed, self._hello = None, hello
-        self._turns, self._skipped = None, False
-        self._identities = {}
+        run.started_at_s = run.looked_back_s = self._monotonic()
+        run.hello = hello
         installed = self._settings(True).bundle
         if hello.get("bundle") and installed is not None:
             # The player may have gone back to the bundle before while it started.
-            self._identities[str(hello["bundle"])] = chosen(installed.parent) or installed.resolve()
+            self._run.bundles[str(hello["bundle"])] = chosen(installed.parent) or installed.resolve()
         self._tell(Notice("player-started", "The player is running."))
 
     def _player(self, settings: PlayerSettings) -> Process:
@@ -215,10 +229,10 @@ class PlayerSupervisor:
             self._process.kill()
         self._process.terminate()
         self._process = None
-        healthy = self._monotonic() - self._started_at_s >= HEALTHY_S
+        healthy = self._monotonic() - self._run.started_at_s >= HEALTHY_S
         self._failed = 0 if healthy else self._failed + 1
         # One that died after it had shown its picture says nothing about the bundle.
-        self._starts_without_picture += self._dark and self.want != BLACK
+        self._starts_without_picture += self._run.dark and self.want != BLACK
         self._start_at_s = self._monotonic() + BACK_OFF_S[min(max(self._failed - 1, 0), len(BACK_OFF_S) - 1)]
         self._view = replace(self._view, shown=None, problem=why, outputs=None, restarts=self._view.restarts + 1)
         if self._monotonic() >= self._start_at_s:
@@ -226,7 +240,7 @@ class PlayerSupervisor:
 
     def _ends_for_silence(self, *, refused: bool = False) -> bool:
         # While work shows pictures of its own nothing is wanted here, and an end would make its photographs black.
-        as_wanted = self._reached == (self.want,)
+        as_wanted = self._run.reached == (self.want,)
         return self._patience.ends(self._monotonic(), as_wanted=as_wanted, refused=refused)
 
     # -- showing
@@ -234,36 +248,36 @@ class PlayerSupervisor:
     def _follow(self, status: dict[str, Any]) -> None:
         # First: a bundle that can't be read ends this step, and people need to know of the cable, too.
         self._see_outputs(status)
-        path = self._identities.get(str(status["bundle"]))
+        path = self._run.bundles.get(str(status["bundle"]))
         name = status["appearance"] if status["showing"] == "appearance" else ""
         shown = BLACK if status["showing"] == "black" else None
         if name:
             shown = Showing(path, str(name), brightness=float(status["brightness"]))
         want = self.want
         if name:
-            self._dark, self._starts_without_picture = False, 0
-        if status["skipped"] and name and not self._skipped:
+            self._run.dark, self._starts_without_picture = False, 0
+        if status["skipped"] and name and not self._run.skipped:
             # Once, because it comes round again and again.
-            self._skipped = True
+            self._run.skipped = True
             self._tell(_SKIPPED)
         if self.identifying:
-            if not self._identified:
+            if not self._run.identified:
                 self._ask({"op": "identify"}, 3.0)
-                self._identified = True
+                self._run.identified = True
         elif want == BLACK and self.notice:
             self._tell_all()
         elif want is not None and (
-            not self._is_shown(want, shown, status) or self._identified or self._noticed is not None
+            not self._is_shown(want, shown, status) or self._run.identified or self._run.noticed is not None
         ):
-            self._identified, self._noticed = False, None
+            self._run.identified, self._run.noticed = False, None
             self._put(want, path)
             shown = want
-        if self._monotonic() - self._started_at_s >= HEALTHY_S:
+        if self._monotonic() - self._run.started_at_s >= HEALTHY_S:
             self._failed = 0
         outputs = self._view.outputs
         if outputs is None and self._view.problem is not None:
             self._tell(Notice("player-well", "The player shows what it should again."))
-        self._reached = (want,)
+        self._run.reached = (want,)
         self._view = replace(self._view, shown=shown, problem=outputs, warning=self._warning(status))
 
     def _see_outputs(self, status: dict[str, Any]) -> None:
@@ -276,11 +290,11 @@ class PlayerSupervisor:
         running = bool(status["sequence_running"])
         if not want.in_turn:
             # What somebody else lets the player show in turn is not ours to end.
-            return shown == want and not (running and self._turns)
+            return shown == want and not (running and self._run.turns)
         names = {name for name, _, _ in want.in_turn}
         same = shown is not None and shown.bundle == want.bundle and shown.appearance in names
         same = same and shown is not None and shown.brightness == want.brightness
-        return running and same and self._turns in (None, want.in_turn)
+        return running and same and self._run.turns in (None, want.in_turn)
 
     def _warning(self, status: dict[str, Any]) -> Notice | None:
         reported = status.get("warning")
@@ -292,13 +306,13 @@ class PlayerSupervisor:
         return warning
 
     def _tell_all(self) -> None:
-        outputs = outputs_of(self._hello)
+        outputs = outputs_of(self._run.hello)
         turn = int(self._monotonic() / NOTICE_TURN_S) % len(outputs)
-        if self._noticed == (turn, self.notice) and not self._identified:
+        if self._run.noticed == (turn, self.notice) and not self._run.identified:
             return
-        sequence = put(Path(self._hello["inbox"]), outputs, notice(outputs, self.notice, turn))
+        sequence = put(Path(self._run.hello["inbox"]), outputs, notice(outputs, self.notice, turn))
         self._ask({"op": "show", "sequence": sequence}, 3.0)
-        self._identified, self._noticed = False, (turn, self.notice)
+        self._run.identified, self._run.noticed = False, (turn, self.notice)
 
     def _put(self, want: Showing, loaded: Path | None) -> None:
         if not want.appearance or want.bundle is None:
@@ -307,8 +321,8 @@ class PlayerSupervisor:
             return
         if loaded != want.bundle:
             answer = self._ask({"op": "load-bundle", "path": str(want.bundle)}, 5.0)
-            self._identities[str(answer["bundle"])] = want.bundle
-            self._skipped = False
+            self._run.bundles[str(answer["bundle"])] = want.bundle
+            self._run.skipped = False
         request: dict[str, Any] = {"op": "play", "appearance": want.appearance, "fade_s": want.fade_s}
         if want.in_turn:
             items = [list(turn) for turn in want.in_turn]
@@ -317,8 +331,8 @@ class PlayerSupervisor:
         # The answer comes when the picture has faded in; until then the status tells what comes.
         with contextlib.suppress(DeviceTimeout) if want.fade_s > FADE_AWAITED_S else contextlib.nullcontext():
             if self._ask(request, PUT_S)["ok"]:
-                self._dark, self._starts_without_picture = False, 0
-        self._turns = want.in_turn
+                self._run.dark, self._starts_without_picture = False, 0
+        self._run.turns = want.in_turn
         what = f"{len(want.in_turn)} appearances in turn" if want.in_turn else want.appearance
         self._tell(Notice("playing", f"The player shows {what}."))
 
@@ -329,14 +343,14 @@ class PlayerSupervisor:
         """
         want = self.want
         unread = want is not None and want.bundle is not None and not want.appearance
-        return not self._with_bundle and self._dark and unread and self._earlier() is not None
+        return not self._run.with_bundle and self._run.dark and unread and self._earlier() is not None
 
     def _starts_again(self) -> bool:
         """Whether a player that can't load a bundle is to. One with a picture shows that of another bundle, such as one
         without some projectors; of the one before it could show all.
         """
-        if self._dark:
-            return self._with_bundle or self._monotonic() - self._started_at_s > AGAIN_S
+        if self._run.dark:
+            return self._run.with_bundle or self._monotonic() - self._run.started_at_s > AGAIN_S
         installed, want = self._installed, self.want
         if installed is None or want is None or want.bundle != installed:
             return False
@@ -350,9 +364,9 @@ class PlayerSupervisor:
     def _earlier(self) -> Path | None:
         """Looked for once a minute: the bundle that can be gone back to from the installed one."""
         now_s, link = self._monotonic(), self._settings(True).bundle
-        if link is None or now_s - self._looked_back_s < AGAIN_S:
+        if link is None or now_s - self._run.looked_back_s < AGAIN_S:
             return None
-        self._looked_back_s = now_s
+        self._run.looked_back_s = now_s
         return before_it(link.parent, self._installed, Starts.read(link.parent))
 
     def _trouble(self, problem: Notice) -> None:

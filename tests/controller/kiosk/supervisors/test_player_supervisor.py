@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 
+from controller.kiosk import world as player_starts
 from controller.kiosk.decide.interfaces import Showing
-from controller.kiosk.supervisors import player_supervisor as player_keeper
 from controller.kiosk.supervisors.player_supervisor import PlayerSupervisor
 from controller.play.control.launch import PlayerSettings
 from hal.notices import Notice
@@ -36,7 +36,7 @@ running: list[ModelProcess] = []
 def test_a_player_that_starts_after_its_keeper_was_closed_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(player_keeper, "PlayerProcess", ModelProcess)
+    monkeypatch.setattr(player_starts, "PlayerProcess", ModelProcess)
 
     def settings(with_bundle: bool) -> PlayerSettings:
         supervisor.close()  # the service ends while the start is prepared
@@ -94,7 +94,7 @@ def test_an_output_without_a_picture_is_told_beside_a_damaged_bundle(tmp_path: P
         # After starts that show nothing, one runs without the bundle, and answers.
         supervisor.step()
         now_s[0] += 5.0
-        if not supervisor._with_bundle:
+        if not supervisor._run.with_bundle:
             break
     wire.missing = ["P2"]
     supervisor.step()
