@@ -143,7 +143,7 @@ class Caller:
         """Call ``function``; its result must fit the annotation ``returns``.
 
         Raises the driver's own DeviceError unchanged, DriverFault("driver-fault") for other errors except Ctrl-C, and
-        DriverFault("driver-stuck") for a call that does not end: it goes on, and ``late`` gets what it may return.
+        DriverFault("driver-stuck") for a call that does not end: it still runs, and ``late`` gets what it may return.
         """
         patience = _Patience(self._grace_s, *args, *kwargs.values())
         try:

@@ -115,7 +115,7 @@ class WorkerLink(ABC, Generic[Opened]):
         )
 
     def not_opened(self, error: Exception) -> NotOpened:
-        """For ``find``: the device is listed, and ``error`` came of opening it."""
+        """For ``find``: the device is listed, and opening it raised ``error``."""
         return NotOpened(
             "hid-not-opened",
             what=f"The {self._name} is plugged in, but can't be opened ({error}).",

@@ -157,7 +157,7 @@ class Index:
     """What a bundle holds and where.
 
     ``stage`` and ``calibration`` say for which stage and from which calibration it was made; ``created_unix_s`` is
-    given by whoever publishes; ``revision`` never goes down on a kiosk (see ``install``). Version 1 has neither
+    given by the publisher; ``revision`` never goes down on a kiosk (see ``install``). Version 1 has neither
     ``schedule`` nor ``live``; versions 1 and 2 have one codec. ``codec`` is one of ``CODECS``.
     """
 

@@ -209,7 +209,7 @@ _LARGEST_BYTES: Final = 4096
 class Starts:
     """What is known of the starts with one bundle.
 
-    ``bundle``: its file's name; ``failed``: starts in a row without a picture, the one that goes on now among them;
+    ``bundle``: its file's name; ``failed``: starts in a row without a picture, the present one among them;
     ``given_up``: the file's name of a bundle that is not gone back to, because it failed itself.
     """
 
@@ -268,7 +268,7 @@ def _parsed(data: bytes) -> Starts | None:
 
 
 def forget(folder: Path) -> None:
-    """Count anew: somebody installed a bundle, or went back to one. Raises OSError."""
+    """Start counting again, because a bundle was installed or rolled back. Raises OSError."""
     for file in (folder / NAME, _in_memory(folder)):
         if file is not None:
             file.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ from controller.bundle.reader import Bundle
 from controller.core.channels import own_light
 
 ROUNDS: Final = 3
-"""Each leaves about a fifth of the error of the one before: a surface throws back less than it gets."""
+"""Each leaves about a fifth of the previous error: a surface throws back less than it gets."""
 SAMPLES: Final = 64
 """Target pixels that stand for a block."""
 
@@ -62,13 +62,13 @@ class LiveIndirect:
         """
         surface, black, most = self.sampled
         above = light - black
-        found: Float = np.zeros((len(self.factors), 3), np.float32)
+        falling: Float = np.zeros((len(self.factors), 3), np.float32)
         for _ in range(ROUNDS):
-            direct = surface * found
+            direct = surface * falling
             np.subtract(above, direct, out=direct)
             np.clip(direct, 0, most, out=direct)
-            found = self.factors @ direct.mean(axis=0)
-        return found.reshape(*self.grid, 3)
+            falling = self.factors @ direct.mean(axis=0)
+        return falling.reshape(*self.grid, 3)
 
     def spread(self, falling: Float) -> Float:
         """``falling`` (grid rows, columns, 3) at all target pixels: (height, width, 3), between blocks' middles."""
@@ -184,19 +184,19 @@ class LiveMaps:
             _output(bundle, o.name, (o.width_px, o.height_px), segmented=f"{o.name}.segment" in live.arrays)
             for o in bundle.index.outputs
         )
-        found = cls(
+        maps = cls(
             (width, height), gain, bundle.live_array("offset"), bundle.live_array("present"),
             float(_shaped(bundle.live_array("unit"), (1,), "f4", "unit")[0]),
             _shaped(bundle.live_array("noise"), (TILE, TILE), "f4", "noise"), outputs,
             _indirect(bundle, (height, width)) if "indirect.factors" in live.arrays else None,
             bundle.live_array("paint") if "paint" in live.arrays else None,
         )  # fmt: skip
-        _shaped(found.gain, (height, width, 3), "f2", "gain")
-        _shaped(found.offset, (height, width, 3), "f2", "offset")
-        _shaped(found.present, (height, width), "u1", "present")
-        if found.paint is not None:
-            _shaped(found.paint, (height, width, 3, 3), "f2", "paint")
-        return found
+        _shaped(maps.gain, (height, width, 3), "f2", "gain")
+        _shaped(maps.offset, (height, width, 3), "f2", "offset")
+        _shaped(maps.present, (height, width), "u1", "present")
+        if maps.paint is not None:
+            _shaped(maps.paint, (height, width, 3, 3), "f2", "paint")
+        return maps
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
         """The bundle's live section: every array by its name in it."""
@@ -346,6 +346,6 @@ def _means(maps: LiveMaps, output: OutputMaps, scale: Float) -> Float:
         share = np.exp(np.float32(-0.5) * (dx * dx - 2 * r * dx * dy + dy * dy) / (1 - r * r))
         total[here] += share[:, None] * scale[y, x]
         weight[here] += share * present[y, x]
-    found = np.zeros((*lit.shape, 3), np.float32)
-    found[lit] = np.divide(total, weight[:, None], out=np.zeros_like(total), where=weight[:, None] > 0)
-    return found
+    means = np.zeros((*lit.shape, 3), np.float32)
+    means[lit] = np.divide(total, weight[:, None], out=np.zeros_like(total), where=weight[:, None] > 0)
+    return means

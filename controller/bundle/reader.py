@@ -133,13 +133,13 @@ class Bundle:
             raise damaged(f"there are bytes between its parts, at {start}")
 
     def _blobs(self) -> list[fmt.Blob]:
-        found = []
+        blobs_of_all = []
         for appearance in self.index.appearances:
-            found += [blob for blobs in appearance.bands.values() for blob in blobs]
-            found += [appearance.thumbnail] if appearance.thumbnail else []
+            blobs_of_all += [blob for blobs in appearance.bands.values() for blob in blobs]
+            blobs_of_all += [appearance.thumbnail] if appearance.thumbnail else []
         if self.index.live is not None:
-            found += [array.blob for array in self.index.live.arrays.values()]
-        return found
+            blobs_of_all += [array.blob for array in self.index.live.arrays.values()]
+        return blobs_of_all
 
     def _view(self, blob: fmt.Blob) -> memoryview:
         return memoryview(self._data)[blob.offset : blob.offset + blob.length]
@@ -159,18 +159,18 @@ class Bundle:
 
         Raises BundleError("bundle-not-live") where the bundle has none of that name, and ("bundle-damaged").
         """
-        found = None if self.index.live is None else self.index.live.arrays.get(name)
-        if found is None:
+        array = None if self.index.live is None else self.index.live.arrays.get(name)
+        if array is None:
             raise BundleError(
                 "bundle-not-live",
                 what=f"The bundle contains no {name!r} for the live mode.",
                 remedy="Build it again on the stage with 'velatura bundle build --live'.",
             )
-        values = np.empty(found.shape, f"<{found.dtype}")
-        view = self._view(found.blob)
-        if xxhash.xxh3_64_intdigest(view) != found.blob.xxh3:
-            raise damaged(f"the bytes at {found.blob.offset} do not match their checksum")
-        self._inflater.into(view, values, found.blob.offset)
+        values = np.empty(array.shape, f"<{array.dtype}")
+        view = self._view(array.blob)
+        if xxhash.xxh3_64_intdigest(view) != array.blob.xxh3:
+            raise damaged(f"the bytes at {array.blob.offset} do not match their checksum")
+        self._inflater.into(view, values, array.blob.offset)
         if values.dtype.kind == "u":
             np.add.accumulate(values, axis=0, dtype=values.dtype, out=values)
         return values
@@ -198,14 +198,14 @@ class Bundle:
         are there already stay. Checks the quick checksum of every band that it reads. Raises as ``decode``; the
         buffers' content is then undefined. ValueError if a buffer does not have its output's shape.
         """
-        found = self.index.appearance(appearance)
+        bundled = self.index.appearance(appearance)
         codec = self.index.codec if self.version >= fmt.TILED_FROM else None
         images = {}
         for name, buffer in buffers.items():
             layout = self.index.output(name)
             if buffer.shape != (layout.height_px, layout.width_px, 3) or buffer.dtype != np.uint8:
                 raise ValueError(f"the buffer for {name} has shape {buffer.shape} and dtype {buffer.dtype}")
-            bands = [(blob, self._view(blob)) for blob in found.bands[name]]
+            bands = [(blob, self._view(blob)) for blob in bundled.bands[name]]
             content = None if known is None else known[name]
             images[name] = TiledImage(bands, layout, codec, buffer, content, self._inflater)
         tasks = [task for image in images.values() for task in image.tasks()]

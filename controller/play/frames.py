@@ -1,7 +1,7 @@
 """Sets of frames, and the mapped file that passes them on (docs/reference/player-protocol.md, "Frame file").
 
 The same layout serves the inbox (the controller writes, the player reads) and the memory output (the player writes,
-whoever emulates the projectors reads).
+the program that stands for the projectors reads).
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ def parse_outputs(text: str) -> tuple[OutputSize, ...]:
     """Read ``P1:280x210,P2:280x210``. Raises UsageError("outputs-wrong")."""
     outputs = []
     for part in text.split(","):
-        found = _OUTPUT.fullmatch(part)
-        if found is None or len(found[1].encode()) > LONGEST_NAME_BYTES or not found[1].isprintable():
+        match = _OUTPUT.fullmatch(part)
+        if match is None or len(match[1].encode()) > LONGEST_NAME_BYTES or not match[1].isprintable():
             raise _outputs_wrong(f"{part!r} is not NAME:WIDTHxHEIGHT")
-        outputs.append(OutputSize(found[1], int(found[2]), int(found[3])))
+        outputs.append(OutputSize(match[1], int(match[2]), int(match[3])))
     if len({output.name for output in outputs}) != len(outputs) or len(outputs) > MOST_OUTPUTS:
         raise _outputs_wrong(f"there are more than {MOST_OUTPUTS}, or two have the same name")
     if any(not 1 <= side <= MAX_SIDE_PX for output in outputs for side in output.shape[:2]):
@@ -158,7 +158,7 @@ class FrameFile:
     def __init__(self, path: Path, outputs: Sequence[OutputSize]) -> None:
         """Map ``path``, making it (mode 0600) unless it is there with these outputs already.
 
-        A file that is there goes on counting, so that readers who have it mapped see each new set.
+        The sequence of an existing file continues, so that readers who have it mapped see each new set.
 
         Raises WorkError("no-space" or "cannot-write"), UsageError("frames-in-use") if another process writes to it.
         """
@@ -206,7 +206,7 @@ class FrameFile:
     def read(self, into: FrameSet) -> int:
         """Copy the set out and return its sequence number.
 
-        Raises WorkError("frames-changing") if it was being written meanwhile.
+        Raises WorkError("frames-changing") if a set was written at the same time.
         """
         before = self.sequence
         for image, source in zip(into.pixels, self._mapped.pixels, strict=True):
@@ -238,7 +238,7 @@ def _in_use(path: Path) -> UsageError:
 
 
 def _refuse_in_use(path: Path) -> None:
-    """Raise UsageError("frames-in-use") rather than put another file in the place of one that somebody writes to."""
+    """Raise UsageError("frames-in-use") rather than put another file in the place of one that a process writes to."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

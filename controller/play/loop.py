@@ -25,7 +25,7 @@ from hal.codecs import player as player_codec
 
 
 class Playlist:
-    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or for ever if 0.
+    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or without end if 0.
 
     ``first_fade_s``: how long the first item comes in at the very beginning, None: as it says.
     """
@@ -66,7 +66,7 @@ class Playlist:
 
     @property
     def fade_s(self) -> float:
-        """For how long it comes in over the one before; 0: at once."""
+        """Seconds for which it fades in over the previous one; 0: at once."""
         return self._items[self._at][2] if self._first_fade_s is None else self._first_fade_s
 
     @property

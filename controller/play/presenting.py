@@ -157,7 +157,7 @@ _FORGET_PACED: Final = 0.9995
 class Presenter:
     """One ``Output`` on the grid of ``rate_hz``. It reads only the monotonic clock, which can't be set.
 
-    ``shown`` is the set on the outputs (the one before, while another fades in over it); ``last`` counts the sets.
+    ``shown`` is the set on the outputs (the previous one, while another fades in over it); ``last`` counts the sets.
     ``late`` counts what came more than a tick after its time, since ``begin_sequence``.
     """
 
@@ -193,13 +193,13 @@ class Presenter:
         began_s = time.monotonic()
         self._prepare(coming, frames)
         # Remember a slow preparation for a while, so that the next of its kind begins early enough. For what has a time
-        # of its own that is a long while: to begin too early costs nothing, where somebody waits it costs a tick.
+        # of its own that is a long while: to begin too early costs nothing, where a request waits it costs a tick.
         took_s = time.monotonic() - began_s
         self._prepare_s = min(max(took_s, _FORGET * self._prepare_s), tick_s)
         self._slowest_s = min(max(took_s, _FORGET_PACED * self._slowest_s), tick_s)
         sleep_until(due_s)
         if time.monotonic() > due_s + tick_s and coming.share == 0:
-            # One that somebody waits for is due when it comes; one that follows another has a time of its own.
+            # One that a request waits for is due when it comes; one that follows another has a time of its own.
             self.late += coming.paced and coming.on_result is None
             coming.delay(self.grid.after(time.monotonic()) - 1)
         self.last = PresentedSet(self.last.sequence + 1, self._output.flip())

@@ -125,8 +125,8 @@ def channels_of(product: str) -> int | None:
 
     Many makers' HID devices share vendor 16c0 and product 05df; only the name is specific.
     """
-    found = _NAME.fullmatch(product)
-    return int(found[1]) if found else None
+    match = _NAME.fullmatch(product)
+    return int(match[1]) if match else None
 
 
 def switch_report(channel: int, closed: bool) -> bytes:

@@ -181,13 +181,13 @@ def _folder_until_exit() -> Path:
 @cache
 def digest_of(source: Path) -> str:
     """A digest, 16 hexadecimal digits, of ``source`` and of all files of this project that it imports."""
-    found, waiting = {source}, [source]
+    sources, waiting = {source}, [source]
     while waiting:
-        new = _imported(waiting.pop()) - found
-        found |= new
+        new = _imported(waiting.pop()) - sources
+        sources |= new
         waiting += new
     content = hashlib.sha256()
-    for path in sorted(found):
+    for path in sorted(sources):
         content.update(f"{path.relative_to(ROOT)}\0".encode())
         content.update(hashlib.sha256(path.read_bytes()).digest())
     return content.hexdigest()[:16]
@@ -210,8 +210,8 @@ def _file_of(module: str) -> Path | None:
 
 def _quotas(groups: Path, membership: Path) -> list[float]:
     """CPUs that each control group of this process, and each group above it, may use."""
-    found = (_quota_of(group) for group in groups_of("cpu", groups, membership))
-    return [quota for quota in found if quota is not None]
+    quotas = (_quota_of(group) for group in groups_of("cpu", groups, membership))
+    return [quota for quota in quotas if quota is not None]
 
 
 def _quota_of(group: Path) -> float | None:
@@ -236,9 +236,9 @@ _LIMITS: Final = (
 
 def free_bytes(groups: Path = GROUPS, membership: Path = MEMBERSHIP, meminfo: Path = MEMINFO) -> int | None:
     """Bytes that can be had without swapping: of the machine, or of the tightest control group; None: not known."""
-    found = [_of_group(group) for group in groups_of("memory", groups, membership)]
-    known = [value for value in (_of_machine(meminfo), *found) if value is not None]
-    return max(min(known), 0) if known else None
+    of_groups = [_of_group(group) for group in groups_of("memory", groups, membership)]
+    amounts = [value for value in (_of_machine(meminfo), *of_groups) if value is not None]
+    return max(min(amounts), 0) if amounts else None
 
 
 def _of_machine(meminfo: Path) -> int | None:

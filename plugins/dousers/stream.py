@@ -91,7 +91,7 @@ class Stream:
         if before is not None and before.write(line):
             return
         self._end_process()
-        # Receivers drop packets whose number is up to 20 behind: the new process goes on well ahead of the old one.
+        # Receivers drop packets whose number is up to 20 behind: the new process starts well ahead of the old one.
         self._running = _Running(self._target, 0 if before is None else (before.sequence + _SKIPPED) % 256)
         self._running.write(line)
 

@@ -104,16 +104,16 @@ class PjLinkListener:
                 what=f"The search for projectors could not be sent: {error.strerror}.",
                 remedy="Check the network cable and that this machine has an address.",
             ) from error
-        found: dict[str, FoundProjector] = {}
+        projectors: dict[str, FoundProjector] = {}
         patience = deadline.within(patience_s)
-        while not patience.passed and len(found) < MOST_FOUND:
+        while not patience.passed and len(projectors) < MOST_FOUND:
             patience.sleep(0)
             for heard in self._received(patience):
                 if isinstance(heard.notification, SearchAck):
-                    found.setdefault(heard.notification.mac, FoundProjector(heard.host, heard.notification.mac))
+                    projectors.setdefault(heard.notification.mac, FoundProjector(heard.host, heard.notification.mac))
                 elif len(self._kept) < MOST_FOUND:
                     self._kept.append(heard)
-        return tuple(found.values())
+        return tuple(projectors.values())
 
     def heard(self, *, deadline: Deadline) -> Heard:
         """The next notification of a projector. DeviceTimeout if none came before the deadline."""
@@ -156,22 +156,22 @@ ANSWER_S: Final = 8.0
 def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     """Projectors that answer the search (class 2), and those in stage.toml (any class)."""
     known = {str(settings.get("address", "")): settings for settings in wanted.of("projector", "pjlink")}
-    found = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
+    devices = [_tried(address, settings, wanted, deadline) for address, settings in known.items()]
     hosts = {host for address in known if (host := _host(address))}
     try:
         answers = _searched(wanted, deadline)
     except DeviceError as error:
         problem = Notice.of(error)
-        return [*found, Found("network", "PJLink search", "search for projectors", problems=(problem,))]
+        return [*devices, Found("network", "PJLink search", "search for projectors", problems=(problem,))]
     for host, mac in answers:
         if host in hosts:
-            found = [
+            devices = [
                 dataclasses.replace(device, identity=mac) if _host(device.address) == host else device
-                for device in found
+                for device in devices
             ]
         else:
-            found.append(dataclasses.replace(_tried(host, {"address": host}, wanted, deadline), identity=mac))
-    return found
+            devices.append(dataclasses.replace(_tried(host, {"address": host}, wanted, deadline), identity=mac))
+    return devices
 
 
 def _searched(wanted: SearchScope, deadline: Deadline) -> list[tuple[str, str]]:
@@ -184,17 +184,17 @@ def _searched(wanted: SearchScope, deadline: Deadline) -> list[tuple[str, str]]:
 
 def _tried(address: str, settings: Mapping[str, Any], wanted: SearchScope, deadline: Deadline) -> Found:
     table = {"address": address, **{key: value for key, value in settings.items() if key in ("password", "profile")}}
-    found = Found("network", address, "PJLink projector", "projector", "pjlink", table)
+    entry = Found("network", address, "PJLink projector", "projector", "pjlink", table)
     try:
         projector = open_pjlink_projector(table, OpenContext(wanted.stage), deadline.within(ANSWER_S))
     except DeviceError as error:
-        return dataclasses.replace(found, problems=(Notice.of(error),))
+        return dataclasses.replace(entry, problems=(Notice.of(error),))
     with contextlib.closing(projector):
         try:
             identity = projector.identity(deadline=deadline.within(ANSWER_S))
         except DeviceError as error:
-            return dataclasses.replace(found, problems=(Notice.of(error),))
-    return dataclasses.replace(found, what=f"PJLink projector, {identity.maker} {identity.model}")
+            return dataclasses.replace(entry, problems=(Notice.of(error),))
+    return dataclasses.replace(entry, what=f"PJLink projector, {identity.maker} {identity.model}")
 
 
 def _host(address: str) -> str:

@@ -27,7 +27,7 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
     if not os.environ.get("DISPLAY") or program is None:
         return []
     try:
-        done = subprocess.run(  # noqa: S603 - a program of the system, without arguments from anybody
+        done = subprocess.run(  # noqa: S603 - a program of the system, without arguments from outside
             [program, "--query"], capture_output=True, text=True, errors="replace", check=False,
             timeout=max(0.1, deadline.within(PATIENCE_S).left_s()),
         )  # fmt: skip

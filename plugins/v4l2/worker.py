@@ -53,14 +53,14 @@ class VideoDevice:
         except OSError as error:
             raise kernel.device_error(error) from error
         try:
-            found = identify(path, self._handle)
-            if found is None:
+            node = identify(path, self._handle)
+            if node is None:
                 raise DeviceRefused(
                     "camera-no-capture",
                     what=f"{path} takes no pictures.",
                     remedy="Write another video device for address in the [camera] table.",
                 )
-            self.node: VideoNode = found
+            self.node: VideoNode = node
         except BaseException:
             os.close(self._handle)
             raise
@@ -82,23 +82,25 @@ class VideoDevice:
 
     def codes(self) -> list[str]:
         """The codes of its formats."""
-        found = []
+        codes = []
         for index in range(_MOST):
-            one = kernel.FormatDescription(index=index, type=kernel.CAPTURE)
-            if not kernel.answered(self._handle, kernel.ENUM_FMT, one):
+            description = kernel.FormatDescription(index=index, type=kernel.CAPTURE)
+            if not kernel.answered(self._handle, kernel.ENUM_FMT, description):
                 break
-            found.append(code_of(one.pixelformat))
-        return [code for code in found if code]
+            codes.append(code_of(description.pixelformat))
+        return [code for code in codes if code]
 
     def largest_px(self, code: str) -> tuple[int, int]:
         """The size with the most pixels; (0, 0) where the driver has no list."""
         best = (0, 0)
         for index in range(_MOST):
-            one = kernel.FrameSize(index=index, pixelformat=number_of(code))
-            if not kernel.answered(self._handle, kernel.ENUM_FRAMESIZES, one):
+            frame_size = kernel.FrameSize(index=index, pixelformat=number_of(code))
+            if not kernel.answered(self._handle, kernel.ENUM_FRAMESIZES, frame_size):
                 break
-            discrete = one.type == kernel.DISCRETE
-            size = (one.sides[0], one.sides[1]) if discrete else (one.sides[1], one.sides[4])
+            discrete = frame_size.type == kernel.DISCRETE
+            size = (
+                (frame_size.sides[0], frame_size.sides[1]) if discrete else (frame_size.sides[1], frame_size.sides[4])
+            )
             best = max(best, size, key=lambda sides: sides[0] * sides[1])
             if not discrete:
                 break
@@ -106,11 +108,11 @@ class VideoDevice:
 
     def set_format(self, video: VideoFormat, size_px: tuple[int, int]) -> None:
         """Set format and size; ``size_px`` (0, 0) leaves the size. Raises DeviceRefused where it takes another."""
-        wanted = kernel.Format(type=kernel.CAPTURE)
-        wanted.fmt.pix.width, wanted.fmt.pix.height = size_px
-        wanted.fmt.pix.pixelformat, wanted.fmt.pix.field = number_of(video.code), kernel.DISCRETE
-        kernel.call(self._handle, kernel.S_FMT, wanted)
-        has = wanted.fmt.pix
+        frame_format = kernel.Format(type=kernel.CAPTURE)
+        frame_format.fmt.pix.width, frame_format.fmt.pix.height = size_px
+        frame_format.fmt.pix.pixelformat, frame_format.fmt.pix.field = number_of(video.code), kernel.DISCRETE
+        kernel.call(self._handle, kernel.S_FMT, frame_format)
+        has = frame_format.fmt.pix
         if has.pixelformat != number_of(video.code) or size_px not in ((0, 0), (has.width, has.height)):
             raise DeviceRefused(
                 "camera-format",
@@ -123,25 +125,25 @@ class VideoDevice:
 
     def control(self, identifier: int) -> kernel.ControlQuery | None:
         """Range of a control that can be set; None where it has none."""
-        one = kernel.ControlQuery(id=identifier)
-        found = kernel.answered(self._handle, kernel.QUERYCTRL, one) and not one.flags & kernel.UNUSABLE
-        return one if found else None
+        query = kernel.ControlQuery(id=identifier)
+        usable = kernel.answered(self._handle, kernel.QUERYCTRL, query) and not query.flags & kernel.UNUSABLE
+        return query if usable else None
 
     def set_control(self, identifier: int, value: int) -> int:
         """Set a control; return what it has then."""
-        one = kernel.Control(id=identifier, value=value)
-        kernel.call(self._handle, kernel.S_CTRL, one)
-        kernel.call(self._handle, kernel.G_CTRL, one)
-        return int(one.value)
+        control = kernel.Control(id=identifier, value=value)
+        kernel.call(self._handle, kernel.S_CTRL, control)
+        kernel.call(self._handle, kernel.G_CTRL, control)
+        return int(control.value)
 
     def stop_automatics(self) -> None:
         """Exposure, gain, white balance and the like are left as they are now."""
-        wanted = dict(kernel.AUTOMATIC)
+        values = dict(kernel.AUTOMATIC)
         if self.node.driver == "uvcvideo":
-            wanted.update([kernel.UVC_GAMMA])
-        for identifier, value in wanted.items():
-            found = self.control(identifier)
-            if found is not None and found.minimum <= value <= found.maximum:
+            values.update([kernel.UVC_GAMMA])
+        for identifier, value in values.items():
+            control = self.control(identifier)
+            if control is not None and control.minimum <= value <= control.maximum:
                 # A menu need not have this entry: then it is left.
                 with contextlib.suppress(DeviceRefused):
                     self.set_control(identifier, value)
@@ -151,24 +153,27 @@ class VideoDevice:
         intervals = self._intervals()
         if not intervals:
             return
-        room = [one for one in intervals if one[0] / one[1] >= longest_s]
-        by_time = sorted(room or intervals, key=lambda one: one[0] / one[1])
+        room = [interval for interval in intervals if interval[0] / interval[1] >= longest_s]
+        by_time = sorted(room or intervals, key=lambda interval: interval[0] / interval[1])
         numerator, denominator = by_time[0] if room else by_time[-1]
-        wanted = kernel.Parameters(type=kernel.CAPTURE, numerator=numerator, denominator=denominator)
-        kernel.answered(self._handle, kernel.S_PARM, wanted)
+        parameters = kernel.Parameters(type=kernel.CAPTURE, numerator=numerator, denominator=denominator)
+        kernel.answered(self._handle, kernel.S_PARM, parameters)
 
     def _intervals(self) -> list[tuple[int, int]]:
-        found = []
+        intervals = []
         for index in range(_MOST):
-            one = kernel.FrameInterval(index=index, pixelformat=number_of(self.format.code))
-            one.width, one.height = self.size_px
-            if not kernel.answered(self._handle, kernel.ENUM_FRAMEINTERVALS, one):
+            interval = kernel.FrameInterval(index=index, pixelformat=number_of(self.format.code))
+            interval.width, interval.height = self.size_px
+            if not kernel.answered(self._handle, kernel.ENUM_FRAMEINTERVALS, interval):
                 break
-            pairs = [(one.parts[at], one.parts[at + 1]) for at in range(0, 2 if one.type == kernel.DISCRETE else 4, 2)]
-            found += [pair for pair in pairs if pair[0] and pair[1]]
-            if one.type != kernel.DISCRETE:
+            pairs = [
+                (interval.parts[at], interval.parts[at + 1])
+                for at in range(0, 2 if interval.type == kernel.DISCRETE else 4, 2)
+            ]
+            intervals += [pair for pair in pairs if pair[0] and pair[1]]
+            if interval.type != kernel.DISCRETE:
                 break
-        return found
+        return intervals
 
     def frame(self, skip: int, seconds: float) -> bytes:
         """Start, pass over ``skip`` whole frames, take the next one, stop; rows are without padding.
@@ -186,13 +191,13 @@ class VideoDevice:
             self._stop()
 
     def _map_buffers(self) -> None:
-        wanted = kernel.Buffers(count=_BUFFERS, type=kernel.CAPTURE, memory=kernel.MMAP)
-        kernel.call(self._handle, kernel.REQBUFS, wanted)
-        for index in range(wanted.count):
-            one = self._buffer(index)
-            kernel.call(self._handle, kernel.QUERYBUF, one)
+        request = kernel.Buffers(count=_BUFFERS, type=kernel.CAPTURE, memory=kernel.MMAP)
+        kernel.call(self._handle, kernel.REQBUFS, request)
+        for index in range(request.count):
+            buffer = self._buffer(index)
+            kernel.call(self._handle, kernel.QUERYBUF, buffer)
             try:
-                self._maps.append(mmap.mmap(self._handle, one.length, offset=one.m.offset))
+                self._maps.append(mmap.mmap(self._handle, buffer.length, offset=buffer.m.offset))
             except OSError as error:
                 raise kernel.device_error(error) from error
 
@@ -207,16 +212,16 @@ class VideoDevice:
             left_s = ends_s - time.monotonic()
             if left_s <= 0 or not watch.poll(1000 * left_s):
                 raise _cut(cut) if cut else _late()
-            one = kernel.Buffer(type=kernel.CAPTURE, memory=kernel.MMAP)
-            kernel.call(self._handle, kernel.DQBUF, one)
-            data = self._maps[one.index][: one.bytesused]
-            if one.flags & kernel.BAD_FRAME or not self._is_complete(data):
+            buffer = kernel.Buffer(type=kernel.CAPTURE, memory=kernel.MMAP)
+            kernel.call(self._handle, kernel.DQBUF, buffer)
+            data = self._maps[buffer.index][: buffer.bytesused]
+            if buffer.flags & kernel.BAD_FRAME or not self._is_complete(data):
                 cut += 1
             elif skip:
                 skip -= 1
             else:
                 return self._rows(data)
-            kernel.call(self._handle, kernel.QBUF, self._buffer(one.index))
+            kernel.call(self._handle, kernel.QBUF, self._buffer(buffer.index))
 
     def _is_complete(self, data: bytes) -> bool:
         if self.format.code in COMPRESSED:
@@ -319,9 +324,11 @@ class Worker(DeviceWorker[VideoDevice]):
     def _prepare(self, device: VideoDevice) -> None:
         settings = self._settings
         codes = device.codes()
-        known = [one for code in codes if (one := video_format(code, settings.bits)) is not None]
-        wanted = [one for one in known if one.code.strip() == settings.format] if settings.format else known
-        video: VideoFormat | None = max(wanted, default=None, key=rank)
+        formats = [choice for code in codes if (choice := video_format(code, settings.bits)) is not None]
+        choices = (
+            [choice for choice in formats if choice.code.strip() == settings.format] if settings.format else formats
+        )
+        video: VideoFormat | None = max(choices, default=None, key=rank)
         if video is None:
             raise PluginError(
                 "camera-format",
@@ -338,16 +345,16 @@ class Worker(DeviceWorker[VideoDevice]):
 
     def _measure_exposure(self, device: VideoDevice) -> None:
         """Which control sets the exposure, and its steps."""
-        found = device.control(kernel.EXPOSURE_ABSOLUTE)
+        control = device.control(kernel.EXPOSURE_ABSOLUTE)
         self._control = (kernel.EXPOSURE_ABSOLUTE, _ABSOLUTE_S)
-        if found is None and self._settings.exposure_step_s:
-            found = device.control(kernel.EXPOSURE)
+        if control is None and self._settings.exposure_step_s:
+            control = device.control(kernel.EXPOSURE)
             self._control = (kernel.EXPOSURE, self._settings.exposure_step_s)
-        if found is None:
+        if control is None:
             self._control, self._steps = (0, 1.0), []
             return
-        step_s, low, high, by = self._control[1], max(1, found.minimum), found.maximum, max(1, found.step)
-        on_grid = {found.minimum + round((time_s / step_s - found.minimum) / by) * by for time_s in _THIRDS}
+        step_s, low, high, by = self._control[1], max(1, control.minimum), control.maximum, max(1, control.step)
+        on_grid = {control.minimum + round((time_s / step_s - control.minimum) / by) * by for time_s in _THIRDS}
         self._steps = sorted(step for step in on_grid if low <= step <= high)
 
     def _times(self) -> list[float]:

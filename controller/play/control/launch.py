@@ -39,7 +39,7 @@ class PlayerSettings:
 
     ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
     ``where``: connector or display serial number by output name, where that is another; ``trusted``, ``revoked``:
-    public key files; ``resume``: it goes on with what was playing when it was killed; ``suggested``: it begins with the
+    public key files; ``resume``: it shows again what was playing when it was killed; ``suggested``: it begins with the
     bundle's own playlist otherwise; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
     """
 
@@ -69,7 +69,7 @@ class PlayerSettings:
 
 
 class PlayerProcess:
-    """A running player. Use as a context manager, or call ``terminate``; it goes on if its starter dies.
+    """A running player. Use as a context manager, or call ``terminate``; it keeps running if its starter dies.
 
     ``socket`` is where it serves.
     """
@@ -173,7 +173,7 @@ def _environment() -> dict[str, str]:
 def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:
     """End the player that still serves ``runtime`` because its starter was killed; whether there was one.
 
-    For the holder of the stage's lock only: to anybody else that player may be of use. One that hangs is killed.
+    Only for the holder of the stage's lock: other programs may need that player. One that hangs is killed.
     """
     return end_serving(runtime / SOCKET_NAME, timeout_s)
 
@@ -231,7 +231,7 @@ _ATTACHED_READY_S: Final = 20.0
 
 
 class AttachedPlayer:
-    """As ``launch.PlayerProcess``, of a player that somebody else starts with the arguments in ``options``.
+    """As ``launch.PlayerProcess``, of a player that another program starts with the arguments in ``options``.
 
     ``settings``: what it is to be started with; where the file says something else, the file is written and the player
     ended, and its next start reads it. None: as it is.

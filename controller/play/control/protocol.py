@@ -48,10 +48,10 @@ class Play:
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """Present appearances in turn, (name, seconds, fade_s) each, ``repeat`` times (0: for ever).
+    """Present appearances in turn, (name, seconds, fade_s) each, ``repeat`` times (0: without end).
 
-    An item lasts ``seconds``, in the first ``fade_s`` of which it comes in over the one before.
-    ``rate_hz``: the pictures change at multiples of 1 / rate_hz seconds meanwhile; None: at the player's own.
+    An item lasts ``seconds``, in the first ``fade_s`` of which it fades in over the previous one.
+    ``rate_hz``: during it pictures change at multiples of 1 / rate_hz seconds; None: at the player's own.
     ``brightness``: the share of their light that is shown, 0..1; ``first_fade_s``: for how long the first item comes
     in at the beginning, None: as it says.
     """
@@ -65,7 +65,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Suggested:
-    """Present the playlist that the loaded bundle suggests, ``repeat`` times (0: for ever)."""
+    """Present the playlist that the loaded bundle suggests, ``repeat`` times (0: without end)."""
 
     repeat: int
 

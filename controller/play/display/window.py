@@ -254,7 +254,7 @@ class WindowOutput:
     def _follow(self) -> None:
         """Outputs came, went or moved: place the window and the pictures again."""
         found, _ = self._find()
-        # With all cables out at the start, the stage's outputs look like those of somebody who gave no names.
+        # With all cables out at the start, the stage's outputs look like outputs without names.
         self._beside = self._beside and not found
         if self._beside:
             return

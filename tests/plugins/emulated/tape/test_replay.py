@@ -16,7 +16,7 @@ from pypjlink import Projector as PyPjLink
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
-from hal.tape import Tape, ptpip_relays, read_tape, stream_relay
+from hal.tape import Tape, read_tape
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of, quick_profile
@@ -29,6 +29,7 @@ from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector
 from plugins.ptp.camera import open_camera
 from tests.campaigns.camera_peers import SIZE, network_peer
+from tests.plugins.emulated.tape.relay import ptpip_relays, stream_relay
 from tests.plugins.ptp.ptp_rig import FLAVOURS, Studio
 
 QUICK = LampTiming(0.1, 0.1)
