@@ -98,7 +98,7 @@ import controller.__main__ as program
 import controller.stage.services.calibrate, controller.stage.services.play, controller.stage.services.live
 import controller.stage.services.bundle
 import controller.stage.services.camera, controller.stage.services.plan, controller.kiosk.api.offline_dispatch
-import trimesh, cv2, OpenEXR, plugins.emulated.bench, controller.demo.job, controller.stage.doctor.examine
+import trimesh, cv2, OpenEXR, plugins.emulated.bench, controller.demo, controller.stage.doctor.examine
 import controller.stage.services.compare, controller.panel.server
 from tests.campaigns.bad_readers import COMMANDS
 program.MEMBERS["For this campaign"] = COMMANDS

@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
-from controller.demo import stage as demo_stage
+from controller import demo as demo_stage
 from plugins.emulated import bench
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.emulated.optics import staging, world

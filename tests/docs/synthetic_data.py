@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import save_arrays
-from controller.stage.artefacts.photographs import BLACK, Taken, captures_folder, light_of
+from controller.stage.artefacts.photographs import BLACK, TakenPhotograph, captures_folder, light_of
 from controller.stage.artefacts.solved import Solved
 from controller.stage.services.export import export
 from tests.controller.api.test_photographs import write_captures
@@ -59,7 +59,7 @@ def write_full_run(run: Path) -> None:
             folder = captures_folder(run, of.shot(name))
             folder.mkdir(parents=True, exist_ok=True)
             write_dng(folder / f"{name}.dng", mosaic_of(np.minimum(light * scene * exposure_s, 1.0), RGGB))
-            taken.append(Taken(name, folder / f"{name}.dng", exposure_s, projector=of.projector))
+            taken.append(TakenPhotograph(name, folder / f"{name}.dng", exposure_s, projector=of.projector))
         of.write(run, taken)
     rng = np.random.default_rng(5)
     frames = {name: rng.integers(0, 256, (20, 26, 3), dtype=np.uint8) for name in ("left", "right")}

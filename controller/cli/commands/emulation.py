@@ -40,7 +40,7 @@ def demo(
     """Run a complete job on an emulated stage, up to the report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.demo.stage import prepare
+        from controller.demo import prepare
 
         stage = prepare(out.resolve(), size=size, object_file=object, seed=seed, room=room)
         if prepare_only:
@@ -49,7 +49,7 @@ def demo(
             check_stage(stage)
             return {"stage": str(stage)}
         # Only now: all that the job uses takes seconds to import.
-        from controller.demo.job import demo
+        from controller.demo import demo
 
         return demo(stage, reporter=reporter, cancel=cancel)
 

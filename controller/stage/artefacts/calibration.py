@@ -15,7 +15,7 @@ from controller.optics.calibrate.values import Calibration, Correspondence, Phas
 from controller.optics.capture.brackets import merge_brackets
 from controller.optics.capture.raw import CAMERA_BLUR_PX
 from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures
-from controller.stage.artefacts.photographs import BLACK, Taken, codes_of, light_of
+from controller.stage.artefacts.photographs import BLACK, TakenPhotograph, codes_of, light_of
 from controller.stage.artefacts.projectors import (
     Light,
     Pixels,
@@ -29,7 +29,7 @@ LIT_SHARE = 0.004
 """A camera pixel counts as lit if a projector's white is above this share of the brightest white."""
 
 
-def merge_photographs(taken: Sequence[Taken]) -> FloatImage:
+def merge_photographs(taken: Sequence[TakenPhotograph]) -> FloatImage:
     """HDR radiance in full scales per second from photographs of one picture."""
     noise = taken[0].profile.noise if taken and taken[0].profile is not None else None
     return merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
@@ -40,7 +40,7 @@ def read_black(folder: Path) -> FloatImage:
     return merge_photographs(BLACK.read(folder))
 
 
-def read_captures(folder: Path, projector: str) -> dict[str, Taken]:
+def read_captures(folder: Path, projector: str) -> dict[str, TakenPhotograph]:
     """All photographs of one projector's patterns, by the pattern's name."""
     return {**light_of(projector).by_name(folder), **codes_of(projector).by_name(folder)}
 

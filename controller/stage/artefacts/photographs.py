@@ -21,7 +21,7 @@ PATTERN: Final = "pattern"
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class TakenPhotograph:
     """A photograph on disk, with the exposure that the camera confirmed, in seconds.
 
     ``fresh``: it was taken by this run, not by an earlier one.
@@ -72,7 +72,7 @@ class PhotographSet:
         """The identity of one of them; ``projector`` if the set itself has none."""
         return ShotId(str(self.kind), name, projector or self.projector)
 
-    def write(self, run: Path, taken: Sequence[Taken]) -> Path:
+    def write(self, run: Path, taken: Sequence[TakenPhotograph]) -> Path:
         """Write the index, in the order in which they were taken."""
         rows = [
             {
@@ -85,26 +85,26 @@ class PhotographSet:
         ]
         return write_json(self.index(run), rows)
 
-    def read(self, run: Path) -> tuple[Taken, ...]:
+    def read(self, run: Path) -> tuple[TakenPhotograph, ...]:
         """The photographs in the index, with the run's corrected exposure times."""
         profile = load_profile(run)
         return tuple(self._taken(run, row, profile) for row in read_json(self.index(run)))
 
-    def by_name(self, run: Path) -> dict[str, Taken]:
+    def by_name(self, run: Path) -> dict[str, TakenPhotograph]:
         """As ``read``, by name; for a set of one projector or of none, whose names differ."""
         return {photograph.name: photograph for photograph in self.read(run)}
 
-    def by_projector(self, run: Path, name: str = PATTERN) -> dict[str | None, Taken]:
+    def by_projector(self, run: Path, name: str = PATTERN) -> dict[str | None, TakenPhotograph]:
         """As ``read``, those of this name by their lit projector."""
         return {photograph.projector: photograph for photograph in self.read(run) if photograph.name == name}
 
     @staticmethod
-    def _taken(run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> Taken:
+    def _taken(run: Path, row: Mapping[str, Any], profile: CameraProfile | None) -> TakenPhotograph:
         exposure_s = true_exposure(profile, float(row["exposure_s"]))
-        return Taken(row["name"], run / row["path"], exposure_s, profile=profile, projector=row["projector"])
+        return TakenPhotograph(row["name"], run / row["path"], exposure_s, profile=profile, projector=row["projector"])
 
 
-def noise_of(taken: Taken) -> CameraNoise:
+def noise_of(taken: TakenPhotograph) -> CameraNoise:
     """Noise of a photograph's samples in full scales per second; as measured, or as cameras have it."""
     noise = CameraNoise() if taken.profile is None else taken.profile.noise
     return noise.per_second(taken.exposure_s)
@@ -140,7 +140,7 @@ def white_name(number: int) -> str:
     return f"{WHITE}-{number}"
 
 
-def white_bracket(taken: Sequence[Taken]) -> list[Taken]:
+def white_bracket(taken: Sequence[TakenPhotograph]) -> list[TakenPhotograph]:
     """The bracket of white among the photographs of a projector's light."""
     found = {photograph.name: photograph for photograph in taken}
     names = (white_name(number) for number in range(len(found)))
@@ -196,7 +196,7 @@ class Developed(Mapping[str, FloatImage]):
     ``ready`` holds images in memory (HDR black and white), which take precedence over the photographs.
     """
 
-    def __init__(self, taken: Mapping[str, Taken], ready: Mapping[str, FloatImage]) -> None:
+    def __init__(self, taken: Mapping[str, TakenPhotograph], ready: Mapping[str, FloatImage]) -> None:
         self._taken = taken
         self._ready = ready
 

@@ -18,7 +18,7 @@ from controller.core.errors import UsageError
 from controller.core.storage import exclusive
 from controller.optics.solve.engines import graphics_sentence
 from controller.run.progress import Reporter
-from controller.stage.doctor.values import Examination, Tried
+from controller.stage.doctor.values import DeviceResult, Examination
 from controller.stage.doctor.writing import write
 from controller.stage.rig.lamp_guard import fatal_faults, faulty
 from controller.stage.sessions.check import Checked, check_stage
@@ -74,7 +74,7 @@ def devices_of(checked: Checked) -> Iterator[Device]:
         yield Device("key panel", "button_panel", *checked.key_panel)
 
 
-class Trying:
+class DeviceSurvey:
     """Tests one device after the other, and remembers which relays are open."""
 
     def __init__(self, checked: Checked, deadline: Deadline) -> None:
@@ -82,14 +82,14 @@ class Trying:
         self._deadline = deadline
         self._dark: dict[str, str] = {}
 
-    def each(self, failed: Mapping[str, Notice]) -> Iterator[tuple[Tried, Notice | None]]:
+    def results(self, failed: Mapping[str, Notice]) -> Iterator[tuple[DeviceResult, Notice | None]]:
         """Test every device, except those whose address has ``failed`` already."""
         for device in devices_of(self._checked):
             problem = failed.get(device.place)
             answer = None
             if problem is None:
                 try:
-                    answer = self._asked(device)
+                    answer = self._answer_of(device)
                 except DeviceError as error:
                     problem = Notice.of(error)
             if problem is not None and device.name in self._dark:
@@ -98,9 +98,9 @@ class Trying:
                     f"Projector {device.name} does not answer, and its mains relay {self._dark[device.name]} is open.",
                     "A run closes it automatically. To test it now, switch the relay on by hand (usbrelay).",
                 )
-            yield Tried(device.name, device.kind, answer), problem and replace(problem, about=device.name)
+            yield DeviceResult(device.name, device.kind, answer), problem and replace(problem, about=device.name)
 
-    def _asked(self, device: Device) -> str:
+    def _answer_of(self, device: Device) -> str:
         context = open_context(self._checked.stage.folder)
         until = self._deadline.within(OPEN_S)
         opened = open_device(device.driver, device.settings, context, until, name=device.title)
@@ -349,10 +349,8 @@ def _tried(checked: Checked, seen: Examination, deadline: Deadline, reporter: Re
         if device.problems and not device.problems[0].code.endswith("may-be-taken")
     }
     tried, findings = [], list(seen.findings)
-    for one, finding in Trying(checked, deadline).each(failed):
-        tried.append(one)
-        if finding is not None and replace(finding, about="") not in [
-            replace(earlier, about="") for earlier in findings
-        ]:
+    for result, finding in DeviceSurvey(checked, deadline).results(failed):
+        tried.append(result)
+        if finding is not None and replace(finding, about="") not in [replace(known, about="") for known in findings]:
             findings.append(finding)
     return replace(seen, tried=tuple(tried), findings=tuple(findings))

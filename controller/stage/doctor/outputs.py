@@ -27,7 +27,7 @@ from controller.stage.rig.lamp_session import lit
 from controller.stage.rig.power import light
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.open import opened
+from controller.stage.sessions.open import opened_rig
 from controller.stage.sessions.run import LOCK
 from hal.deadline import Deadline, in_seconds
 from hal.notices import Level, Notice
@@ -68,7 +68,7 @@ def examine_outputs(
     safety = checked.stage.tables.safety
     with (
         exclusive(stage / LOCK, what_is_running="Velatura"),
-        opened(checked, deadline=deadline) as rig,
+        opened_rig(checked, deadline=deadline) as rig,
         lit(rig, Machine(), power_down_s=safety.power_down_s, reporter=reporter),
     ):
         reporter.say("Switching the lamps on.")

@@ -11,7 +11,7 @@ from hal.notices import Notice
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class DeviceResult:
     """A tested device of stage.toml: ``answer`` describes its state, None if it failed."""
 
     name: str
@@ -28,7 +28,7 @@ class Examination:
     """
 
     found: tuple[Found, ...]
-    tried: tuple[Tried, ...]
+    tried: tuple[DeviceResult, ...]
     findings: tuple[Notice, ...]
     new: tuple[Found, ...]
     written: tuple[str, ...] = ()

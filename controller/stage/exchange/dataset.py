@@ -18,7 +18,7 @@ from controller.optics.capture.linear_files import exr_bytes
 from controller.optics.capture.profile import load_profile, true_exposure
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import read_json, safe_name
-from controller.stage.artefacts.photographs import Taken
+from controller.stage.artefacts.photographs import TakenPhotograph
 from controller.stage.artefacts.published import has_photograph, read_photograph_of
 from controller.stage.artefacts.solved import read_solved
 from controller.stage.exchange.content import Content
@@ -34,7 +34,7 @@ MEASURED: Final = (
 @dataclass(frozen=True, slots=True)
 class _Photograph:
     kind: str
-    taken: Taken
+    taken: TakenPhotograph
 
 
 def write_dataset(content: Content, folder: Path) -> dict[str, int]:
@@ -85,7 +85,7 @@ def _photographs(run: Path) -> Iterator[_Photograph]:
                 continue
             known.add(path)
             seconds = true_exposure(profile, float(row["exposure_s"]))
-            taken = Taken(row["name"], path, seconds, profile=profile, projector=row.get("projector"))
+            taken = TakenPhotograph(row["name"], path, seconds, profile=profile, projector=row.get("projector"))
             yield _Photograph(path.parent.name, taken)
 
 

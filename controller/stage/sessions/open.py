@@ -35,7 +35,7 @@ OPEN_S = 20.0
 
 
 @contextlib.contextmanager
-def opened(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iterator[Rig]:
+def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iterator[Rig]:
     """Open every device of the stage and start the player; on leaving, close the devices and end the player.
 
     ``plays``: the player starts with the installed bundle; the start fails if it shows no picture of it.

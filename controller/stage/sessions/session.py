@@ -19,7 +19,7 @@ from controller.stage.rig.ambient_light import dark_before
 from controller.stage.rig.lamp_session import lit, power_steps
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
-from controller.stage.sessions.open import opened
+from controller.stage.sessions.open import opened_rig
 from controller.stage.sessions.run import LONGEST_RUN_S, stage_lock, unfinished_run
 from hal.deadline import in_seconds
 
@@ -36,7 +36,7 @@ class StageWork:
     name : the run's kind; an unfinished run of this name is continued
     make_steps : its steps with the lamps on
     dark : refuse a bright room, if the stage has a light sensor
-    plays : as in ``sessions.open.opened``
+    plays : as in ``sessions.open.opened_rig``
     before : steps before the lamps are struck, if they are not lit yet
     """
 
@@ -95,7 +95,7 @@ class OwnSession(StageSession):
             stage_lock(stage.folder),
             kernels_compiled(reporter) as compiled,
             self.around or contextlib.nullcontext(),
-            opened(checked, deadline=deadline, plays=work.plays) as rig,
+            opened_rig(checked, deadline=deadline, plays=work.plays) as rig,
             Journal(unfinished_run(stage.folder, work.name, finished=self.again)) as journal,
         ):
             clear_unfinished_writes(journal.folder)

@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import VelaturaError
-from controller.demo.stage import DEFAULT_ROOM
+from controller.demo import DEFAULT_ROOM
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.metapixels.from_phase import fit_metapixels

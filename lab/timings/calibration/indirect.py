@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.demo.stage import prepare
+from controller.demo import prepare
 from controller.optics.solve.result.metrics import colour_difference
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import TroubleCode
-from controller.demo.job import demo
-from controller.demo.stage import APPEARANCES, prepare
+from controller.demo import APPEARANCES, demo, prepare
 from controller.run.progress import Silent
 from lab.timings import Row, at_least, at_most
 from plugins.emulated.core.truth import NO_BANDS, BenchTruth, ProjectorTruth, read_truth

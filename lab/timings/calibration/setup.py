@@ -22,7 +22,7 @@ from typing import Final
 from unittest.mock import patch
 
 from controller.config.writer import KeyChange, rewrite_stage
-from controller.demo.stage import DEFAULT_ROOM
+from controller.demo import DEFAULT_ROOM
 from controller.run.progress import Phase, Progress, Silent
 from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.sessions.bench import BenchProcess

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.demo.stage import DEFAULT_ROOM, prepare
+from controller.demo import DEFAULT_ROOM, prepare
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId

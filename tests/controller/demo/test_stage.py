@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from controller import demo as module
 from controller.config import load_stage
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.demo import stage as module
-from controller.demo.stage import BUILDING, DEFAULT_ROOM, MARK, prepare
+from controller.demo import BUILDING, DEFAULT_ROOM, MARK, prepare
 from hal.errors import DeviceError
 
 TABLES = {

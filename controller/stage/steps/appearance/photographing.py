@@ -26,7 +26,7 @@ from controller.optics.solve.result.refinement import FLOOR
 from controller.run.runner import Context, Step
 from controller.run.step_id import ShotId, StepId
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.photographs import Taken
+from controller.stage.artefacts.photographs import TakenPhotograph
 from controller.stage.artefacts.published import write_photograph, write_playback
 from controller.stage.artefacts.solved import read_solved
 from controller.stage.rig.rig import Rig
@@ -114,7 +114,7 @@ def _known(white: float, available_s: Sequence[float], longest_s: float, profile
     return [value for value in available_s if low <= value <= min(high, longest_s) and profile.knows(value)]
 
 
-def timed(taken: Sequence[Taken]) -> list[Taken]:
+def timed(taken: Sequence[TakenPhotograph]) -> list[TakenPhotograph]:
     """Photographs of one picture with their true exposures: those that are not known, by those that are.
 
     ``taken`` have the exposures of their ``profile`` where it knows them. Where no two overlap, nothing is changed.
@@ -134,7 +134,7 @@ def timed(taken: Sequence[Taken]) -> list[Taken]:
     return [replace(one, exposure_s=fmean(times[one.exposure_s])) if one.exposure_s in times else one for one in taken]
 
 
-def _measured_s(one: Taken, sure: Taken, profile: CameraProfile) -> float:
+def _measured_s(one: TakenPhotograph, sure: TakenPhotograph, profile: CameraProfile) -> float:
     """Its exposure in seconds as the light says, compared with ``sure``."""
     (shorter, levels), (longer, _) = (
         _exposed(each, profile) for each in sorted((one, sure), key=lambda each: each.exposure_s)
@@ -143,7 +143,7 @@ def _measured_s(one: Taken, sure: Taken, profile: CameraProfile) -> float:
     return sure.exposure_s / ratio if one.exposure_s < sure.exposure_s else sure.exposure_s * ratio
 
 
-def _exposed(one: Taken, profile: CameraProfile) -> tuple[RawExposure, SensorLevels]:
+def _exposed(one: TakenPhotograph, profile: CameraProfile) -> tuple[RawExposure, SensorLevels]:
     raw = read_mosaic(one.path, profile=profile)
     return RawExposure(raw.samples, one.exposure_s), raw.levels
 
@@ -219,7 +219,9 @@ def photograph_hdr(rig: Rig, context: Context, shown: ShownPicture, longest_s: f
     return np.asarray(np.nan_to_num(merged), np.float32)
 
 
-def take_hdr(rig: Rig, context: Context, shown: ShownPicture, longest_s: float) -> tuple[list[Taken], FloatImage]:
+def take_hdr(
+    rig: Rig, context: Context, shown: ShownPicture, longest_s: float
+) -> tuple[list[TakenPhotograph], FloatImage]:
     """As ``photograph_hdr``: the photographs, and their combination, NaN where it is too bright for all."""
     profile = load_profile(context.folder)
     exposures_s = speeds(shown.white, rig.acquirer.exposures_s(), longest_s, profile, light=shown.light)
@@ -233,7 +235,7 @@ def take_hdr(rig: Rig, context: Context, shown: ShownPicture, longest_s: float) 
 def take_bracket(
     rig: Rig, context: Context, kind: str, name: str, exposures_s: Sequence[float], *, shown_at_s: float,
     of: Mapping[str, str],
-) -> list[Taken]:  # fmt: skip
+) -> list[TakenPhotograph]:  # fmt: skip
     """Photographs of what is shown now, in this order, with their true exposures; the rest as ``photograph_hdr``."""
     with photograph_series(rig, context) as series:
         for number, exposure_s in enumerate(exposures_s):

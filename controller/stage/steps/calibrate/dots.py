@@ -41,7 +41,7 @@ from controller.stage.artefacts.calibration import read_calibration, read_corres
 from controller.stage.artefacts.depth_edges import EdgeDots, read_edges, write_edges, write_terms
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.artefacts.kinds import StepKind, of_projectors
-from controller.stage.artefacts.photographs import Developed, PhotographSet, Taken
+from controller.stage.artefacts.photographs import Developed, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import DotMetapixels, DotNotes, Light, write_dot_figures
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
@@ -128,7 +128,7 @@ def _photograph_name(pattern: DotPattern) -> str:
     return f"{pattern.spacing_px:02d}-{pattern.name}"
 
 
-def read_dots(folder: Path, of: PhotographSet, patterns: Sequence[DotPattern]) -> dict[str, Taken]:
+def read_dots(folder: Path, of: PhotographSet, patterns: Sequence[DotPattern]) -> dict[str, TakenPhotograph]:
     """The photographs of the dots of one projector, by the pattern's name."""
     taken = {item.name: item for item in read_batches(folder, of, len(patterns))}
     return {pattern.name: taken[_photograph_name(pattern)] for pattern in patterns}

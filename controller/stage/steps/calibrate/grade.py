@@ -32,7 +32,7 @@ from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.geometry import has_geometry, read_geometry
 from controller.stage.artefacts.grade import ErrorMaps, in_rows, write_grade
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, Taken, codes_of
+from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of
 from controller.stage.artefacts.projectors import IndirectFigures, Light
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
@@ -82,7 +82,7 @@ def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
     return {name: image}
 
 
-def _taken(folder: Path, projector: str, pattern: Pattern) -> Taken:
+def _taken(folder: Path, projector: str, pattern: Pattern) -> TakenPhotograph:
     if VERIFICATION.index(folder).exists():
         return VERIFICATION.by_projector(folder)[projector]
     return codes_of(projector).by_name(folder)[pattern.name]

@@ -42,7 +42,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.camera import Delay, Exposures, write_camera_figures, write_response_figures
 from controller.stage.artefacts.kinds import StepKind, white_of
 from controller.stage.artefacts.names import CAPTURES
-from controller.stage.artefacts.photographs import BLACK, CAMERA_RESPONSE, Taken, light_of, white_bracket
+from controller.stage.artefacts.photographs import BLACK, CAMERA_RESPONSE, TakenPhotograph, light_of, white_bracket
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.capture.exposure import White, white_exposures
@@ -263,7 +263,7 @@ def _measure_camera(projectors: Sequence[str], context: Context) -> Sequence[Pat
 
 
 def _of_raw(
-    black: Sequence[Taken], whites: Sequence[Sequence[Taken]], context: Context
+    black: Sequence[TakenPhotograph], whites: Sequence[Sequence[TakenPhotograph]], context: Context
 ) -> tuple[CameraProfile, dict[str, object], Mapping[TroubleCode, str]]:
     dark = [_exposed(one) for one in black]
     levels = dark[0][0].levels
@@ -303,12 +303,12 @@ def _of_raw(
     return profile, figures, faults
 
 
-def _exposed(taken: Taken) -> tuple[RawMosaic, RawExposure]:
+def _exposed(taken: TakenPhotograph) -> tuple[RawMosaic, RawExposure]:
     raw = read_mosaic(taken.path)
     return raw, RawExposure(raw.samples, taken.exposure_s)
 
 
-def _samples(taken: Taken, profile: CameraProfile) -> FloatImage:
+def _samples(taken: TakenPhotograph, profile: CameraProfile) -> FloatImage:
     """Raw samples in full scale, NaN where clipped."""
     linear, clipped = read_mosaic(taken.path, profile=profile).linear()
     linear[clipped] = np.nan
@@ -316,7 +316,7 @@ def _samples(taken: Taken, profile: CameraProfile) -> FloatImage:
 
 
 def _of_colours(
-    kind: str, black: Sequence[Taken], whites: Sequence[Sequence[Taken]]
+    kind: str, black: Sequence[TakenPhotograph], whites: Sequence[Sequence[TakenPhotograph]]
 ) -> tuple[CameraProfile, dict[str, object]]:
     """Measure only the noise: the response is known, and there is no black level and no mosaic."""
     profile = black[0].profile or CameraProfile()

@@ -18,7 +18,7 @@ from controller.optics.calibrate.values import Metapixels
 from controller.optics.capture.patterns import PAPER_SPACING_PX, dot_spacing
 from controller.run.runner import Context
 from controller.stage.artefacts.camera import Exposures
-from controller.stage.artefacts.photographs import PhotographSet, Taken, captured, codes_of
+from controller.stage.artefacts.photographs import PhotographSet, TakenPhotograph, captured, codes_of
 from controller.stage.artefacts.projectors import Pixels
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps.capture.exposure import bracket
@@ -70,7 +70,7 @@ def _part(context: Context, start: float, share: float, fraction: float, note: s
     context.advance(start + share * fraction, note)
 
 
-def read_batches(folder: Path, of: PhotographSet, photographs: int) -> Iterator[Taken]:
+def read_batches(folder: Path, of: PhotographSet, photographs: int) -> Iterator[TakenPhotograph]:
     """The photographs that ``take_in_batches`` listed, in order."""
     for number in range(-(-photographs // BATCH)):
         yield from dataclasses.replace(of, batch=number).read(folder)

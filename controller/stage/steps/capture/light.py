@@ -28,7 +28,7 @@ from controller.stage.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.stage.artefacts.photographs import (
     WHITE,
     Developed,
-    Taken,
+    TakenPhotograph,
     light_of,
     noise_of,
     white_bracket,
@@ -133,7 +133,7 @@ class _Taking:
         ]
         self._paths = take_all(self.rig, self.context, self._planned, into=self.set)
 
-    def photographs(self) -> dict[str, Taken]:
+    def photographs(self) -> dict[str, TakenPhotograph]:
         """By name, those taken so far."""
         return self.set.by_name(self.context.folder)
 
@@ -173,13 +173,13 @@ def why_not(check: MapCheck) -> str:
     )
 
 
-def _developed(folder: Path, taken: Mapping[str, Taken]) -> tuple[Developed, Taken]:
+def _developed(folder: Path, taken: Mapping[str, TakenPhotograph]) -> tuple[Developed, TakenPhotograph]:
     """Photographs of a projector with black and white merged, and one of them."""
     bracket = white_bracket(list(taken.values()))
     return Developed(taken, {"black": read_black(folder), "white": merge_photographs(bracket)}), bracket[0]
 
 
-def _readable(folder: Path, taken: Mapping[str, Taken], plan: PatternPlan) -> float:
+def _readable(folder: Path, taken: Mapping[str, TakenPhotograph], plan: PatternPlan) -> float:
     """Share of the lit camera pixels whose coloured code is clear."""
     captures, one = _developed(folder, taken)
     cells = decode_colours(captures, plan, noise_of(one))

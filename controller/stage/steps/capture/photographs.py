@@ -21,7 +21,7 @@ from controller.run.step_id import ShotId
 from controller.stage.artefacts.camera import longest_wait_s, raise_delay
 from controller.stage.artefacts.photographs import (
     PhotographSet,
-    Taken,
+    TakenPhotograph,
     capture_name,
     captures_folder,
     delete_photograph,
@@ -73,11 +73,11 @@ class PhotographSeries:
 
     rig: Rig
     context: Context
-    taken: list[Taken] = field(default_factory=list)
+    taken: list[TakenPhotograph] = field(default_factory=list)
     _confirmed: int = 0
     _checked_at_s: float = field(default_factory=time.monotonic)
 
-    def add(self, photograph: Taken) -> None:
+    def add(self, photograph: TakenPhotograph) -> None:
         """Check the lamps every CHECK_LAMPS_EVERY_S. Raises as ``Rig.check_light``."""
         self.taken.append(photograph)
         if time.monotonic() - self._checked_at_s >= CHECK_LAMPS_EVERY_S:
@@ -125,7 +125,7 @@ def use_delay(rig: Rig, folder: Path) -> None:
         rig.acquirer.set_delay(wait_s)
 
 
-def _take(rig: Rig, context: Context, planned: Planned, identity: ShotId) -> Taken:
+def _take(rig: Rig, context: Context, planned: Planned, identity: ShotId) -> TakenPhotograph:
     acquirer = rig.acquirer
     frames = rig.on_outputs(planned.frames())
     settings = {"exposure_s": repr(planned.exposure_s), "frames": frames_digest(frames)}
@@ -184,7 +184,7 @@ def _changed_photograph(
 
 def take_photograph(
     rig: Rig, context: Context, identity: ShotId, exposure_s: float, *, shown_at_s: float, of: Mapping[str, str]
-) -> Taken:
+) -> TakenPhotograph:
     """Photograph the picture shown since ``shown_at_s``; ``of`` names it for the journal."""
     use_delay(rig, context.folder)
     profile = load_profile(context.folder)
@@ -202,18 +202,18 @@ def take_photograph(
     return _as_measured(_journalled(context, identity, settings, file.path, confirmed_s), profile)
 
 
-def _as_measured(taken: Taken, profile: CameraProfile | None) -> Taken:
+def _as_measured(taken: TakenPhotograph, profile: CameraProfile | None) -> TakenPhotograph:
     """With what is known of the camera: its true exposure, if that differs from what it says."""
     return replace(taken, profile=profile, exposure_s=true_exposure(profile, taken.exposure_s))
 
 
-def _taken(identity: ShotId, path: Path, exposure_s: float) -> Taken:
-    return Taken(identity.name, path, exposure_s, projector=identity.projector)
+def _taken(identity: ShotId, path: Path, exposure_s: float) -> TakenPhotograph:
+    return TakenPhotograph(identity.name, path, exposure_s, projector=identity.projector)
 
 
 def _journalled(
     context: Context, identity: ShotId, settings: Mapping[str, str], path: Path, exposure_s: float
-) -> Taken:
+) -> TakenPhotograph:
     write_exposure(path, exposure_s)
     artefact = context.journal.record_shot(identity, settings, path)
     return replace(_taken(identity, artefact.path, exposure_s), fresh=True)

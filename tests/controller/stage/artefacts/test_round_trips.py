@@ -22,7 +22,7 @@ from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.depth_edges import edged, write_terms
 from controller.stage.artefacts.geometry import projectors_of, read_geometry, write_geometry
 from controller.stage.artefacts.grade import ErrorMaps, graded, read_error_maps, write_grade
-from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, Taken
+from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels
 from controller.stage.artefacts.solved import Solved, SolvedBase, is_solved, read_solved, remove_solved
 from controller.stage.steps.modes import DotOptions, mode_step
@@ -70,8 +70,8 @@ def test_photographs_are_found_by_projector_and_name(names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as place:
         run = Path(place)
         for kept in (DRIFT, VERIFICATION):
-            shot = [Taken(PATTERN, run / f"{n}.dng", n + 1.0, projector=name) for n, name in enumerate(names)]
-            shot += [Taken(shown, run / f"{shown}.dng", 9.0) for shown in ("white", "black")]
+            shot = [TakenPhotograph(PATTERN, run / f"{n}.dng", n + 1.0, projector=name) for n, name in enumerate(names)]
+            shot += [TakenPhotograph(shown, run / f"{shown}.dng", 9.0) for shown in ("white", "black")]
             kept.write(run, shot)
             assert kept.read(run) == tuple(shot)
             assert {name: one.exposure_s for name, one in kept.by_projector(run).items()} == {
@@ -80,7 +80,7 @@ def test_photographs_are_found_by_projector_and_name(names: list[str]) -> None:
         for n, name in enumerate(names):
             for batch in (None, 0, 1):
                 some = PhotographSet("dots", name, batch)
-                some.write(run, [Taken(f"{n}-{batch}", run / "a.dng", 1.0, projector=name)])
+                some.write(run, [TakenPhotograph(f"{n}-{batch}", run / "a.dng", 1.0, projector=name)])
         for n, name in enumerate(names):
             for batch in (None, 0, 1):
                 assert list(PhotographSet("dots", name, batch).by_name(run)) == [f"{n}-{batch}"]

@@ -11,7 +11,7 @@ from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
-from controller.demo.job import demo
+from controller.demo import demo
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId

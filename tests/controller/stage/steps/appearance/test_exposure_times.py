@@ -7,7 +7,7 @@ import pytest
 
 from controller.core.arrays import FloatImage
 from controller.optics.capture.profile import CameraNoise, CameraProfile
-from controller.stage.artefacts.photographs import Taken
+from controller.stage.artefacts.photographs import TakenPhotograph
 from controller.stage.steps.appearance.photographing import brightest, speeds, timed
 from tests.controller.optics.capture.test_raw import BLACK, WHITE, write_dng
 
@@ -19,10 +19,10 @@ def profile_of(*known: tuple[float, float]) -> CameraProfile:
     return CameraProfile(exposures=np.array(known) if known else np.empty((0, 2)))
 
 
-def photographed(path: Path, told_s: float, opened_s: float, profile: CameraProfile, seed: int) -> Taken:
+def photographed(path: Path, told_s: float, opened_s: float, profile: CameraProfile, seed: int) -> TakenPhotograph:
     light = np.random.default_rng(seed).poisson(LIGHT * opened_s * 30_000) / 30_000
     write_dng(path, np.clip(np.rint(BLACK + light * (WHITE - BLACK)), 0, WHITE).astype(np.uint16))
-    return Taken(path.stem, path, profile.true_exposure(told_s), profile=profile)
+    return TakenPhotograph(path.stem, path, profile.true_exposure(told_s), profile=profile)
 
 
 def test_a_camera_that_is_right_is_asked_for_the_exposures_that_are_wanted() -> None:
@@ -116,5 +116,5 @@ def test_what_cannot_be_measured_stays_as_the_camera_says(tmp_path: Path) -> Non
     assert timed([short, dark]) == [short, dark], "none is known"
     assert timed([dark, known])[0].exposure_s == pytest.approx(1e-5), "nothing is well exposed in both"
     assert timed([known]) == [known]
-    sound = Taken("short", short.path, short.exposure_s, profile=profile_of())
+    sound = TakenPhotograph("short", short.path, short.exposure_s, profile=profile_of())
     assert timed([sound, known]) == [sound, known]

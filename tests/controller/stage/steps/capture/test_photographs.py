@@ -15,7 +15,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Context
 from controller.run.step_id import ShotId
-from controller.stage.artefacts.photographs import Developed, PhotographSet, Taken
+from controller.stage.artefacts.photographs import Developed, PhotographSet, TakenPhotograph
 from controller.stage.steps.capture import photographs as shots
 from controller.stage.steps.capture.photographs import Planned, take_all, take_photograph
 from hal.deadline import Cancelled, Deadline, in_seconds
@@ -198,7 +198,7 @@ def test_a_camera_that_goes_leaves_the_photographs_before_it(stage: ModelRig, co
 
 
 def test_what_plays_is_photographed_once_for_each_thing_it_may_be(stage: ModelRig, context: Context) -> None:
-    def photograph(bundle: str) -> Taken:
+    def photograph(bundle: str) -> TakenPhotograph:
         return take_photograph(stage.rig, context, ShotId("played", "vase"), 1.0, shown_at_s=0.0, of={"bundle": bundle})
 
     assert photograph("one").fresh
@@ -210,7 +210,7 @@ def test_what_plays_is_photographed_once_for_each_thing_it_may_be(stage: ModelRi
 
 def test_ready_images_go_before_photographs_of_the_same_name() -> None:
     white = np.ones((2, 2, 3), np.float32)
-    taken = {name: Taken(name, Path(f"{name}.dng"), 1.0) for name in ("white", "red")}
+    taken = {name: TakenPhotograph(name, Path(f"{name}.dng"), 1.0) for name in ("white", "red")}
     developed = Developed(taken, {"black": 0 * white, "white": white})
     assert list(developed) == ["black", "white", "red"]
     assert len(developed) == 3

@@ -1,1 +1,0 @@
-"""A complete job on an emulated stage, with a report at the end. Entry: `job.demo`, `stage`."""
