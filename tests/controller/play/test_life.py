@@ -210,6 +210,8 @@ def test_starting_loads_neither_the_window_library_nor_the_rest_of_the_controlle
         "rich",
         "controller.stage.sessions.run",
         "controller.config",
-        "hal",
+        "hal.deadline",
+        "hal.interfaces",
+        "hal.registry",
     }
     assert not heavy & modules
