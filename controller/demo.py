@@ -180,7 +180,8 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
     checked, out = check_stage(stage), stage.parent
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     session = OwnSession(stage, around=bench)
-    engine = choose_engine(checked.stage.tables.solve.device, reporter.say)
+    solve = checked.stage.tables.solve
+    engine = choose_engine(solve.device, reporter.say, solve.method)
     steps = partial(demo_steps, checked=checked, engine=engine)
     run = session.run(checked, StageWork("demo", steps), reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")

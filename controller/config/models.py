@@ -237,6 +237,11 @@ class SolveTable(ConfigTable):
         description="how far a target is bent where light is lacking, so that the object's own pattern does not "
         "show, from 0 (what can't be shown is cut off) to 1",
     )
+    method: Literal["global", "regions"] = Field(
+        default="global",
+        description='the solver: "global" (all pixels together), or "regions" (the paper\'s: regions of 16 x 16 camera '
+        "pixels, one after the other; much slower, nearly as good, on the processor alone)",
+    )
     device: Literal["auto", "cpu", "gpu"] = Field(
         default="auto",
         description='what solves: "cpu" (the processor), "gpu" (a graphics processor, also one in software), or "auto" '

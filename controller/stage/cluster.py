@@ -28,7 +28,9 @@ from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.extras import extra_missing
 from controller.optics.solve.appearance import Base, StageLight, prepare_base
+from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import Solution
+from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target
@@ -113,7 +115,8 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
             _kept[key] = base, DriveLevels(stage.transport)
         base, drive = _kept[key]
         light = StageLight(stage.transport, stage.black, stage.indirect, drive)
-        return solve_appearance(light, base, asked, options)
+        engine = choose_engine("cpu", lambda note: None, options.method)
+        return solve_appearance(light, base, asked, options, SolveContext(engine))
 
     return _outcome_of(work)
 

@@ -24,6 +24,7 @@ WRITTEN = {
     "develop_and_merge": ("scene.exr",),
     "opencv_calibration": ("projector.png",),
     "read_dataset": ("dataset.png",),
+    "another_norm": (),
     "own_matrices": ("frames.npz", "left.png"),
     "first-notebook": ("geometry.png", "object.glb", "projectors.png", "appearance.png", "frames/left.png"),
     "own-data": (),

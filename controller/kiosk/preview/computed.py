@@ -45,7 +45,8 @@ class ComputedPreviews:
 
     def possible(self, checked: Checked) -> bool:
         """Whether a graphics processor may be there; known for certain after the first target."""
-        device = checked.stage.tables.solve.device
+        solve = checked.stage.tables.solve
+        device = "cpu" if solve.method == "regions" else solve.device
         return device != "cpu" and device not in self._none_for and importlib.util.find_spec(MODULE) is not None
 
     def of(self, checked: Checked, target: Path) -> Computed:

@@ -69,7 +69,7 @@ class Solver:
 
     def __init__(self, stage: Stage) -> None:
         table = SolveTable.model_validate(stage.solve)
-        engine = choose_engine(table.device, lambda note: None)
+        engine = choose_engine(table.device, lambda note: None, table.method)
         if isinstance(engine, Processor):
             raise no_device()
         self._engine = engine

@@ -28,6 +28,7 @@ from controller.optics.solve.appearance import (
 )
 from controller.optics.solve.bounded.engine import ALONE, SolveContext
 from controller.optics.solve.bounded.equations import TOLERANCE, SolveSettings, appearance_weights
+from controller.optics.solve.engines import Method
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import (
@@ -57,6 +58,7 @@ class SolveOptions:
 
     ``base``: the base image; with "high-pass" each appearance solves one of its own
     ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
+    ``method``: which solver, so that a run knows; the engine of the context is the one that solves
     """
 
     share: float
@@ -64,16 +66,23 @@ class SolveOptions:
     mode: Mode = "auto"
     base: BaseChoice = "white"
     adapt: float = 0.0
+    method: Method = "global"
 
     def inputs(self) -> dict[str, str]:
         """What an appearance depends on, as the journal compares it."""
-        asked = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
-        return asked if self.adapt == 0 else {**asked, "adapt": repr(self.adapt)}
+        inputs = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
+        if self.adapt != 0:
+            inputs["adapt"] = repr(self.adapt)
+        return inputs | self._method()
 
     def base_inputs(self) -> dict[str, str]:
         """The inputs of the base image; the mode and brightness of appearances are not among them."""
         shared = "white" if self.base == "high-pass" else self.base
-        return {"smoothness": repr(self.smoothness), "base": shared}
+        return {"smoothness": repr(self.smoothness), "base": shared} | self._method()
+
+    def _method(self) -> dict[str, str]:
+        # not the usual one, which runs of earlier versions do not name
+        return {} if self.method == "global" else {"method": self.method}
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,8 @@ def make_appearances(
     chosen = None if order.base is None else base_choice(order.base)
     checked = check_stage(session.stage)
     folder = checked.stage.folder
-    engine = choose_engine(checked.stage.tables.solve.device if order.device is None else order.device, reporter.say)
+    solve = checked.stage.tables.solve
+    engine = choose_engine(solve.device if order.device is None else order.device, reporter.say, solve.method)
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=order.accept_grade)
         calibrated = Calibrated(run, checked.names, engine)

@@ -63,7 +63,7 @@ def block_coordinate_descent(
     light, light_y, before = (transport.sensor_buffer() for _ in range(3))
     residual = np.empty_like(right_hand_side)
     y, step = x.copy(), np.empty_like(x)
-    total = max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
+    total = _total(problem)
     inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
     for iteration in range(1, control.most_iterations + 1):
         if control.cancelled is not None and control.cancelled():
@@ -75,12 +75,10 @@ def block_coordinate_descent(
             if iteration > 1:
                 _write_forward(transport, y, light_y)
         before[:] = light_y
-        for n, (rows, columns) in enumerate(transport.sizes):
+        for n in range(len(transport.sizes)):
             transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
             transport.adjoint_of_buffer(n, residual, step)
-            start, segment = transport.span(n).start, transport.segment(n)
-            smoothness = problem.majoriser, problem.across, problem.down, problem.strength_per_step
-            a, b = projected_step(y, x, step, *smoothness, start, rows, columns, segment)
+            a, b = _projected_step(problem, n, y, x, step)
             squared_step, uphill = squared_step + a, uphill + b
             transport.accumulate_forward(n, step, light_y)
         kkt = float(np.sqrt(squared_step / total))
@@ -100,6 +98,32 @@ def block_coordinate_descent(
         if kkt <= control.tolerance:
             break
     return x, kkt, iteration
+
+
+def kkt_residual(problem: Problem, x: FloatImage) -> float:
+    """The KKT residual at ``x`` (3, pixels): of one step of each projector from there, the others being as they are."""
+    transport = problem.transport
+    right_hand_side = transport.right_hand_side(problem.target(), problem.weights)
+    light, residual, step = transport.sensor_buffer(), np.empty_like(right_hand_side), np.empty_like(x)
+    _write_forward(transport, x, light)
+    transport.normal_residual(light, problem.weights, right_hand_side, residual)
+    squared_step = 0.0
+    for n in range(len(transport.sizes)):
+        transport.adjoint_of_buffer(n, residual, step)
+        squared_step += _projected_step(problem, n, x, x, step)[0]
+    return float(np.sqrt(squared_step / _total(problem)))
+
+
+def _projected_step(problem: Problem, n: int, y: FloatImage, x: FloatImage, step: FloatImage) -> tuple[float, float]:
+    """``projected_step`` of projector ``n``."""
+    rows, columns = problem.transport.sizes[n]
+    start, segment = problem.transport.span(n).start, problem.transport.segment(n)
+    smoothness = problem.majoriser, problem.across, problem.down, problem.strength_per_step
+    return projected_step(y, x, step, *smoothness, start, rows, columns, segment)
+
+
+def _total(problem: Problem) -> float:
+    return max(float(problem.majoriser.sum(dtype=np.float64)), np.finfo(np.float64).tiny)
 
 
 def _write_forward(transport: LightTransport, x: FloatImage, buffer: FloatImage) -> None:

@@ -30,10 +30,11 @@ import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.optics.solve.bounded.engine import ALONE, SolveContext
+from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext, kkt_residual
 from controller.optics.solve.bounded.equations import (
     DEFAULT_SETTINGS,
     Problem,
+    Solution,
     SolveInput,
     SolveSettings,
     build_problem,
@@ -239,13 +240,14 @@ class RegionSolution:
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
     ``light`` (camera rows, columns, 3) float32: T p
-    ``objective``: as of ``bounded.Solution``, over the whole image
+    ``objective``, ``kkt``: as of ``Solution``, over the whole image
     ``regions``, ``unknowns``: how many were solved, and their unknowns in all
     """
 
     frames: tuple[FloatImage, ...]
     light: FloatImage
     objective: float
+    kkt: float
     regions: int
     unknowns: int
     seconds: float
@@ -354,9 +356,9 @@ def solve_regions(
             if context.cancelled is not None and context.cancelled():
                 raise WorkError("solve-cancelled", what="The solve was stopped.", remedy="Start it again to repeat it.")
     light = transport.forward_planes(x)
-    objective = objective_of(problem, x, light)
+    objective, kkt = objective_of(problem, x, light), kkt_residual(problem, x)
     frames = tuple(plane_frames(x, transport.sizes))
-    return RegionSolution(frames, plane_image(light), objective, done, unknowns, time.perf_counter() - began)
+    return RegionSolution(frames, plane_image(light), objective, kkt, done, unknowns, time.perf_counter() - began)
 
 
 def _solve_phase(
@@ -389,3 +391,26 @@ def _centres(transport: LightTransport, pixels: Pixels) -> Pixels:
     at = np.floor(transport.gaussian_mean_planes(place)[:2, pixels].T + 0.5).astype(np.int64)
     inside: Pixels = np.clip(at, 0, np.array([rows - 1, columns - 1]))
     return inside
+
+
+class RegionsEngine(Processor):
+    """The paper's solver in place of the global one, ``method = "regions"`` in stage.toml; on the processor alone.
+
+    A solve begins anew, whatever ``start`` it has, and takes its own time: ``tolerance`` and ``most_iterations`` don't
+    matter. A solution's ``iterations`` are its regions; it has converged when all of them are solved. Progress is told
+    after each region.
+    """
+
+    name = "processor, by regions"
+    worked = name
+
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
+        """As ``Engine.solve``."""
+        result = solve_regions(
+            given.transport,
+            given.target,
+            given.black,
+            SolveSettings(given.smoothness, given.weights),
+            SolveContext(progress=control.progress, cancelled=control.cancelled),
+        )
+        return Solution(result.frames, result.objective, result.kkt, result.regions, result.seconds, converged=True)

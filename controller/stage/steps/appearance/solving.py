@@ -35,7 +35,7 @@ BASE = StepId(StepKind.BASE)
 
 def options_of(table: SolveTable) -> SolveOptions:
     """How appearances are solved by [solve] of stage.toml, wherever they are."""
-    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt)
+    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, table.method)
 
 
 @dataclass(frozen=True, slots=True)

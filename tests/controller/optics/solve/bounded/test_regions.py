@@ -16,7 +16,15 @@ from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings, build_problem
-from controller.optics.solve.bounded.regions import SOLVERS, BoxProblem, RegionCut, Regions, solve_box, solve_regions
+from controller.optics.solve.bounded.regions import (
+    SOLVERS,
+    BoxProblem,
+    RegionCut,
+    Regions,
+    RegionsEngine,
+    solve_box,
+    solve_regions,
+)
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.edge_terms import EdgeTerm, with_terms
@@ -252,3 +260,21 @@ def test_a_solver_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
             solve_box(name, problem)
         assert refused.value.code == "solver-missing"
         assert name in refused.value.remedy
+
+
+def test_as_an_engine_it_solves_what_any_engine_does(stage: Stage) -> None:
+    calibration = crop(stage)
+    transport = build_transport(calibration)
+    target = picture(transport)
+    told: list[float] = []
+    context = SolveContext(RegionsEngine(), lambda done, left: told.append(left))
+    found = solve_bounded(transport, target, calibration.black, context=context)
+    regions = solve_regions(transport, target, calibration.black)
+    for one, other in zip(found.frames, regions.frames, strict=True):
+        np.testing.assert_array_equal(one, other)
+    best = solve_bounded(transport, target, calibration.black, SolveSettings(tolerance=1e-6, most_iterations=6000))
+    assert found.converged
+    assert found.iterations == regions.regions == len(told)
+    assert told[-1] == 0
+    assert best.objective < found.objective < 1.06 * best.objective
+    assert best.kkt < found.kkt < 0.02
