@@ -26,6 +26,9 @@ MOST_STEPS: Final = 40
 MOST_HALVINGS: Final = 30
 CLOSE: Final = 1e-6
 """The light may miss its optimum by this part of the root of the pull, a hundredth of all projectors' light."""
+SINGLE_MOST_HALVINGS: Final = 20
+SINGLE_CLOSE: Final = 1e-6
+"""The same for a graphics processor, in single precision; the latter is a part of all projectors' light."""
 LEVEL: Final = 1e-3
 """Share of a step's slope that may be left, uphill, at its end."""
 LEAST_DETERMINANT: Final = 1e-3

@@ -173,8 +173,12 @@ class Device:
 
     def kernel(self, *sources: str) -> Any:
         """The kernel ``main`` of the files in ``shaders`` with these names, joined."""
+        # not before the first kernel: a look at what this computer has loads no numeric package
+        from controller.optics.solve.gpu.shader_constants import declarations
+
         if sources not in self._kernels:
             code = "\n".join(_source(name) for name in sources)
+            code = declarations(code) + code
             with _refusals(f"compile {sources[-1]}"):
                 module = self._device.create_shader_module(code=code)
                 self._kernels[sources] = self._device.create_compute_pipeline(

@@ -1,12 +1,12 @@
 """The windows of a stage, from its phase maps and white images, and the order in which products take them.
 
-``walk`` goes over a camera picture for one projector: it counts the windows, and then writes them. The order of
+Each projector's camera picture is walked over twice: windows are counted, and then written. The order of
 windows, and of tiles of them, is for speed alone, but the same in every product.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -54,69 +54,118 @@ Shape = tuple[int, int, int, int]
 """Sort, table rows across and down, and skew."""
 
 
+class Sight(NamedTuple):
+    """What says where the camera looks into one projector's frame; all but ``colours`` and ``apart`` by camera pixel.
+
+    ``position`` (rows, columns, 2), ``spread`` (rows, columns of the projector, 3): of its ``PhaseMap``
+    ``apart`` (3, 5): what is added to place and spread of each of the camera's colours
+    ``white`` (rows, columns, 3), ``use`` (rows, columns), ``colours``: as of ``build_windows``
+    """
+
+    position: FloatImage
+    spread: FloatImage
+    apart: Float64
+    white: FloatImage
+    colours: npt.NDArray[np.int64]
+    use: Mask
+
+
+class WindowArrays(NamedTuple):
+    """Arrays of some windows, (windows,) each; as of ``Windows``."""
+
+    site: npt.NDArray[np.int32]
+    at: npt.NDArray[np.uint16]
+    across: npt.NDArray[np.uint16]
+    down: npt.NDArray[np.uint16]
+    skew: npt.NDArray[np.int8]
+    gain: FloatImage
+
+
 @compiled(parallel=True)
-def walk(
-    position: FloatImage,
-    spread: FloatImage,
-    apart: Float64,
-    white: FloatImage,
-    colours: npt.NDArray[np.int64],
-    use: Mask,
+def count_windows(sight: Sight, table: Profiles, small: SmallProfiles, counts: npt.NDArray[np.int64]) -> None:
+    """Add the windows of each band of camera rows, cell and sort to ``counts`` (bands, cells)."""
+    height, width = sight.use.shape
+    for band in prange(BANDS):
+        for r in range(band * height // BANDS, (band + 1) * height // BANDS):
+            for c in range(width):
+                for colour in range(3):
+                    left, top, shape, inside = _window(sight, table, small, r, c, colour)
+                    if inside > 0:
+                        counts[band, _place(sight, left, top, colour)[0] + shape[0]] += 1
+
+
+@compiled(parallel=True)
+def write_windows(
+    sight: Sight,
     table: Profiles,
     small: SmallProfiles,
     halo: int,
-    fill: npt.NDArray[np.int64],
-    counting: bool,
-    site: npt.NDArray[np.int32],
-    at: npt.NDArray[np.uint16],
-    across: npt.NDArray[np.uint16],
-    down: npt.NDArray[np.uint16],
-    skew: npt.NDArray[np.int8],
-    gain: FloatImage,
+    ahead: npt.NDArray[np.int64],
+    windows: WindowArrays,
 ) -> None:
-    """Count the windows of each band, cell and sort in ``fill`` (bands, cells), or write them from there on.
+    """Write the windows that ``count_windows`` counts.
 
-    Arrays as in ``Windows``; ``apart`` (3, 5): what is added to place and spread of each of the camera's colours
+    ``ahead`` (bands, cells): where the next window of a band, cell and sort goes; it moves on with each
     """
-    rows, columns = spread.shape[:2]
+    height, width = sight.use.shape
+    # names of their own: where it writes to arrays of a tuple, numba's parallel loop frees their memory twice
+    site, at, across, down, skew, gain = windows
+    apart = 0 if sight.colours.size > 0 else sight.use.size  # sites of one colour from those of the next
+    for band in prange(BANDS):
+        for r in range(band * height // BANDS, (band + 1) * height // BANDS):
+            for c in range(width):
+                for colour in range(3):
+                    left, top, shape, inside = _window(sight, table, small, r, c, colour)
+                    if inside > 0:
+                        cell, tile_top, tile_left = _place(sight, left, top, colour)
+                        e = ahead[band, cell + shape[0]]
+                        ahead[band, cell + shape[0]] = e + 1
+                        site[e] = r * width + c + colour * apart
+                        at[e] = _buffer_place(table, shape, top - tile_top, left - tile_left, halo)
+                        across[e], down[e], skew[e] = shape[1], shape[2], shape[3]
+                        gain[e] = sight.white[r, c, colour] / inside
+
+
+@compiled()
+def _window(
+    sight: Sight, table: Profiles, small: SmallProfiles, r: int, c: int, colour: int
+) -> tuple[int, int, Shape, float]:
+    """Of one colour at a camera pixel: column and row of the projector pixel, shape, and the sum of its shares.
+
+    The sum is 0 where there is no window.
+    """
+    none = (0, 0, (0, 0, 0, 0), 0.0)
+    if not sight.use[r, c] or not sight.white[r, c, colour] > 0:
+        return none
+    if sight.colours.size > 0 and sight.colours[r & 1, c & 1] != colour:
+        return none
+    rows, columns = sight.spread.shape[:2]
+    apart = sight.apart
+    x, y = sight.position[r, c, 0] + apart[colour, 0], sight.position[r, c, 1] + apart[colour, 1]
+    # NaN fails every comparison
+    if not (-BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
+        return none
+    row = min(max(int(np.floor(y + 0.5)), 0), rows - 1)
+    column = min(max(int(np.floor(x + 0.5)), 0), columns - 1)
+    xx = sight.spread[row, column, 0] + apart[colour, 2]
+    xy = sight.spread[row, column, 1] + apart[colour, 3]
+    yy = sight.spread[row, column, 2] + apart[colour, 4]
+    if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
+        return none
+    left, top = int(np.floor(x)), int(np.floor(y))
+    shape = _shape(xx, xy, yy, x - left, y - top, table.small[0])
+    return left, top, shape, _inside(table, small, left, top, shape, rows, columns)
+
+
+@compiled()
+def _place(sight: Sight, left: int, top: int, colour: int) -> tuple[int, int, int]:
+    """The first sort of the cell that a window belongs to, and row and column where its tile begins."""
+    rows, columns = sight.spread.shape[:2]
     tiles_across = (columns + TILE - 1) // TILE
     tiles = (rows + TILE - 1) // TILE * tiles_across
-    one = colours.size > 0
-    for band in prange(BANDS):
-        for r in range(band * use.shape[0] // BANDS, (band + 1) * use.shape[0] // BANDS):
-            for c in range(use.shape[1]):
-                if not use[r, c]:
-                    continue
-                for colour in range(3):
-                    if (one and colours[r & 1, c & 1] != colour) or not white[r, c, colour] > 0:
-                        continue
-                    x, y = position[r, c, 0] + apart[colour, 0], position[r, c, 1] + apart[colour, 1]
-                    # NaN fails every comparison
-                    if not (-BEYOND <= x < columns + BEYOND - 1 and -BEYOND <= y < rows + BEYOND - 1):
-                        continue
-                    left, top = int(np.floor(x)), int(np.floor(y))
-                    near_row = min(max(int(np.floor(y + 0.5)), 0), rows - 1)
-                    near_column = min(max(int(np.floor(x + 0.5)), 0), columns - 1)
-                    xx = spread[near_row, near_column, 0] + apart[colour, 2]
-                    xy = spread[near_row, near_column, 1] + apart[colour, 3]
-                    yy = spread[near_row, near_column, 2] + apart[colour, 4]
-                    if not (xx > 0 and yy > 0 and xx * yy > xy * xy):
-                        continue
-                    shape = _shape(xx, xy, yy, x - left, y - top, table.small[0])
-                    inside = _inside(table, small, left, top, shape, rows, columns)
-                    if inside == 0:
-                        continue
-                    tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
-                    tile_column = min(max(left // TILE, 0), tiles_across - 1)
-                    cell = SORTS * (colour * tiles + tile_row * tiles_across + tile_column) + shape[0]
-                    e = fill[band, cell]
-                    fill[band, cell] = e + 1
-                    if counting:
-                        continue
-                    site[e] = r * use.shape[1] + c + (0 if one else colour * use.size)
-                    at[e] = _buffer_place(table, shape, top - tile_row * TILE, left - tile_column * TILE, halo)
-                    across[e], down[e], skew[e] = shape[1], shape[2], shape[3]
-                    gain[e] = white[r, c, colour] / inside
+    tile_row = min(max(top // TILE, 0), (rows - 1) // TILE)
+    tile_column = min(max(left // TILE, 0), tiles_across - 1)
+    return SORTS * (colour * tiles + tile_row * tiles_across + tile_column), tile_row * TILE, tile_column * TILE
 
 
 @compiled()
@@ -305,17 +354,6 @@ def _rounds(at: npt.NDArray[np.uint16]) -> Numbers:
     return order
 
 
-_Filled = tuple[
-    npt.NDArray[np.int32],
-    npt.NDArray[np.uint16],
-    npt.NDArray[np.uint16],
-    npt.NDArray[np.uint16],
-    npt.NDArray[np.int8],
-    FloatImage,
-]
-"""``site``, ``at``, ``across``, ``down``, ``skew`` and ``gain`` of some windows."""
-
-
 def build_windows(
     maps: tuple[PhaseMap, ...],
     white: tuple[FloatImage, ...],
@@ -333,15 +371,15 @@ def build_windows(
     apart = [_apart(m, mixing[n]) for n, m in enumerate(maps)]
     halo = max((_halo(m.spread_px2, apart[n], tables[0]) for n, m in enumerate(maps)), default=NEAR)
     place, cell_first = place_cells(sizes)
-    walks = [
-        (phase_map.projector_px, phase_map.spread_px2, apart[n], white[n], colours, use[n], *tables, halo)
+    sights = [
+        Sight(phase_map.projector_px, phase_map.spread_px2, apart[n], white[n], colours, use[n])
         for n, phase_map in enumerate(maps)
     ]
     # all are counted first, so that there is one array of each kind from the beginning
     bands, counts, rooms = [], [], []
-    for n, arguments in enumerate(walks):
+    for n, sight in enumerate(sights):
         bands.append(np.zeros((BANDS, SORTS * int(cell_first[n + 1] - cell_first[n])), np.int64))
-        walk(*arguments, bands[n], True, *_empty(0))
+        count_windows(sight, *tables, bands[n])
         count = bands[n].sum(axis=0)
         small = np.arange(count.size) % SORTS != OTHER
         counts.append(count)
@@ -349,13 +387,13 @@ def build_windows(
     room = np.concatenate(rooms)
     first = np.concatenate([[0], np.cumsum(room)])
     filled = _empty(int(first[-1]))
-    for n, arguments in enumerate(walks):
+    for n, sight in enumerate(sights):
         cells = slice(SORTS * int(cell_first[n]), SORTS * int(cell_first[n + 1]) + 1)
         own = first[cells] - first[cells.start]
         part = slice(int(first[cells.start]), int(first[cells.stop - 1]))
-        mine = _part(filled, part)
+        mine = WindowArrays(*(array[part] for array in filled))
         begins = own[:-1] + np.cumsum(bands[n], axis=0) - bands[n]
-        walk(*arguments, begins, False, *mine)
+        write_windows(sight, *tables, halo, begins, mine)
         settle(own, counts[n], *mine)
     turn, turn_first = take_turns(place, sizes, room.reshape(-1, SORTS).sum(axis=1), cell_first)
     start = np.cumsum([0, *(int(rows * columns) for rows, columns in sizes)]).astype(np.int64)
@@ -373,8 +411,8 @@ def build_windows(
     )
 
 
-def _empty(count: int) -> _Filled:
-    return (
+def _empty(count: int) -> WindowArrays:
+    return WindowArrays(
         np.empty(count, np.int32),
         np.empty(count, np.uint16),
         np.empty(count, np.uint16),
@@ -382,11 +420,6 @@ def _empty(count: int) -> _Filled:
         np.empty(count, np.int8),
         np.empty(count, np.float32),
     )
-
-
-def _part(filled: _Filled, part: slice) -> _Filled:
-    site, at, across, down, skew, gain = filled
-    return site[part], at[part], across[part], down[part], skew[part], gain[part]
 
 
 def _apart(phase_map: PhaseMap, mixing: FloatImage) -> Float64:

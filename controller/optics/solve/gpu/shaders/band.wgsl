@@ -13,11 +13,6 @@ struct Band {
   mixing: array<vec4<f32>, 3>,
 }
 
-const MARGIN: i32 = 32;
-const PHASE_BITS: u32 = 8u;
-const PHASES: i32 = 256;
-const SHEAR_BITS: u32 = 6u;
-
 @group(0) @binding(0) var<uniform> band: Band;
 @group(0) @binding(2) var<storage, read> first: array<u32>;
 

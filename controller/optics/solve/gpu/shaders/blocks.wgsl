@@ -11,8 +11,6 @@ struct Blocks {
   number: u32,
 }
 
-const BLOCK_PX: u32 = 4u;
-
 @group(0) @binding(0) var<uniform> blocks: Blocks;
 
 fn index_of(id: vec3<u32>, groups: vec3<u32>) -> u32 { return id.x + id.y * groups.x * 64u; }

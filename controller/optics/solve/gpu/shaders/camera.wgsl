@@ -10,8 +10,6 @@ struct Camera {
   edges: u32,
 }
 
-const GREEN: u32 = 1u;
-
 @group(0) @binding(0) var<uniform> camera: Camera;
 
 fn index_of(id: vec3<u32>, groups: vec3<u32>) -> u32 { return id.x + id.y * groups.x * 64u; }

@@ -4,15 +4,13 @@
 @group(0) @binding(3) var<storage, read> observed: array<f32>;
 @group(0) @binding(4) var<storage, read_write> edge_weights: array<u32>;
 
-const STEPS: f32 = 65535.0;
-
 fn alike(i: u32, j: u32) -> u32 {
   if (observed[i] <= frame.faint || observed[j] <= frame.faint) { return 0u; }
   let one = sums[i] * per_sum[i] / observed[i];
   let other = sums[j] * per_sum[j] / observed[j];
   let larger = max(one, other);
   let alpha = select(1.0, min(one, other) / larger, larger > 0.0);
-  return u32(STEPS * alpha * alpha + 0.5);
+  return u32(EDGE_WEIGHT_STEPS * alpha * alpha + 0.5);
 }
 
 @compute @workgroup_size(64)

@@ -2,8 +2,6 @@
 @group(0) @binding(3) var<storage, read> table: array<f32>;
 @group(0) @binding(4) var<storage, read> skews: array<f32>;
 
-const SKEW_STEPS: i32 = 127;
-
 fn share(w: vec4<u32>, i: i32, j: i32) -> f32 {
   let along = table[4u * (w.z & 0xffffu) + u32(i)];
   let upright = table[4u * (w.z >> 16u) + u32(j)];

@@ -5,13 +5,6 @@
 @group(0) @binding(3) var<storage, read> mixing: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> shown: array<f32>;
 
-const RIDGE: f32 = 1e-4;
-const LEAST_DETERMINANT: f32 = 1e-3;
-const MOST_STEPS: i32 = 40;
-const MOST_HALVINGS: i32 = 20;
-const CLOSE: f32 = 1e-6;
-const LEVEL: f32 = 1e-3;
-
 // What projector n adds to the light: camera channel by projector channel, columns as WGSL has them.
 fn light_of(n: u32, at: u32, unit: f32) -> mat3x3<f32> {
   let count = blocks.across * blocks.down;
@@ -88,14 +81,14 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
   if (size > 0.0 && !within(p)) {
     var gradient = gradient_at(y, light, start, at, unit);
     for (var k = 0; k < MOST_STEPS; k++) {
-      if (max(abs(gradient.x), max(abs(gradient.y), abs(gradient.z))) < CLOSE) { break; }
+      if (max(abs(gradient.x), max(abs(gradient.y), abs(gradient.z))) < SINGLE_CLOSE) { break; }
       let step = newton_step(y, gradient, start, at, unit);
       let slope = dot(gradient, step);
       if (!(slope < 0.0)) { break; }
       var length = 1.0;
       var ahead = y + step;
       gradient = gradient_at(ahead, light, start, at, unit);
-      for (var half = 0; half < MOST_HALVINGS && dot(gradient, step) > -LEVEL * slope; half++) {
+      for (var half = 0; half < SINGLE_MOST_HALVINGS && dot(gradient, step) > -LEVEL * slope; half++) {
         length *= 0.5;
         ahead = y + length * step;
         gradient = gradient_at(ahead, light, start, at, unit);

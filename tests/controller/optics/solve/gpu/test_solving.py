@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Calibration
+from controller.optics.solve import gpu
 from controller.optics.solve.appearance import base_image, scale_frames, solve_base
 from controller.optics.solve.bounded.engine import SolveContext
-from controller.optics.solve.bounded.equations import SolveSettings, build_problem
+from controller.optics.solve.bounded.equations import EDGE_WEIGHT_STEPS, SolveInput, SolveSettings, build_problem
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.gpu.device import Device
 from controller.optics.solve.gpu.engine import GpuEngine
+from controller.optics.solve.gpu.equations import DeviceEquations
+from controller.optics.solve.gpu.transport import DeviceTransport
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import frame_planes
 from lab.timings.tools.synthetic import synthetic_calibration
+from tests.controller.optics.solve.bounded.smoothness_reference import smoothness_weights
 from tests.controller.optics.solve.bounded.test_solver_oracle import bent, exact, unreachable_in_parts
 from tests.controller.optics.solve.gpu.conftest import any_windows, few, opened, stages
 
@@ -298,3 +306,32 @@ def test_a_device_without_room_leaves_the_solve_to_the_processor(
     assert len(notes) == 1
     assert "in one piece" in notes[0]
     assert device.held_bytes == held
+
+
+@few
+@given(seed=st.integers(0, 2**20), mosaic=st.booleans())
+def test_the_weights_of_smoothness_are_those_of_the_reference(device: Device, seed: int, mosaic: bool) -> None:
+    """Paper 2.4, eq. 3: the same reference in NumPy that the processor's loop is tested against."""
+    transport = any_windows(seed, mosaic=mosaic)
+    black = np.zeros((*transport.camera_shape, 3), np.float32)
+    pattern = np.random.default_rng(seed).uniform(0.2, 1, black.shape).astype(np.float32)
+    target = transport.reach() * pattern
+    there = DeviceEquations(DeviceTransport(device, transport))
+    there.build(SolveInput(transport, target, black, SMOOTHNESS, None, None))
+    dark = build_problem(transport, target, black, SMOOTHNESS, None).majoriser == 0
+    for n, (one, size) in enumerate(zip(there.projectors, transport.sizes, strict=True)):
+        packed = device.read(one.edge_weights, 3 * one.pixels).view(np.uint32).reshape(3, *size)
+        white = transport.forward_part(n, np.ones((*size, 3), np.float32))
+        expected = smoothness_weights(transport.gaussian_mean(target, n), transport.gaussian_mean(white, n))
+        lit = ~np.moveaxis(dark[:, transport.span(n)].reshape(3, *size), 0, 2)
+        found = np.moveaxis(packed, 0, 2)
+        across, down = (part / EDGE_WEIGHT_STEPS for part in (found[:, :-1] & 0xFFFF, found[:-1] >> 16))
+        np.testing.assert_allclose(across, expected.across**2 * (lit[:, 1:] & lit[:, :-1]), atol=1e-3)
+        np.testing.assert_allclose(down, expected.down**2 * (lit[1:] & lit[:-1]), atol=1e-3)
+    there.free()
+
+
+def test_no_shader_declares_a_constant_of_its_own() -> None:
+    shaders = Path(gpu.__file__).parent / "shaders"
+    for shader in shaders.glob("*.wgsl"):
+        assert not re.search(r"^const ", shader.read_text("utf-8"), re.MULTILINE), shader.name
