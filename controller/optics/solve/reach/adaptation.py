@@ -39,17 +39,19 @@ from controller.optics.transport import LightTransport
 CELL: Final = 0.012
 """Side of a cell, relative to the picture's longer side."""
 LEAST_SIDE_PX: Final = 4
+"""A cell's side is at least so many camera pixels."""
 THIN: Final = 0.005
 """Obstacles narrower than this part of the picture are left out: grazing edges, specks, noise."""
 QUANTILE: Final = 0.95
-"""Of the needs in a cell, the one that counts as its obstacle."""
+"""A cell's obstacle is this quantile of the needs of its pixels."""
 REACH: Final = 0.04
-"""How far the sheet needs to fall to 1/e beside an obstacle, relative to the picture's longer side."""
+"""Beside an obstacle, the sheet falls to 1/e over this distance, relative to the picture's longer side."""
 ROUNDS: Final = 60
+"""Active sets are tried so often at most."""
 SOFT_CELLS: Final = 0.7
 """Standard deviation of the last smoothing, in cells."""
 BESIDE: Final = 4
-"""Cells beside the object's that the last smoothing reaches."""
+"""So many cells beside those of the object are reached by the last smoothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,9 +167,10 @@ def _differences(cells: Mask) -> Any:
     """(pairs, cells): one row for each two cells side by side, their difference."""
     number = np.full(cells.shape, -1)
     number[cells] = np.arange(int(cells.sum()))
-    pairs = [(a[both], b[both]) for a, b in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
-             for both in ((a >= 0) & (b >= 0),)]  # fmt: skip
-    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    below = np.stack([number[1:].ravel(), number[:-1].ravel()])
+    beside = np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()])
+    pairs = np.concatenate([below, beside], axis=1)
+    first, second = pairs[:, (pairs >= 0).all(axis=0)]
     row = np.arange(first.size)
     values = np.concatenate([np.ones(first.size), -np.ones(first.size)])
     at = (np.concatenate([row, row]), np.concatenate([first, second]))

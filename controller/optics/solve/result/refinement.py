@@ -27,36 +27,41 @@ from controller.optics.solve.result.metrics import colour_difference
 SCALES_PX: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Standard deviations of the filter's bands; the finest band is what the first leaves."""
 NOISE_FACTOR: Final = 2.0
-"""Of the noise's variance that is taken from a band's energy: the energy of few samples may be large by chance."""
+"""So many times the noise's variance is subtracted from a band's energy: that of few samples may be large by chance."""
 SAMPLES_A_SITE: Final = 4.0
-"""Camera pixels to each red or blue sample: the noise of means falls by so much less than with the pixels' number."""
+"""Camera pixels for each red or blue sample. The noise of a mean falls with the number of samples, not of pixels."""
 LIMIT: Final = 2.0
 """A target's light is never corrected by more than this factor, and ``FLOOR`` of white."""
 FLOOR: Final = 0.1
+"""This share of white is added to a pixel's light before an error is compared with it, so that the dark counts less."""
 LEAST_OUTLIER: Final = 0.15
-"""Of the light and ``FLOOR`` of white: an error below it is never an outlier."""
+"""An error is never an outlier below this share of the pixel's light and ``FLOOR``."""
 OUTLIER_SPREADS: Final = 6.0
+"""An error is an outlier beyond this many spreads of the errors around the median."""
 OUTLIER_PX: Final = 9
-"""Side of the smallest area of outliers: edges of shadows are thinner, hands are not."""
+"""Side in camera pixels of the smallest area of outliers. Edges of shadows are thinner; a hand is larger."""
 MARGIN_PX: Final = 12
-"""Around what was rejected, where a penumbra may be."""
+"""Camera pixels around a rejected area that are rejected, too: a penumbra may be there."""
 CHANGED: Final = 0.04
-"""Of the light and ``FLOOR`` of white: lamps flicker by less between two photographs."""
+"""A pixel has changed where the first and the last exposure differ by this share of its light and ``FLOOR``: lamps
+flicker by less."""
 MOST_REJECTED: Final = 0.3
+"""A photograph is refused where a larger share of the pixels is rejected."""
 DARKEST: Final = 0.5
 BRIGHTEST: Final = 2.0
+"""A photograph is refused where its median light is outside this range, as a share of the predicted one."""
 EDGE_PX: Final = 2.0
 """The correction ends smoothly over about twice this beyond the pixels in reach."""
 LEAST_GAIN: Final = 0.02
-"""CIEDE2000: what two photographs of the same frames differ by, as a mean over the pixels."""
+"""Mean CIEDE2000 by which two photographs of the same frames differ. A smaller gain is noise."""
 STEADY_STEP_PX: Final = 3
-"""Every so many rows and columns are looked at for what lamps that flicker change."""
+"""Flicker is measured at every third row and column."""
 SURE: Final = 2.0
-"""Standard deviations of what lamps flicker by: a smaller factor of a projector's light says nothing."""
+"""A change of a projector's light counts beyond this many standard deviations of its flicker."""
 LEAST_FLICKER: Final = 1e-6
-"""Of a lamp's light: no lamp is steadier."""
+"""The least standard deviation of a lamp's light, as a share of it: no lamp is steadier."""
 CORRELATED_PX: Final = 16.0
-"""Camera pixels whose errors count as one when the uncertainty of a mean is estimated."""
+"""So many neighbouring camera pixels count as one error when the uncertainty of a mean is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
