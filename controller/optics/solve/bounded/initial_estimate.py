@@ -104,24 +104,25 @@ def _solve_blocks(white: FloatImage, mixing: Float64, target: FloatImage) -> Non
 @compiled()
 def _solve_block(B: Float64, light: Float64, p: Float64) -> None:
     """Write what makes the ``light`` (3,) by B p, 0 <= p <= 1, as nearly and as alike as possible to ``p``."""
-    a, b, c, d, e, f, g, h, i = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    # light of each camera channel by the colours of all projectors together
+    rr, rg, rb, gr, gg, gb, br, bg, bb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(0, p.size, 3):
-        a, b, c = a + B[0, k], b + B[0, k + 1], c + B[0, k + 2]
-        d, e, f = d + B[1, k], e + B[1, k + 1], f + B[1, k + 2]
-        g, h, i = g + B[2, k], h + B[2, k + 1], i + B[2, k + 2]
-    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    size = (a * a + e * e + i * i) / 3
+        rr, rg, rb = rr + B[0, k], rg + B[0, k + 1], rb + B[0, k + 2]
+        gr, gg, gb = gr + B[1, k], gg + B[1, k + 1], gb + B[1, k + 2]
+        br, bg, bb = br + B[2, k], bg + B[2, k + 1], bb + B[2, k + 2]
+    determinant = rr * (gg * bb - gb * bg) - rg * (gr * bb - gb * br) + rb * (gr * bg - gg * br)
+    size = (rr * rr + gg * gg + bb * bb) / 3
     if not determinant > LEAST_DETERMINANT * size * np.sqrt(size):
         # without light, or in fewer than three colours: channel by channel
-        r, s, t = light[0] / max(a, 1e-30), light[1] / max(e, 1e-30), light[2] / max(i, 1e-30)
+        red, green, blue = light[0] / max(rr, 1e-30), light[1] / max(gg, 1e-30), light[2] / max(bb, 1e-30)
     else:
-        r = light[0] * (e * i - f * h) + light[1] * (c * h - b * i) + light[2] * (b * f - c * e)
-        s = light[0] * (f * g - d * i) + light[1] * (a * i - c * g) + light[2] * (c * d - a * f)
-        t = light[0] * (d * h - e * g) + light[1] * (b * g - a * h) + light[2] * (a * e - b * d)
-        r, s, t = r / determinant, s / determinant, t / determinant
+        red = light[0] * (gg * bb - gb * bg) + light[1] * (rb * bg - rg * bb) + light[2] * (rg * gb - rb * gg)
+        green = light[0] * (gb * br - gr * bb) + light[1] * (rr * bb - rb * br) + light[2] * (rb * gr - rr * gb)
+        blue = light[0] * (gr * bg - gg * br) + light[1] * (rg * br - rr * bg) + light[2] * (rr * gg - rg * gr)
+        red, green, blue = red / determinant, green / determinant, blue / determinant
     for k in range(0, p.size, 3):
-        p[k], p[k + 1], p[k + 2] = min(max(r, 0.0), 1.0), min(max(s, 0.0), 1.0), min(max(t, 0.0), 1.0)
-    if size > 0 and (min(r, s, t) < 0 or max(r, s, t) > 1):
+        p[k], p[k + 1], p[k + 2] = min(max(red, 0.0), 1.0), min(max(green, 0.0), 1.0), min(max(blue, 0.0), 1.0)
+    if size > 0 and (min(red, green, blue) < 0 or max(red, green, blue) > 1):
         _shared_out(B, light, RIDGE * size, p)
 
 
@@ -168,20 +169,27 @@ def _dual(B: Float64, light: Float64, ridge: float, start: Float64, y: Float64, 
 @compiled()
 def _newton_step(B: Float64, ridge: float, start: Float64, y: Float64, gradient: Float64, step: Float64) -> None:
     """Write -(ridge I + B_f B_f')^-1 gradient, f the numbers that are off their bounds, to ``step``."""
-    a, b, c, d, e, f = ridge, 0.0, 0.0, ridge, 0.0, ridge
+    h00, h01, h02, h11, h12, h22 = ridge, 0.0, 0.0, ridge, 0.0, ridge
     for k in range(start.size):
-        u, v, w = B[0, k], B[1, k], B[2, k]
-        if 0 < start[k] - u * y[0] - v * y[1] - w * y[2] < 1:
-            a, b, c, d, e, f = a + u * u, b + u * v, c + u * w, d + v * v, e + v * w, f + w * w
-    # Cholesky's factors: the matrix is positive definite
-    g = a**0.5
-    h, i = b / g, c / g
-    j = (d - h * h) ** 0.5
-    k1 = (e - h * i) / j
-    m = (f - i * i - k1 * k1) ** 0.5
-    r = -gradient[0] / g
-    s = (-gradient[1] - h * r) / j
-    t = (-gradient[2] - i * r - k1 * s) / m
-    step[2] = t / m
-    step[1] = (s - k1 * step[2]) / j
-    step[0] = (r - h * step[1] - i * step[2]) / g
+        red, green, blue = B[0, k], B[1, k], B[2, k]
+        if 0 < start[k] - red * y[0] - green * y[1] - blue * y[2] < 1:
+            h00, h01, h02, h11, h12, h22 = (
+                h00 + red * red,
+                h01 + red * green,
+                h02 + red * blue,
+                h11 + green * green,
+                h12 + green * blue,
+                h22 + blue * blue,
+            )
+    # the Hessian h = l l' (Cholesky: it is positive definite), then l z = -gradient and l' step = z
+    l00 = h00**0.5
+    l10, l20 = h01 / l00, h02 / l00
+    l11 = (h11 - l10 * l10) ** 0.5
+    l21 = (h12 - l10 * l20) / l11
+    l22 = (h22 - l20 * l20 - l21 * l21) ** 0.5
+    z0 = -gradient[0] / l00
+    z1 = (-gradient[1] - l10 * z0) / l11
+    z2 = (-gradient[2] - l20 * z0 - l21 * z1) / l22
+    step[2] = z2 / l22
+    step[1] = (z1 - l21 * step[2]) / l11
+    step[0] = (z0 - l10 * step[1] - l20 * step[2]) / l00
