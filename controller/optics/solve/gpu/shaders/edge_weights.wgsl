@@ -1,4 +1,4 @@
-// Writes the squared weights of smoothness to the right (low half) and lower neighbour, as in bounded/equations.py.
+// Writes the squared weights of smoothness to the right (low half) and lower neighbour, as in bounded/equations.py (eq. 3).
 @group(0) @binding(1) var<storage, read> sums: array<f32>;
 @group(0) @binding(2) var<storage, read> per_sum: array<f32>;
 @group(0) @binding(3) var<storage, read> observed: array<f32>;

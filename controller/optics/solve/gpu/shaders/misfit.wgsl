@@ -1,4 +1,4 @@
-// Adds up w (picture - wanted)^2 over the camera's pixels.
+// Adds up w (picture - wanted)^2 over the camera's pixels (eq. 2).
 @group(0) @binding(1) var<storage, read> picture: array<f32>;
 @group(0) @binding(2) var<storage, read> wanted: array<f32>;
 @group(0) @binding(3) var<storage, read> weights: array<f32>;

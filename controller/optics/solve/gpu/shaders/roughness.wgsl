@@ -1,4 +1,4 @@
-// Adds up the smoothness term of the objective over a projector's pixels.
+// Adds up the smoothness term of the objective over a projector's pixels (eq. 3).
 @group(0) @binding(1) var<storage, read> x: array<f32>;
 @group(0) @binding(2) var<storage, read> edge_weights: array<u32>;
 

@@ -1,4 +1,4 @@
-// Base times scale of one projector (paper eqs 5 and 6), in the camera's channels and back; frame.matrix unmixes.
+// Base times scale of one projector, in the camera's channels and back; frame.matrix unmixes (eqs 4 to 6).
 // sums under the metapixels before, frames after
 @group(0) @binding(1) var<storage, read_write> sums: array<f32>;
 // the base's mixed frames times what makes means of the sums

@@ -1,4 +1,4 @@
-// A projected, scaled gradient step of one projector, with smoothness, bounds and white segment.
+// A projected, scaled gradient step of one projector, with smoothness, bounds and white segment (eqs 2 and 3).
 @group(0) @binding(1) var<storage, read> y: array<f32>;
 @group(0) @binding(2) var<storage, read> x: array<f32>;
 @group(0) @binding(3) var<storage, read> majoriser: array<f32>;
