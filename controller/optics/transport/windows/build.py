@@ -391,7 +391,8 @@ def build_windows(
         cells = slice(SORTS * int(cell_first[n]), SORTS * int(cell_first[n + 1]) + 1)
         own = first[cells] - first[cells.start]
         part = slice(int(first[cells.start]), int(first[cells.stop - 1]))
-        mine = WindowArrays(*(array[part] for array in filled))
+        site, at, across, down, skew, gain = filled
+        mine = WindowArrays(site[part], at[part], across[part], down[part], skew[part], gain[part])
         begins = own[:-1] + np.cumsum(bands[n], axis=0) - bands[n]
         write_windows(sight, *tables, halo, begins, mine)
         settle(own, counts[n], *mine)
