@@ -105,7 +105,8 @@ def _argument(argument: Any) -> str:
 
 def _option(option: Any) -> str:
     names = ", ".join((*option.opts, *option.secondary_opts))
-    return names if option.is_flag else f"{names} {(option.metavar or option.name).upper()}"
+    value = "|".join(option.type_descriptor.choices or ()) or (option.metavar or option.name).upper()
+    return names if option.is_flag else f"{names} {value}"
 
 
 def _default(option: Any) -> str:

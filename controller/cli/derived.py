@@ -167,17 +167,17 @@ def _lamps(rows: Any) -> Shown:
     return {"days": rows}, "\n".join(lines) or "No lamp has burnt yet."
 
 
-def _changes(found: Any) -> Shown:
-    if found["good_unix_s"] is None:
+def _changes(inventory: Any) -> Shown:
+    if inventory["good_unix_s"] is None:
         text = "There was no good day yet. The first one is after a calibration that graded well, while the kiosk runs."
-        return found, text
-    lines = [f"The last good day was {_day(found['good_unix_s'])} ({found['run']})."]
-    for change in found["changes"]:
+        return inventory, text
+    lines = [f"The last good day was {_day(inventory['good_unix_s'])} ({inventory['run']})."]
+    for change in inventory["changes"]:
         lines += [f"{change['sentence']} (seen on {_day(change['since_unix_s'])})", f"  {change['remedy']}"]
-    if not found["changes"]:
+    if not inventory["changes"]:
         lines.append("Nothing has changed since.")
-    lines += [f"Not compared, because it can't be read now: {name}" for name in found["unknown"]]
-    return found, "\n".join(map(printable, lines))
+    lines += [f"Not compared, because it can't be read now: {name}" for name in inventory["unknown"]]
+    return inventory, "\n".join(map(printable, lines))
 
 
 def _day(unix_s: float) -> str:
