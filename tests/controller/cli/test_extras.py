@@ -129,7 +129,8 @@ def cheap(stage: Path, away: Path) -> dict[str, list[str]]:
     """An invocation of each command that opens no device and ends at once, whatever is installed."""
     picture, bundle = str(away / "no.png"), str(away / "no.vel")
     given: Mapping[str, list[str]] = {
-        "demo": ["--size", "none"], "emulate": [str(away / "nowhere")], "export": [str(away)],
+        "demo": ["--object", str(stage / "stage.toml"), "--out", str(away / "d")],
+        "emulate": [str(away / "nowhere")], "record": [str(away / "nowhere")], "export": [str(away)],
         "plan": [str(away / "no.toml")],
         "report": [str(away)],
         "kiosk serve": [str(stage), "--panel", "none"], "init": [str(stage), "--yes"],
