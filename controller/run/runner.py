@@ -23,7 +23,7 @@ from controller.run.progress import Reporter, Silent, Tracker
 from controller.run.state_machine import Event, Machine
 from controller.run.step_id import StepId, input_name
 from hal.deadline import Cancelled, Deadline
-from hal.errors import DeviceError
+from hal.errors import CodedError, DeviceError
 from hal.notices import Level
 from hal.runtime.compute import threads_may_compute
 
@@ -227,8 +227,8 @@ class Runner:
         """Journal the failure and report it to the machine; errors here must not hide ``error``."""
         stopped = isinstance(error, Cancelled)
         broken = isinstance(error, DeviceError) and not stopped
-        code = error.code if isinstance(error, VelaturaError | DeviceError) else type(error).__name__
-        text = error.what if isinstance(error, VelaturaError | DeviceError) else str(error)
+        code = error.code if isinstance(error, CodedError) else type(error).__name__
+        text = error.what if isinstance(error, CodedError) else str(error)
         try:
             self._journal.record(code, text, Level.INFO if stopped else Level.ERROR)
             event = Event.FAIL if broken else Event.CANCEL
