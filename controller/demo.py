@@ -137,8 +137,8 @@ def _write(stage: Path, options: Mapping[str, Any], *, object_file: Path | None)
 
 def _read_mark(mark: Path) -> object:
     try:
-        return {"room": "dark", **json.loads(mark.read_bytes())}  # a demo from before rooms has none
-    except (OSError, ValueError, TypeError):
+        return json.loads(mark.read_bytes())
+    except (OSError, ValueError):
         return None
 
 
