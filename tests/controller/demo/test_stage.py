@@ -146,16 +146,6 @@ def test_an_object_that_can_not_be_read_is_told(bench: ModelBench, tmp_path: Pat
     assert bench.prepared == []
 
 
-def test_a_demo_from_before_rooms_goes_on_as_one_in_the_dark(bench: ModelBench, tmp_path: Path) -> None:
-    stage = prepared(tmp_path / "out", room="dark")
-    mark = json.loads((stage / "demo.json").read_bytes())
-    del mark["room"]
-    (stage / "demo.json").write_text(json.dumps(mark))
-    assert prepared(tmp_path / "out", room="dark") == stage
-    with pytest.raises(UsageError):
-        prepared(tmp_path / "out", room="room")
-
-
 def test_an_unknown_room_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="dark, room, hard") as refused:
         prepared(tmp_path / "out", room="cellar")
