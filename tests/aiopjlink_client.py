@@ -1,4 +1,4 @@
-"""aiopjlink, a PJLink client that nobody here wrote."""
+"""aiopjlink, a PJLink client by other authors."""
 
 from __future__ import annotations
 

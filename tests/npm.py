@@ -17,7 +17,7 @@ needs_npm: Final = pytest.mark.skipif(
 
 
 def run_node(script: Path, *words: str, folder: Path | None = None, check: bool = True) -> str:
-    """What a script prints, with the packages at hand."""
+    """What a script prints, with the packages available."""
     environment = {**os.environ, "NODE_PATH": str(PACKAGES), "NODE_NO_WARNINGS": "1"}
     done = subprocess.run(
         ["node", str(script), *words], cwd=folder, env=environment, text=True, capture_output=True, timeout=120,

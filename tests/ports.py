@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def kept_port() -> Iterator[int]:
-    """A port of the loopback that is given to nobody else meanwhile, also while the test's server does not run.
+    """A port of the loopback that is given to no one else meanwhile, also while the test's server does not run.
 
     Bound and not listening: connections are refused, and a server may still listen there if it sets SO_REUSEADDR, as
     asyncio's and Mosquitto's do on Linux.

@@ -26,7 +26,7 @@ NEEDS_THE_DEMO: Final = (
 LONGEST_FIRST: Final = (
     "tests/booted/",
     MAKES_THE_DEMO,
-    "tests/end_to_end/test_going_on.py",
+    "tests/end_to_end/test_continuing.py",
     "tests/end_to_end/test_drift.py",
     "tests/real_kernel/test_on_kernel.py",
     "tests/end_to_end/test_refusing_devices.py",

@@ -1,12 +1,15 @@
-"""Texts that users see are in plain words: no archaic phrase, no sentence that needs a second reading.
+"""Texts are in plain words: no archaic phrase, and in messages no sentence that needs a second reading.
 
-They are the messages, help and templates of the product, the README and every page of the documentation.
+They are the messages, help and templates of the product, the README and every page of the documentation, and for
+developers the docstrings, comments and module names of all code.
 """
 
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -16,6 +19,8 @@ import pytest
 ROOT: Final = Path(__file__).parents[1]
 FOLDERS: Final = ("controller", "hal", "plugins")
 """Folders whose messages, help and templates are in plain words."""
+CODE: Final = (*FOLDERS, "lab", "tests", "firmware_configs")
+"""Folders whose docstrings, comments and module names are in plain words."""
 PAGES: Final = ("docs", "README.md")
 """Pages, and folders of them, in plain words."""
 LONGEST: Final = 25
@@ -86,6 +91,17 @@ def texts(source: str) -> Iterator[tuple[int, str, str]]:
             yield node.lineno, names.get(id(node), ""), text
 
 
+def notes(source: str) -> Iterator[tuple[int, str]]:
+    """(line, text) of each comment and docstring, without the code that it quotes: for developers."""
+    statement = {tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.NL, tokenize.COMMENT, tokenize.ENCODING}
+    before = tokenize.ENCODING
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        is_docstring = token.type == tokenize.STRING and token.string.endswith('"""') and before in statement
+        if token.type == tokenize.COMMENT or is_docstring:
+            yield token.start[0], re.sub(r"``.*?``|`.*?`", "", token.string, flags=re.DOTALL)
+        before = token.type
+
+
 def faults(argument: str, text: str) -> list[str]:
     """What is wrong with one text, each with what to write instead."""
     found = []
@@ -106,6 +122,18 @@ def test_messages_and_help_are_plain(folder: str) -> None:
         for path in sorted((ROOT / folder).rglob("*.py"))
         for line, argument, text in texts(path.read_text())
         for fault in faults(argument, text)
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("folder", CODE)
+def test_docstrings_comments_and_module_names_are_plain(folder: str) -> None:
+    files = [path for path in sorted((ROOT / folder).rglob("*.py")) if path != Path(__file__)]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {fault}"
+        for path in files
+        for line, text in [(1, path.stem.replace("_", " ")), *notes(path.read_text("utf-8"))]
+        for fault in faults("", text)
     ]
     assert wrong == []
 
@@ -134,6 +162,8 @@ def test_faults_are_found() -> None:
 E = Error("code", what=f"The file {{name}} was told off.", remedy="Mend it. {long}")
 HELP = {{"key": "made anew each time"}}
 '''
+    assert [faults("", text) for _, text in notes(source)] == [[f"'Nobody': write {PLAIN['nobody']}"]]
+    assert list(notes("x = 1  # ``told`` is a name, anew\n")) == [(1, "#  is a name, anew")]
     found = {argument: faults(argument, text) for _, argument, text in texts(source)}
     assert [fault.split(":")[0] for fault in found["what"]] == ["'told'"]
     assert [fault.split(":")[0] for fault in found["remedy"]] == ["'Mend'", f"{LONGEST + 1} words in a sentence"]

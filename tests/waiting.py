@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 def eventually(so: Callable[[], object], *, within_s: float = 30.0, every_s: float = 0.02) -> bool:
-    """Whether it becomes so; ``within_s`` is long, because a loaded machine is slow, and is waited only in vain."""
+    """Whether it becomes so; ``within_s`` is long for a loaded machine, and is waited in full only if it does not."""
     ends_s = time.monotonic() + within_s
     while not so():
         if time.monotonic() > ends_s:

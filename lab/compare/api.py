@@ -28,7 +28,7 @@ from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 @dataclass(frozen=True, slots=True)
 class ComparisonTarget:
-    """What the camera shall see, in the stage's unit of light. The arrays are the method's own copies.
+    """What the camera is to see, in the stage's unit of light. The arrays are the method's own copies.
 
     ``name``: of the target
     ``radiance`` (camera rows, columns, 3) float32, linear and finite, not below the light of black frames

@@ -35,7 +35,7 @@ class Entry:
 
     @property
     def about(self) -> str:
-        """The first line of what the method says of itself."""
+        """The first line of the method's docstring."""
         text = inspect.getdoc(self.method) or ""
         return text.split("\n", 1)[0].rstrip(".")
 

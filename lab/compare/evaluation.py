@@ -151,7 +151,7 @@ def _attempt(work: Callable[[], Any], check: Callable[[], None]) -> tuple[Any, F
         raise
     except VelaturaError as error:
         found = error
-    except Exception as error:  # noqa: BLE001 - another's code may raise anything, and the other methods go on
+    except Exception as error:  # noqa: BLE001 - another's code may raise anything, and the other methods continue
         found = WorkError(
             "benchmark-method-failed",
             what=f"The method failed: {type(error).__name__}: {error}.",

@@ -1,6 +1,6 @@
 """The disk of a simulated kiosk: real files in memory, whose operations may be refused, or be the last before a kill.
 
-Python tells of every file that it opens, renames or removes (audit events), before it does; SQLite is asked through a
+Python reports every file that it opens, renames or removes (audit events), before it does; SQLite is asked through a
 connection of our own. So the kiosk's code writes as always.
 """
 

@@ -203,7 +203,7 @@ class SimulatedPlayer:
             self._screen.violations.append(("bundle kept", how))
 
     def _opens(self, name: str, folder: Path) -> bool:
-        """Whether this bundle can be read, whoever signed it, as far as the disk can be."""
+        """Whether this bundle can be read, whatever its signature, as far as the disk can be."""
         try:
             Bundle.open_trusted(folder / name, ANY_SIGNER).close()
         except VelaturaError:

@@ -1,7 +1,7 @@
 """Threads that take turns, in virtual time: one runs at a time, and a seed decides whose turn it is.
 
 A task is a thread of the system, so the kiosk's code needs no change. It hands its turn on only where it waits: a
-sleep, an event, a lock that is taken, the end of another task. Between two waits nobody else runs.
+sleep, an event, a lock that is taken, the end of another task. Between two waits no one else runs.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Timing:
 
 
 def timed(work: Callable[[], object], *, repeats: int = 5) -> Timing:
-    """Time ``work``, called once beforehand so that it is compiled and its memory is there."""
+    """Time ``work``, called once before, so that it is compiled and its memory is there."""
     work()
     seconds = []
     for _ in range(repeats):

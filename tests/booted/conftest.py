@@ -12,7 +12,7 @@ from tests.booted.kiosk import PICTURE_S, Kiosk, installed, prepared_stage
 from tests.booted.trees import obstacle
 
 ORDER = ("bare", "playing", "faults", "update", "work", "wiped")
-"""Of the files: each goes on with the machine that the one before left."""
+"""Of the files: each continues with the machine that the previous one left."""
 SHORT = "bare"
 """The file that also `make test` runs, on the older Debian; the others are for `make test-long`."""
 

@@ -1,4 +1,4 @@
-"""What is hard to do to a computer without doing it to this one, too: a full disk, and a clock that nobody set; and a
+"""What is hard to do to a computer without doing it to this one, too: a full disk, and a clock that no one set; and a
 damaged file.
 """
 
@@ -80,7 +80,7 @@ def disk_of_its_own(machine: Machine) -> Iterator[Disk]:
     machine.call("mkdir", "--parents", _DISK)
     machine.call("mount", "--types", "tmpfs", "--options", f"size={_ROOMY}", "tmpfs", _DISK)
     machine.call("cp", "--archive", f"{_WRITTEN}/.", _DISK)
-    # The devices go on, and what they made is theirs.
+    # The devices continue, and what they made is theirs.
     machine.call("mount", "--bind", STAGE / "run", Path(_DISK) / STAGE.name / "run")
     machine.call("mount", "--rbind", _DISK, _WRITTEN)
     machine.call("systemctl", "restart", "velatura.target")

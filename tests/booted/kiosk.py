@@ -63,7 +63,7 @@ class Kiosk:
 
     @property
     def password(self) -> str:
-        """Of the first log-in: the installation told it, and each later start of the service keeps a new one."""
+        """Of the first log-in: the installation printed it, and each later start of the service keeps a new one."""
         kept = self.machine.called("cat", RUNTIME / FIRST_LOGIN)
         if kept.returncode == 0:
             return kept.stdout.split()[1]
@@ -154,7 +154,7 @@ class Kiosk:
         self.machine.wait_for(lambda: self.machine.called(*asked, user="velatura").returncode == 0)
 
     def begin_appearance(self, name: str, seed: int) -> None:
-        """Begin to compute an appearance from a picture that nobody has computed yet."""
+        """Begin to compute an appearance from a picture that no one has computed yet."""
         picture = Path(f"/opt/{name}-{seed}.png")
         cv2.imwrite(str(self.machine.at(picture)), np.random.default_rng(seed).integers(0, 256, (48, 48, 3), np.uint8))
         self.begin("add", name, picture)

@@ -1,4 +1,4 @@
-"""A Debian that systemd boots in a container, with a disk of its own: switched on, spoken to, cut off and on again."""
+"""A Debian that systemd boots in a container, with its own disk: switched on, given commands, cut off and on again."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ class Machine:
         return self._init
 
     def cut_off(self) -> None:
-        """As when the power fails: every process is gone at once, and nothing was told."""
+        """As when the power fails: every process is gone at once, and nothing was reported."""
         if self._container is not None:
             os.kill(self._init or self._container.pid, signal.SIGKILL)
             self._container.wait()

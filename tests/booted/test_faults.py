@@ -29,7 +29,7 @@ def test_on_a_disk_that_is_read_only_from_the_boot_on_it_plays_and_a_damaged_bun
     playing.boot(read_only=True)
     try:
         machine.wait_for(lambda: playing.shows(OTHER_SEED))
-        # The devices begin anew, too.
+        # The devices start again, too.
         machine.wait_for(lambda: set(playing.problems()) == {"disk"} and "disk" in playing.status()["reason"])
         assert "can't be written to" in playing.problems()["disk"]
         assert 'name="password"' in machine.fetched(f"https://{ADDRESS}:8377/login")

@@ -3,8 +3,8 @@
     python -m tests.campaigns.camera_faults [CAPTURES] [SEED]
 
 Half of the cameras are on PTP/IP, half on the emulated USB bus. Prints one line for each camera, and ends with 0 where
-no picture was lost or taken twice, none was another one than the newest, every call ended in time, and the driver told
-of every fault that it had to repair.
+no picture was lost or taken twice, none was another one than the newest, every call ended in time, and the driver
+reported every fault that it had to repair.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ _MENDED: Final = {
     "drop_before_exposure": {"camera-shot-lost", "camera-disconnected"},
     "wrong_lengths": {"camera-protocol"},
 }
-"""Each fault, and the codes under which the driver may tell of it."""
+"""Each fault, and the codes under which the driver may report it."""
 _ASKED_FOR_ITSELF: Final = "sony"
-"""A body that is asked whether its picture is there: a lost event costs nothing, and nobody can know of it."""
+"""A body that is asked whether its picture is there: a lost event costs nothing, and no one can know of it."""
 
 
 class Bench(Protocol):

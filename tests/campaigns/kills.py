@@ -1,4 +1,4 @@
-"""Power cuts at random moments of a calibration: it goes on, and its bundle is the same to the byte.
+"""Power cuts at random moments of a calibration: it continues, and its bundle is the same to the byte.
 
     python -m tests.campaigns.kills [KILLS] [SEED] [SECONDS]
 
@@ -238,7 +238,7 @@ class Lived:
     cuts: int = 0
 
     def repeated(self, whole: Lived) -> int:
-        """Photographs that were taken again, besides those of a life without kills."""
+        """Photographs that were taken again, without those of a life without kills."""
         return sum((self.exposed - whole.exposed).values())
 
     def differences(self, whole: Lived) -> list[str]:
@@ -254,7 +254,7 @@ class Lived:
 
 
 def begin(folder: Path, nursery: Nursery, *, photographs: int = 0) -> Path:
-    """A stage whose calibration was killed when it had taken so many photographs: what all lives go on from."""
+    """A stage whose calibration was killed when it had taken so many photographs: what all lives continue from."""
     begun = prepare_mini(folder / "begun")
     with Life(begun, nursery) as life, life.working() as process:
         while not (list((begun / "runs").glob("*/journal.sqlite")) and taken(begun) >= photographs):
@@ -264,7 +264,7 @@ def begin(folder: Path, nursery: Nursery, *, photographs: int = 0) -> Path:
 
 
 def uninterrupted(stage: Path, nursery: Nursery) -> Lived:
-    """Let it go on to its end."""
+    """Let it continue to its end."""
     with Life(stage, nursery) as life, life.working() as process:
         assert process.until(BEGUN), process.told
         began_s = time.monotonic()
@@ -291,7 +291,7 @@ def _ports_in(stage: Path) -> list[int]:
 
 
 def ports() -> tuple[int, int]:
-    """Two that nobody listens on now, below those that the system hands out: they must be free again after a cut."""
+    """Two that no one listens on now, below those that the system hands out: they must be free again after a cut."""
     dice, found = random.SystemRandom(), list[int]()
     while len(found) < 2:
         with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", dice.randrange(20_000, 32_000))) as one:
@@ -300,7 +300,7 @@ def ports() -> tuple[int, int]:
 
 
 def killed(stage: Path, nursery: Nursery, dice: random.Random, most: int, longest_s: float) -> Lived:
-    """Let it go on to its end, killed ``most`` times at most, each time within ``longest_s`` of its beginning."""
+    """Let it continue to its end, killed ``most`` times at most, each time within ``longest_s`` of its beginning."""
     kills = cuts = 0
     began_s = time.monotonic()
     with Life(stage, nursery) as life:

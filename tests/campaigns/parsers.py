@@ -172,7 +172,7 @@ def atheris_child(name: str, folder: Path, options: list[str]) -> None:
     import atheris  # type: ignore[import-untyped]
 
     outcome = Outcome(name)
-    # What the fuzzer follows must be told to it before it is imported anew, with its branches counted.
+    # What the fuzzer follows must be known to it before it is imported again, with its branches counted.
     for module in [m for m in sys.modules if m.startswith(("hal", "controller", "plugins", "tests.campaigns.parser_"))]:
         del sys.modules[module]
     with atheris.instrument_imports(

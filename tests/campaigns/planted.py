@@ -4,7 +4,7 @@
 
 Each patch of ``planted_bugs`` is put into a copy of the code in a temporary folder. There, lives of one seed after
 the other are lived, for at most so many seconds of a core; first without a bug, where nothing may be found. With
-WORDs only the patches that have one in their names. ``--seeds``: lives that nobody has looked at yet; ``--log``: lives
+WORDs only the patches that have one in their names. ``--seeds``: lives that no one has looked at yet; ``--log``: lives
 with incidents of the event log alone (``log_lives``). A search that fails does not stop the others; the exit
 code is 1 then.
 """

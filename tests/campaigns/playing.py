@@ -28,7 +28,7 @@ from tests.controller.play.wire import Frames, Pictures, Wire, noise
 
 NAMES: Final = ("P1", "P2", "P3")
 APPEARANCES: Final = 80
-"""More than a player keeps decoded, so that each is decoded anew."""
+"""More than a player keeps decoded, so that each is decoded again."""
 FEW: Final = 6
 RATE_HZ: Final = 30.0
 MOST_IN_WINDOWS: Final = 10_800
@@ -53,7 +53,7 @@ class Found:
 
 
 def in_memory(swaps: int) -> Found:
-    """Small pictures, each set decoded anew, presented as fast as they go."""
+    """Small pictures, each set decoded again, presented as fast as they go."""
     outputs = [(name, WIDTH, HEIGHT) for name in NAMES]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)

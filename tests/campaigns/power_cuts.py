@@ -9,7 +9,7 @@ each part ends at its next cut. ``--part``: all CUTS are of this part. Hundred c
 each with a SEED of its own. Ends with 0 where the picture came back every time, settings, key, bundle and every
 event were there after each cut, and a calibration at the end ran through and its bundle plays.
 
-The devices are emulated on the same machine, and begin anew, too. So some boots beside devices that are on follow, for
+The devices are emulated on the same machine, and start again, too. So some boots beside devices that are on follow, for
 the kiosk's own time.
 """
 

@@ -4,7 +4,7 @@
 
 Two lives, one over the end of summer time and one over its beginning. Every minute is accounted for: the stage did what
 its hours say, or an incident excuses it, of which the event log tells; and at every minute the log's last word on the
-stage's state is what it is. The hours are worked out here a second time, from local dates alone.
+stage's state is true. The hours are worked out here a second time, from local dates alone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SCHEDULE = Schedule(
     "03:30",
 )
 SETTLING_S = 200.0
-"""After a change of any kind a stage may be between what it did and what it is to do for so long."""
+"""After a change of any kind a stage may be between what it did and what it has to do for so long."""
 REPAIR_S = 1900.0
 """After an incident: the longest retry out of a fault, and the lamps' own times."""
 TOLD = {

@@ -5,7 +5,7 @@
 The faults are the emulators' own lists of knobs and deeds: a new knob is a new row of the matrix. Each case: bring the
 kiosk to the step, turn the knob, wait until the kiosk has settled (playing, degraded, fault or off), look whether it
 says why and what to do; then repair, and see it play again. CASES of the matrix are drawn (without a number: all)
-and shared among LANES processes, each with a kiosk of its own that goes on from case to case; SKIP leaves out so many
+and shared among LANES processes, each with a kiosk of its own that continues from case to case; SKIP leaves out so many
 of the first that are drawn, so that a campaign can be done in parts, and WORD all whose names begin with another word
 ("board", "wire" ...). A new row does not change the order of the others. Ends with 0 where every case was explained and
 repaired before its deadline, nothing hung, no lamp was struck while it cooled, and none lost its mains while hot.
@@ -40,11 +40,11 @@ STEPS: Final = ("off", "powering", "warming", "playing", "calibrating", "degrade
 REACH_S, SETTLE_S, MENDED_S, GAP_S = 120.0, 300.0, 240.0, 30.0
 """Deadlines, for machines that do much else meanwhile: three strikes of a dead lamp alone take 105 s."""
 WORK_S: Final = 15.0
-"""For so long work may go on after a fault; then somebody cancels it."""
+"""For so long work may continue after a fault; then somebody cancels it."""
 NOTICED_S: Final = 25.0
 """By then a fault that lasts has been noticed where it matters; a short silence is no event for 15 s."""
 TOLD_S: Final = 90.0
-"""By then the technician is told of a device that does not answer: it is looked at every 10 s, with 20 s to open it."""
+"""By then a device that does not answer is reported: it is looked at every 10 s, with 20 s to open it."""
 STARVED_S: Final = 1.0
 """Where the machine itself stood still for so long at once, a device may well have been late for our clock."""
 
@@ -149,7 +149,7 @@ def _told(kiosk: WiredKiosk, before: int, word: str) -> bool:
 
 
 def _nothing_else(kiosk: WiredKiosk, before: int, fault: Fault) -> None:
-    """Nobody was told of a device to which nothing was done."""
+    """No one was informed of a device to which nothing was done."""
     others = [word for name, word in WORDS.items() if name not in fault.name.split()]
     told = [row.text for row in kiosk.service.log.after(before) if row.level != "info"]
     wrong = [text for text in told if any(word in text for word in others)]

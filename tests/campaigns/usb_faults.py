@@ -54,7 +54,7 @@ def _wire(name: str) -> Iterator[Fault]:
             blocks = goes_on(value) and not isinstance(value, float) and name in ASKED
             turn, told = _turn(name, f"faults.{knob.name}", value), WORDS[name] if blocks else ""
             words = f"{name} wire" if name == TETHER else name
-            # Who was told has noticed.
+            # The person who was informed has noticed.
             yield Fault(f"{words} {knob.name}={value}", turn, mend_usb, goes_on(value) and not blocks, told)
 
 

@@ -25,7 +25,7 @@ Turn = Callable[[WiredKiosk], None]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """``lasts``: until it is mended; ``told``: words in what the technician must then be told of at every step.
+    """``lasts``: until it is repaired; ``told``: words in what the technician must then be informed of at every step.
 
     ``tethered``: strikes only where the camera is on USB.
     """

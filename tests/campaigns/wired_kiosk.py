@@ -82,7 +82,7 @@ def usb_environment() -> Iterator[dict[str, str]]:
 
 
 def prepare_wired(out: Path, *, usb: bool = False, tethered: bool = False) -> Path:
-    """A stage with a bundle to play and its rays cast, to be copied for as many kiosks as there shall be.
+    """A stage with a bundle to play and its rays cast, to be copied for as many kiosks as are needed.
 
     ``tethered``: its camera is on USB, and not on the network.
     """
@@ -215,7 +215,7 @@ class WiredKiosk:
                     os.kill(pid, number)
 
     def _rest(self) -> None:
-        """``starved_s``: the longest that this process was not let go on when it should have been."""
+        """``starved_s``: the longest that this process was not let continue when it should have been."""
         began_s = time.monotonic()
         time.sleep(POLL_S)
         self.starved_s = max(self.starved_s, time.monotonic() - began_s - POLL_S)

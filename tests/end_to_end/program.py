@@ -125,7 +125,7 @@ class Command:
         resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (size, hard))
 
     def interrupt(self) -> Outcome:
-        """Ctrl-C, and what comes of it."""
+        """Ctrl-C, and its result."""
         self.process.send_signal(signal.SIGINT)
         return self.outcome(timeout_s=180)
 
@@ -218,7 +218,7 @@ class Bench:
 
 
 def wrong_code(outcome: Outcome, code: int = 2) -> str:
-    """The code of an error, which is told in two sentences and nothing else."""
+    """The code of an error, which is reported in two sentences and nothing else."""
     assert outcome.code == code, outcome
     assert outcome.stderr == ""
     assert outcome.error.keys() == {"code", "what", "remedy"}

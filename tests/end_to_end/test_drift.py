@@ -1,4 +1,4 @@
-"""A calibrated stage is bumped, and Velatura says what has happened and mends what it can."""
+"""A calibrated stage is bumped, and Velatura says what has happened and repairs what it can."""
 
 from __future__ import annotations
 

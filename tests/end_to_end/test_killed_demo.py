@@ -1,4 +1,4 @@
-"""A demo that is killed leaves nothing that keeps the next one from going on; and its help."""
+"""A demo that is killed leaves nothing that keeps the next one from continuing; and its help."""
 
 from __future__ import annotations
 

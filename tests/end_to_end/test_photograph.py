@@ -1,4 +1,4 @@
-"""What the demo's appearances achieve, photographed anew by the running kiosk."""
+"""What the demo's appearances achieve, photographed again by the running kiosk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Appearances that can't be made, on a stage that is calibrated: told within a second, nothing solved or published."""
+"""Appearances that can't be made, on a calibrated stage: reported within a second, nothing solved or published."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def devices(stage: Path) -> Iterator[None]:
 
 
 def first_password(kiosk: Command) -> str:
-    """The one-time password that the console told."""
+    """The one-time password that the console showed."""
     kiosk.wait_for_message("First login")
     told = [str(record["message"]["text"]) for record in kiosk.records if "message" in record]
     found = re.search(r"password (\S+) \(once\)", " ".join(told))

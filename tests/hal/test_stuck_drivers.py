@@ -1,4 +1,4 @@
-"""Drivers that never return: the call is left behind, the device is named, and the other devices go on."""
+"""Drivers that never return: the call is left behind, the device is named, and the other devices continue."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
     """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
 
     ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's; ``board`` makes another board
-    than the profile's; ``name`` tells several apart.
+    than the profile's; ``name`` distinguishes several.
     """
     opened: list[SerialPair] = []
 

@@ -43,7 +43,7 @@ class Board(WorkerLink[int]):
 
 
 class Doing(threading.Event):
-    """A cancellation that nobody asks for: does ``work`` when it is looked at the ``turn``-th time."""
+    """A cancellation that no one asks for: does ``work`` when it is looked at the ``turn``-th time."""
 
     def __init__(self, turn: int, work: threading.Thread) -> None:
         super().__init__()

@@ -85,7 +85,7 @@ class Mcp2221(EmulatedHidDevice):
                 if data[4 + 4 * line]:
                     self._directions[line] = data[5 + 4 * line]
         elif command == self._GET_SETTINGS:
-            # Each pin is a GPIO. A driver that is not told asks for this ten times a second, for ever.
+            # Each pin is a GPIO. A driver without one asks for this ten times a second, for ever.
             told[22:26] = bytes(direction << 3 for direction in self._directions)
         elif command != self._STATUS:
             told[1] = self._UNKNOWN

@@ -147,7 +147,7 @@ def test_an_adapter_that_is_busy_for_some_looks_keeps_its_lines(board: Board, ke
     assert isinstance(adapter, Mcp2221)
     before = keys.call(lambda lines: lines, deadline=in_seconds(PATIENCE_S))
     adapter.busy = ENOUGH_LOOKS
-    press(adapter, 0)  # nobody asks meanwhile, so nobody opens them again
+    press(adapter, 0)  # no one asks meanwhile, so no one opens them again
     assert adapter.busy == 0
     assert keys.wait_pressed(deadline=in_seconds(PATIENCE_S)) == PLAY
     assert keys.call(lambda lines: lines, deadline=in_seconds(PATIENCE_S)) is before

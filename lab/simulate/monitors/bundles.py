@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 NAMED_S: Final = 30.0
 SHOWN_S: Final = 900.0
-"""Until a player whose bundle is damaged goes back to the one before: starts in vain, of which each waits longer."""
+"""Until a player whose bundle is damaged goes back to the previous one: some starts fail, each after a longer wait."""
 _FOLDER: Final = STAGE / "bundles"
 
 
@@ -74,7 +74,7 @@ class BundleMonitor:
         return shows and not crashes and not self._world.disk.blind and self._playable()
 
     def _playable(self) -> bool:
-        """Whether the installed bundle can be read, or the one before, which was not given up itself."""
+        """Whether the installed bundle can be read, or the previous one, which was not given up itself."""
         now, earlier = chosen(_FOLDER), previous(_FOLDER)
         if now is not None and now.name not in self.spoilt:
             return True

@@ -47,7 +47,7 @@ class Calendar:
 
 
 SETTLING_S: Final = 200.0
-"""After a change of any kind, the stage may be between what it did and what it is to do: warm-up, rests, cooling."""
+"""After a change of any kind, the stage may be between what it did and what it has to do: warm-up, rests, cooling."""
 FAR_S: Final = 9 * 86_400.0
 
 
@@ -56,7 +56,7 @@ class OpeningExpectation:
 
     What people say lasts until the hours change next. While the kiosk has no time, that is the first change after it
     has one again. A kiosk whose time or hours are wrong ends it at another moment, which is not worked out here: then
-    nobody is ``sure`` until the first change after both are right.
+    no one is ``sure`` until the first change after both are right.
     """
 
     def __init__(self, calendar: Calendar, truth: Callable[[], float]) -> None:

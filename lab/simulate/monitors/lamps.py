@@ -73,7 +73,7 @@ class LampMonitor:
         for supervisor in service.devices.projectors:
             lamp, view = self._world.lamps[supervisor.name], supervisor.view
             dark = view.condition is Condition.LOST and view.looked and not view.maybe_lit
-            # Nobody can know of one that somebody else switched on, or a command that was taken for lost.
+            # No one can know of one that somebody else switched on, or a command that was taken for lost.
             known = lamp.lit and not lamp.by_hand and not lamp.late
             if dark and known and self._world.scheduler.now_s - lamp.struck_at_s > BACK_S:
                 raise Violation("may burn", f"the lamp of {supervisor.name} burns, and counts as dark")
@@ -83,7 +83,7 @@ class LampMonitor:
             lamp, view = self._world.lamps[supervisor.name], supervisor.view
             # A look at it after the strike has ended.
             seen = view.condition in _SEEN and self._world.scheduler.now_s - lamp.struck_at_s > LOOKED_S
-            # Nobody can count a strike by the second of one command, after the first one's light went out.
+            # No one can count a strike by the second of one command, after the first one's light went out.
             commanded = lamp.strikes - lamp.doubled
             if seen and view.strikes < commanded - self._uncounted.get(lamp.name, 0):
                 raise Violation("strikes counted", f"{view.strikes} instead of {commanded} for {lamp.name}")

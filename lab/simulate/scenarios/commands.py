@@ -20,7 +20,7 @@ CHANGES: Final = ("comment", "projector", "display")
 
 @contextlib.contextmanager
 def unknown_outcome_if_killed(life: SystemUnderTest, incident: Incident) -> Iterator[None]:
-    """Of a command in the middle of which the program is killed, nobody knows whether it was kept."""
+    """Of a command in the middle of which the program is killed, no one knows whether it was kept."""
     try:
         yield
     except Killed:
@@ -95,7 +95,7 @@ def expect(life: SystemUnderTest, incident: Incident, values: Mapping[str, Any])
         monitor.disturb(0.0, SETTLING_S)
         cancelled(life)
     elif incident.target == "set-schedule":
-        # Nobody puts older hours back into the file.
+        # No one puts older hours back into the file.
         life.originals.pop("schedule.toml", None)
         monitor.expectation.use(Calendar(values["time_zone"], values["rows"]))
         life.news.set()

@@ -197,7 +197,7 @@ def unbounded_inverse(
 ) -> list[FloatImage]:
     """Least squares without bounds (paper 2.2, eq. 2), clipped to [0, 1] afterwards.
 
-    By LSMR, which ends at the least-norm solution, the pseudo-inverse's, as it goes on.
+    By LSMR, which ends at the least-norm solution, the pseudo-inverse's, as it continues.
     """
     mask, shape = transport.object_mask, transport.camera_shape
     camera = (3, *shape)

@@ -38,7 +38,7 @@ def plate_object(path: Path, seed: int) -> None:
     """Write a pale, unpainted plate, 0.36 m wide and 0.30 m high, whose rim is bent back: the same for every ``seed``.
 
     The middle, three quarters of the width and the height, is flat. A calibration needs the rim: from a plane alone,
-    the poses of projectors can't be told.
+    the poses of projectors can't be determined.
     """
 
     def plate(u: Float64, v: Float64) -> tuple[Float64, Float64, Float64]:

@@ -114,7 +114,7 @@ class Subject:
     ) -> ReachableTarget:
         """A target at the largest exposure that ``share`` of the object can reach.
 
-        ``transport``: of the projectors that shall reach it alone; else all of them. The mask is what they reach.
+        ``transport``: of the projectors that are to reach it alone; else all of them. The mask is what they reach.
         """
         black = self.calibration.black
         drive = self.drive if transport is None else DriveLevels(transport)
@@ -169,7 +169,7 @@ class Recalibration:
 
 
 class StageControl(Protocol):
-    """What an experiment may do besides taking photographs. ``name``: unique in its experiment."""
+    """What an experiment may do apart from taking photographs. ``name``: unique in its experiment."""
 
     def disturb(self, *changes: BenchChange) -> None:
         """Change the stage (``hal.interfaces.Bench.disturb``); without changes: as it was set up."""

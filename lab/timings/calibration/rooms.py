@@ -97,7 +97,7 @@ def _troubles(room: str, found: Sequence[tuple[BenchTruth, dict[str, Any]]]) -> 
 
 
 def possible_troubles(truth: BenchTruth) -> dict[Named, float]:
-    """All troubles that may be told, with their levels; 0 where there is none."""
+    """All troubles that may be reported, with their levels; 0 where there is none."""
     sensor = truth.camera.sensor
     found: dict[Named, float] = {
         (TroubleCode.CAMERA_GLARE, None): truth.camera.glare,

@@ -130,7 +130,7 @@ def _paced(stage: Path, *, changes: bool = True) -> Pace:
 
 
 def _busy(stage: Path, pid: int) -> float:
-    """As ``_at_rest``, while the state changes as often as panels are told."""
+    """As ``_at_rest``, while the state changes as often as panels are updated."""
     with _changing(stage):
         return _at_rest(pid)
 

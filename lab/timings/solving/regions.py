@@ -57,7 +57,7 @@ def measure(size: str) -> list[Row]:
 
 
 def _unmixed(calibration: Calibration) -> Calibration:
-    """The paper's case: mixing is taken out beforehand, and the channels are solved one by one."""
+    """The paper's case: mixing is taken out first, and the channels are solved one by one."""
     plain = [
         dataclasses.replace(part, radiometry=dataclasses.replace(part.radiometry, mixing=np.eye(3)))
         for part in calibration.projectors

@@ -52,7 +52,7 @@ class Truth:
     def picture(self, frames: Sequence[ByteImage], *, direct: bool = False) -> FloatImage:
         """Linear light (rows, columns, 3) before the sensor of a frame for each projector, all of them lit.
 
-        ``direct``: without what other surfaces throw back and what goes astray in lenses.
+        ``direct``: without light from other surfaces and stray light of lenses.
         """
         renderer = self._direct if direct else self._renderer
         return np.asarray(renderer.light(frames, [1.0] * len(frames)), np.float32)
@@ -137,7 +137,7 @@ class Truth:
 
 
 def _direct_alone(truth: BenchTruth, samples: Samples) -> tuple[BenchTruth, Samples]:
-    """Without what goes astray in lenses, which the light that goes straight then lacks."""
+    """Without stray light of lenses, which the light that goes straight then lacks."""
     clear = 1 - truth.camera.glare
     straight = np.array([clear * (1 - one.light.glare) for one in truth.projectors], np.float32)
     projectors = tuple(

@@ -19,7 +19,7 @@ import pytest
 
 
 class PowerCut(BaseException):
-    """Not an Exception: nothing may catch it and go on."""
+    """Not an Exception: nothing may catch it and continue."""
 
 
 class Disk:

@@ -154,7 +154,7 @@ def test_tiles_that_are_there_are_not_read_again(tmp_path: Path) -> None:
     with Bundle.open(path, allow_unsigned=True) as bundle:
         buffer = np.zeros_like(frames[0])
         known = bundle.decode_into("0", {"P1": buffer})
-        buffer[:, 15:] = 7  # what nobody may touch, for it is known to be there
+        buffer[:, 15:] = 7  # what no one may touch, for it is known to be there
         buffer[10:] = 7
         bundle.decode_into("1", {"P1": buffer}, known=known)
     np.testing.assert_array_equal(buffer[:10, :15], frames[1][:10, :15])

@@ -24,7 +24,7 @@ TABLES = {
 
 
 class ModelBench:
-    """Writes one file, and fails after that if it is told to."""
+    """Writes one file, and fails after that if asked to."""
 
     def __init__(self) -> None:
         self.prepared: list[Path] = []

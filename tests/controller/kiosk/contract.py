@@ -238,7 +238,7 @@ def ascending(rows: Sequence[EventRow]) -> bool:
 
 
 def shows_names(stage: Stage) -> bool:
-    """At once: whoever asked looks at the next page."""
+    """At once: the person who asked looks at the next page."""
     return stage.kiosk.snapshot().identifying
 
 

@@ -105,7 +105,7 @@ def _killed(kiosk: Kiosk) -> None:
 
 
 def _nothing(kiosk: Kiosk) -> None:
-    """Mends itself."""
+    """Repairs itself."""
 
 
 def _set(what: str, on: object, off: object) -> Fault:

@@ -52,7 +52,7 @@ class FragileLamp(Lamp):
 
 @dataclass
 class ModelPlayer:
-    """Shows what it is told at once, unless it is hung or has trouble; a hung one comes back after 5 s."""
+    """Shows what is asked at once, unless it is hung or has trouble; a hung one comes back after 5 s."""
 
     world: World
     want: Showing | None = BLACK

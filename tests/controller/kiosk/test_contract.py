@@ -38,7 +38,7 @@ test_every_operation_of_a_kiosk_is_in_the_contract = contract.test_every_operati
 
 @dataclass
 class Real:
-    """A kiosk over its service, whose devices nobody opens and whose work waits: no thread moves it."""
+    """A kiosk over its service, whose devices no one opens and whose work waits: no thread moves it."""
 
     kiosk: StageKiosk
     folder: Path

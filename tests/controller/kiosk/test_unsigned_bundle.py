@@ -1,4 +1,4 @@
-"""A bundle that nobody signed, on a stage that allows it: the service hears it from its player, and says it on."""
+"""A bundle that no one signed, on a stage that allows it: the service hears it from its player, and says it on."""
 
 from __future__ import annotations
 

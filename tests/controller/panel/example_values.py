@@ -71,7 +71,7 @@ def draw_ball(file: Path, name: str, shade: int) -> None:
 
 @cache
 def _ball(tint: int, shade: int) -> bytes:
-    """Kept: each kiosk of a test would draw them anew, for 50 ms."""
+    """Kept: each kiosk of a test would draw them again, for 50 ms."""
     light = ImageOps.invert(Image.radial_gradient("L")).resize((300, 300)).crop((70, 30, 310, 190))
     ball = Image.new("L", (240, 160))
     ImageDraw.Draw(ball).ellipse((50, 10, 190, 150), fill=255)

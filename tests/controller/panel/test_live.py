@@ -59,7 +59,7 @@ def test_a_change_while_the_first_picture_is_drawn_is_not_lost() -> None:
             if text == "old":
                 texts.append("new")
                 hub.changed()
-                time.sleep(0.3)  # long enough for the hub to hear of it while nobody is served yet
+                time.sleep(0.3)  # long enough for the hub to hear of it while no one is served yet
             return {"top": text}
 
         hub = Hub(draw, frames_per_s=100, most=1)

@@ -1,4 +1,4 @@
-"""Nobody enters: every route of the table, with every role."""
+"""No one enters: every route of the table, with every role."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def test_a_stop_ends_the_pages_that_follow_live_without_waiting_for_them(
 
 @pytest.mark.parametrize("again", range(5))
 def test_a_stop_closes_connections_that_begin_at_that_moment(tmp_path: Path, again: int) -> None:
-    """A browser opens spare connections, and would wait for good on one that is open and that nobody reads.
+    """A browser opens spare connections, and would wait for good on one that is open and that no one reads.
 
     Without the closing, about every second time is caught.
     """

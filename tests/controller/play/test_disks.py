@@ -1,4 +1,4 @@
-"""A player on a disk that became read-only: what plays goes on, and what can not be kept is told.
+"""A player on a disk that became read-only: what plays continues, and what can not be kept is reported.
 
 Root may write where the folder's mode says no, so the player is started without that right: as it is on a kiosk.
 """
@@ -33,7 +33,7 @@ _RIGHTS = (1, 2, 3)
 
 
 def without_root_s_rights(start: Callable[[], Found]) -> Found:
-    """What ``start`` returns; processes that it starts obey the modes of files, whoever runs them."""
+    """What ``start`` returns; processes that it starts obey the modes of files, whatever user runs them."""
 
     def drop_and_start() -> Found:
         # Rights belong to the thread, which ends with this; a process that it starts has none that it has lost.

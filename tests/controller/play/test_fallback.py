@@ -27,7 +27,7 @@ Start = Callable[..., PlayerProcess]
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """The link to the installed bundle, whose one output does not fit the player; the one before it is sound."""
+    """The link to the installed bundle, whose one output does not fit the player; the previous one is sound."""
     folder = tmp_path / "bundles"
     install(write_noise(tmp_path / "b.vel"), folder, allow_unsigned=True)
     write_bundle(

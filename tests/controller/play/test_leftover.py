@@ -29,7 +29,7 @@ def test_it_is_ended_even_if_it_hangs_and_another_can_start(
 def test_where_none_serves_nothing_happens(tmp_path: Path) -> None:
     assert not end_leftover(tmp_path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-        listener.bind(str(tmp_path / "player.sock"))  # nobody listens: its player is dead
+        listener.bind(str(tmp_path / "player.sock"))  # no one listens: its player is dead
     assert not end_leftover(tmp_path)
 
 
@@ -37,7 +37,7 @@ def test_one_that_was_still_loading_when_it_was_looked_for_is_replaced_all_the_s
     start: Callable[..., PlayerProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = start()
-    looks = iter([False])  # the first look finds nobody, as while it loads
+    looks = iter([False])  # the first look finds no one, as while it loads
     monkeypatch.setattr(launch, "end_leftover", lambda runtime: next(looks, None) is None and end_leftover(runtime))
     with replace_player(tmp_path, PlayerSettings([("P1", 64, 48)], tmp_path / "other.frame")) as player:
         assert player.alive

@@ -69,7 +69,7 @@ class Slow:
     continued = False
 
     def leave(self) -> None:
-        """Nobody follows."""
+        """No one follows."""
 
     def missing(self) -> tuple[str, ...]:
         return ()
@@ -88,7 +88,7 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
 
 
 def play(presenter: Presenter, clocks: Clocks, count: int) -> None:
-    """Present ``count`` sets, each at the tick after the one before, looking as often as the player's loop does."""
+    """Present ``count`` sets, each at the tick after the previous one, looking as often as the player's loop does."""
     black = FrameSet.black(SIZES)
     presenter.begin_sequence(RATE_HZ)
     tick = presenter.soon()

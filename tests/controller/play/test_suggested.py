@@ -1,4 +1,4 @@
-"""The playlist that a bundle suggests, and what a player tells of a bundle that nobody signed."""
+"""The playlist that a bundle suggests, and what a player reports of a bundle that no one signed."""
 
 from __future__ import annotations
 

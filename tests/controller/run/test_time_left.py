@@ -1,4 +1,4 @@
-"""The time left: from what the last runs took, without jumps that nobody explains."""
+"""The time left: from what the last runs took, without jumps that no one explains."""
 
 from __future__ import annotations
 

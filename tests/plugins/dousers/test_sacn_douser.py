@@ -45,7 +45,7 @@ def truth(covers: str = "left", channel: int = 3, **others: Any) -> DouserTruth:
 
 @contextlib.contextmanager
 def node_of(*dousers: DouserTruth, lamps: dict[str, EmulatedLamp]) -> Iterator[tuple[EmulatedNode, list[Any]]]:
-    """A node that serves one port, and what it told."""
+    """A node that serves one port, and what it reported."""
     told: list[Any] = []
     (node,) = dmx_nodes(dousers, lamps, lambda *what: told.append(what))
     with node:
@@ -111,7 +111,7 @@ def test_a_receiver_that_nobody_here_wrote_hears_two_dousers_as_one_source(recei
     left.close()
     right.move(False, deadline=in_seconds(SOON))
     wait_for(lambda: heard.packets[-1].dmxData[8] == 10)
-    # The one that was closed stays as it is, and the stream goes on for the other.
+    # The one that was closed stays as it is, and the stream continues for the other.
     assert (heard.packets[-1].dmxData[2], heard.presence) == (255, ["available"])
     right.close()
     wait_for(lambda: heard.presence == ["available", "timeout", "timeout", "timeout"])

@@ -100,7 +100,7 @@ def test_a_stage_is_served_at_the_addresses_it_was_prepared_with_and_cleaned_up(
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as desk:
                 desk.sendto(bytes(packet.getBytes()), ("127.0.0.1", port))
             told = [json.loads(next(process.stdout)) for _ in range(2)] if process.stdout is not None else []
-            # Nobody goes on sending.
+            # No one continues sending.
             assert told == [{"douser": "above", "open": True}, {"douser": "above", "open": False}]
             assert [power_of(tty, patience_s=0.5) for tty in ttys[:2]] == [b"", b""], "these two have no mains"
             assert power_of(ttys[2]) == b"OK0\r"

@@ -172,7 +172,7 @@ def test_a_port_that_this_user_may_not_open_comes_with_its_rule(plugged: Any, tm
 
 
 def _as_nobody(port: str) -> list[tuple[str, str, str]]:
-    """What an ordinary user is told: root may open everything, so another process asks."""
+    """What an ordinary user sees: root may open everything, so another process asks."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:

@@ -75,7 +75,7 @@ def _checked(part: Part, number: int) -> Part:
 
 
 def given(rules: list[list[Part]], device: Path, *, properties: Mapping[str, str] | None = None) -> Given:
-    """What ``rules`` give to the device in the folder ``device`` of a ``/sys``, with these properties besides."""
+    """What ``rules`` give to the device in the folder ``device`` of a ``/sys``, with these properties, too."""
     found = Given(properties={**_uevent(device), **_interfaces(device), **(properties or {})})
     for rule in rules:
         if all(_holds(part, device, found) for part in rule if part.is_condition and not _of_parents(part)) and (

@@ -1,4 +1,4 @@
-"""Outlets and relays by network against servers that nobody here wrote: net-snmp's snmpd, pymodbus's server."""
+"""Outlets and relays by network against servers by other authors: net-snmp's snmpd, pymodbus's server."""
 
 from __future__ import annotations
 

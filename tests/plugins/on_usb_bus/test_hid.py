@@ -193,7 +193,7 @@ def test_a_hanging_call_is_left_behind_and_does_not_act_later(bus: UsbBusProcess
     bus.add("relay", "relay", channels=2)
     board = open_relay()
     bus.unplug("relay")
-    bus.plug("relay")  # so that the board must be opened anew, and hangs before the relay is told
+    bus.plug("relay")  # so that the board must be opened again, and hangs before the relay gets it
     bus.set("relay", "faults.stuck", True)
     for _ in range(2):
         started = time.monotonic()

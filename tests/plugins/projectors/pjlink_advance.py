@@ -16,7 +16,7 @@ NOTICE: Final = (
 
 @cache
 def pjlink_advance_python() -> str:
-    """A Python that has the package; "" if none is at hand."""
+    """A Python that has the package; "" if none is available."""
     named = os.environ.get("PJLINK_ADVANCE_PYTHON")
     for name in [named] if named else ["python3.13", "python3.14"]:
         if not (path := shutil.which(name)):

@@ -1,7 +1,7 @@
-"""Our PJLink driver against the emulator of ``pjlink-advance``, which nobody here wrote.
+"""Our PJLink driver against the emulator of ``pjlink-advance``, by other authors.
 
 It needs Python 3.13 or later, so it runs in an interpreter of its own: the one that PJLINK_ADVANCE_PYTHON names, or a
-python3.13 or later on the PATH, if it has the package (docs/how-to/emulated-devices.md). Where none is at hand,
+python3.13 or later on the PATH, if it has the package (docs/how-to/emulated-devices.md). Where none is available,
 ``conftest.py`` leaves these tests out, and says so.
 """
 

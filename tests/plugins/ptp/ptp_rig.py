@@ -23,7 +23,7 @@ from plugins.ptp.still import PtpCamera
 FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old", "nikon", "sony")
 PATIENT = Timing(answer_s=20.0, busy_s=20.0, margin_s=20.0, grace_s=0.1, come_back_s=20.0, reconnect_s=20.0,
                  keep_alive_s=0.05)  # fmt: skip
-"""Nothing but ``grace_s`` is waited for in vain where a camera answers, however loaded the machine is."""
+"""Nothing but ``grace_s`` is waited for without success where a camera answers, however loaded the machine is."""
 HASTY = replace(PATIENT, busy_s=1.0, margin_s=2.0, come_back_s=0.5)
 """For tests of what comes when the driver's patience ends."""
 SHORT = ExposureSettings(0.125, 200, 8.0, raw=False)

@@ -63,7 +63,7 @@ class WebServer:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["content-length"]))
-                if told.code < 300:  # before the answer: whoever gets it may look at once
+                if told.code < 300:  # before the answer: its reader may look at once
                     told.posts.append(json.loads(body))
                 self.send_response(told.code)
                 self.send_header("location", "/elsewhere")

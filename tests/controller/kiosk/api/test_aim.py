@@ -1,4 +1,4 @@
-"""What the aiming page is told: by test shots, by calibrations, by files that are damaged, by cameras that vanish."""
+"""What the aiming page gets: by test shots, by calibrations, by files that are damaged, by cameras that vanish."""
 
 from __future__ import annotations
 

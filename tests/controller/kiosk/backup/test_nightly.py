@@ -155,7 +155,7 @@ def test_a_bit_that_flips_anywhere_is_noticed_before_anything_is_replaced(tmp_pa
     stage = vase(tmp_path / "stage")
     sound = archive.backup(stage).read_bytes()
     settings, bad = (stage / "stage.toml").read_bytes(), tmp_path / "bad.tar.gz"
-    start = 10 + sound[10:].index(b"\0") + 1  # Before it is the name in gzip's header, which nobody reads.
+    start = 10 + sound[10:].index(b"\0") + 1  # Before it is the name in gzip's header, which no one reads.
     judged = 0
     for place in range(start, len(sound), 3):
         data = bytearray(sound)

@@ -20,7 +20,7 @@ from tests.controller.kiosk.vase import vase
 
 
 class Computer:
-    """What udev and the kernel tell of a stick, as files below a root."""
+    """What udev and the kernel report of a stick, as files below a root."""
 
     def __init__(self, folder: Path) -> None:
         self.root, self.stick = folder / "root", folder / "a stick"

@@ -1,4 +1,4 @@
-"""Art-Net, from two senders that nobody here wrote: one finds the stage by itself, one does not ask; bad packets."""
+"""Art-Net, from two senders by other authors: one finds the stage by itself, one does not ask; bad packets."""
 
 from __future__ import annotations
 

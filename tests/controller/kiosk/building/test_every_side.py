@@ -1,4 +1,4 @@
-"""What each side may ask for: driven by peers that nobody here wrote, and held against the table of the how-to page."""
+"""What each side may ask for: driven by peers by other authors, and held against the table of the how-to page."""
 
 from __future__ import annotations
 

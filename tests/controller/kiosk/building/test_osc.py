@@ -85,7 +85,7 @@ def test_an_asker_hears_the_state_and_refusals(kiosk: MemoryKiosk, tmp_path: Pat
             parsed = OscPacket(asker.recv(4096)).messages[0].message
             return [parsed.address, *parsed.params]
 
-        # The listener may not be there at once, and a datagram to nobody is refused at the next call.
+        # The listener may not be there at once, and a datagram to no one is refused at the next call.
         asker.connect(("127.0.0.1", port))
         wait_for(lambda: _sent(asker, message("status")))
         told = {answered[0]: answered[1] for answered in [answer() for _ in range(8)]}
@@ -106,7 +106,7 @@ def test_a_sender_of_unknown_types_does_not_fill_the_journal(
         asker.settimeout(10)
         wait_for(lambda: _sent(asker, message("status")))
         asker.send(b"/velatura/brightness\0\0\0\0,pqxyz\0\0")
-        # Answered after the one before, or dropped with it.
+        # Answered after the previous one, or dropped with it.
         wait_for(lambda: b"/velatura/error" in asker.recv(4096))
     assert caplog.records == []
 

@@ -1,4 +1,4 @@
-"""The stage as one PJLink class 2 projector, judged by three clients that nobody here wrote."""
+"""The stage as one PJLink class 2 projector, judged by three clients by other authors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""sACN, from a sender that nobody here wrote; what counts of several sources; bad packets."""
+"""sACN, from a sender by other authors; what counts of several sources; bad packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""New hours that would close an open stage say so first; an operator's wish counts as it will count."""
+"""New hours that would close an open stage say so first; an operator's request counts as it will count."""
 
 from __future__ import annotations
 

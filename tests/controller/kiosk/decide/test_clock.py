@@ -18,7 +18,7 @@ DAY_S = 86_400.0
 
 @dataclass
 class Clocks:
-    """A wall clock that anybody sets, and one that only goes on."""
+    """A wall clock that anybody sets, and one that only continues."""
 
     folder: Path
     wall_s: float = MAY

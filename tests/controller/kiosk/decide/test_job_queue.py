@@ -30,7 +30,7 @@ PATIENCE_S = 100.0
 
 @dataclass
 class Jobs:
-    """Ends when it is told to."""
+    """Ends when it is asked to."""
 
     refused: Notice | None = None
     running: Request | None = None

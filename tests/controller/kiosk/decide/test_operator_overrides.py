@@ -75,7 +75,7 @@ def test_who_closes_or_opens_by_hand_is_heard_until_the_hours_say_something_new(
     ("asked_at", "wanted", "woken_at", "is_open"),
     [
         ("04T15:00", False, "04T17:00", False),
-        # The building cuts the power for the night: next morning nobody remembers who closed the day before.
+        # The building cuts the power for the night: next morning no one remembers who closed the day before.
         ("04T15:00", False, "05T10:05", True),
         ("04T15:00", False, "05T09:00", False),
         ("04T20:00", True, "05T02:00", True),

@@ -1,4 +1,4 @@
-"""Work in a thread of its own: whatever comes of it is told, kept for whoever follows it, and ends nothing else."""
+"""Work in a thread of its own: every result is reported, kept for those who follow it, and ends nothing else."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ PNG = b"\x89PNG, as far as anybody looks"
 
 @pytest.fixture
 def kiosk(tmp_path: Path) -> Iterator[StageKiosk]:
-    """A calibrated stage whose service has done seven jobs before it began anew; it is moved by hand."""
+    """A calibrated stage whose service has done seven jobs before it started again; it is moved by hand."""
     stage = vase(tmp_path)
     graded_run(stage, "20260101-100000-calibrate", {"left": 0.01})
     (stage / "target.png").write_bytes(PNG)

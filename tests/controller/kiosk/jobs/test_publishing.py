@@ -22,7 +22,7 @@ Make = Callable[[Sequence[str]], None]
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Path:
-    """Its "glass" is no picture; "marble" and "wood" need none."""
+    """Its "glass" is not a picture; "marble" and "wood" need none."""
     stage = vase(tmp_path)
     graded_run(stage, "20260101-100000-calibrate", {"left": 0.01})
     with (stage / "stage.toml").open("a") as toml:

@@ -197,7 +197,7 @@ def test_a_damaged_log_with_empty_rows_keeps_the_others_and_goes_on_in_another_f
 def test_what_a_damaged_log_had_stays_however_many_events_follow_and_whatever_the_clock_says(tmp_path: Path) -> None:
     path = tmp_path / EventLog.FILE
     _torn_log(path)
-    # Numbers go on from the clock's; the oldest events are deleted when a number can be divided by 200.
+    # Numbers continue from the clock's; the oldest events are deleted when a number can be divided by 200.
     log = EventLog(path, durable=False, wall=lambda: 1_795_000_000.0)
     for number in range(450):
         log.add(Notice(f"after-{number}", "It went on."))

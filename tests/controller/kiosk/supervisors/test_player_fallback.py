@@ -1,4 +1,4 @@
-"""A bundle that is damaged while it plays, before a real player: the one before plays, and that is said."""
+"""A bundle that is damaged while it plays, before a real player: the previous one plays, and that is said."""
 
 from __future__ import annotations
 

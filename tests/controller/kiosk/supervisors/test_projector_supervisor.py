@@ -28,7 +28,7 @@ FAULT = ProjectorStatus(Power.FAULT, ("lamp-failed",))
 
 
 class TellingLamp(FragileLamp):
-    """Tells of a fault once, unasked; who heard it, and did not hang up since, has no way to learn that it is over."""
+    """Reports a fault once, unasked; who heard it, and did not hang up since, has no way to learn that it is over."""
 
     heard = False
 

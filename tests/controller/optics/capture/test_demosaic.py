@@ -27,7 +27,7 @@ def random_mosaic(rows: int = 23, columns: int = 31) -> npt.NDArray[np.uint16]:
 
 
 def by_kernels(value: Float64, kernels: Float64) -> Float64:
-    """Every inner pixel as the told kernels say, without the code under test."""
+    """Every inner pixel as the published kernels say, without the code under test."""
     rows, columns = value.shape
     image = np.zeros((rows, columns, 3))
     for row in range(1, rows - 1):

@@ -1,4 +1,4 @@
-"""Pixels that differ in their response are told from paint, noise, and the gaps between a projector's pixels."""
+"""Pixels that differ in their response are not confused with paint, noise, or the gaps between a projector's pixels."""
 
 from __future__ import annotations
 

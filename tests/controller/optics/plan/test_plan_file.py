@@ -1,4 +1,4 @@
-"""plan.toml: what is read from it, and how mistakes are told."""
+"""plan.toml: what is read from it, and how mistakes are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An appearance from picture to frames: what is told of it, and what is advised."""
+"""An appearance from picture to frames: what is reported of it, and what is advised."""
 
 from __future__ import annotations
 

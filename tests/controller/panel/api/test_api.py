@@ -1,4 +1,4 @@
-"""The API: as its own document says, for whoever reads it and whoever breaks it."""
+"""The API: as its own document says, for people who read it and people who break it."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def exercised(operation: Operation) -> Any:
     return test
 
 
-# A restored file may be any bytes; its own test says what comes of it.
+# A restored file may be any bytes; its own test checks that.
 for _operation in OPERATIONS:
     if _operation.path != "/restore":
         globals()[f"test_as_the_document_says_{_operation.name.replace('-', '_')}"] = exercised(_operation)

@@ -1,4 +1,4 @@
-"""Who did what stands in the event log by name; and who tries tokens locks out nobody but himself."""
+"""Who did what stands in the event log by name; and who tries tokens locks out no one but himself."""
 
 from __future__ import annotations
 

@@ -226,7 +226,7 @@ def test_a_building_hears_that_the_panel_takes_its_leave(tmp_path: Path, port: i
 
 
 class Fragile(MemoryKiosk):
-    """Meets an error that nobody thought of when it is to close."""
+    """Meets an error that no one thought of when it is to close."""
 
     def stop(self) -> None:
         raise RuntimeError("nobody thought of this")

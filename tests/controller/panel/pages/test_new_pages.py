@@ -211,7 +211,7 @@ def test_the_naming_has_a_button_each_that_keeps_its_label(fresh: Served) -> Non
 
 
 class CalibratedKiosk(MemoryKiosk):
-    """Nobody took test shots yet."""
+    """No one took test shots yet."""
 
     def aiming(self) -> Aiming:
         return Aiming((ProjectorAim("left", 0.8, 0.9),), 0.7, 0.0, 0.0, source="calibration", measured_unix_s=1e9)

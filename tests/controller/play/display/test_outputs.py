@@ -172,7 +172,7 @@ def test_an_output_that_is_missing_at_the_start_keeps_no_other_dark_and_shows_th
 def test_outputs_that_are_all_away_at_the_start_show_their_pictures_when_they_come(
     outputs: Outputs, start: Start, tmp_path: Path
 ) -> None:
-    """Named as their connectors, so nothing else tells them from outputs that nobody gave a name."""
+    """Named as their connectors, so nothing else tells them from outputs that no one gave a name."""
     sizes = [(name, WIDTH, HEIGHT) for name in CONNECTORS[1:]]
     path = write_noise(tmp_path / "named.vel", outputs=sizes)
     settings = {"outputs": sizes, "frames": None, "bundle": path, "allow_unsigned": True}

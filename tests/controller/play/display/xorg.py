@@ -69,7 +69,7 @@ class Outputs:
         return np.frombuffer(shot.raw, np.uint8).reshape(height, width, 4)[:, :, 2::-1]
 
     def set_edid(self, connector: str, block: bytes) -> None:
-        """Let the display at a connector say this of itself."""
+        """Let the display at a connector report this."""
         from pyglet.libs.x11 import xlib, xrandr
 
         display = xlib.XOpenDisplay(self._display.encode())

@@ -38,7 +38,7 @@ def noise_set(seed: int) -> FrameSet:
 
 @pytest.fixture
 def writer(folder: Path) -> Iterator[FrameFile]:
-    """The shared file, made anew."""
+    """The shared file, made again."""
     (folder / "live.frame").unlink(missing_ok=True)
     with contextlib.closing(FrameFile(folder / "live.frame", SIZES)) as file:
         yield file

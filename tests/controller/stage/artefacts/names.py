@@ -1,4 +1,4 @@
-"""Names that stage.toml lets projectors have, chosen to be hard to tell apart."""
+"""Names that stage.toml lets projectors have, chosen to be hard to distinguish."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_a_worker_killed_in_the_middle_costs_time_and_nothing_else(tmp_path: Pat
 
 
 def test_when_all_workers_go_a_new_one_gets_everything_again_under_another_name(tmp_path: Path) -> None:
-    # Under the same name, a worker that is still asking the lost one for it drops what it is sent (distributed
+    # Under the same name, a worker that is still asking the lost one for it drops what is sent to it (distributed
     # 2026.8.0: "cancelled" to "memory"), and what needs it waits for good.
     with machines(tmp_path, 1) as made, connected(made.address) as cluster:
         spread = SpreadAppearances(cluster, stage_data())

@@ -1,4 +1,4 @@
-"""A scheduler that speaks TLS: with a certificate on both sides work is done, without one nobody is let in."""
+"""A scheduler that speaks TLS: with a certificate on both sides work is done, without one no one is let in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting for workers: with a scheduler that says what it is told to."""
+"""Waiting for workers: with a scheduler whose answers a test sets."""
 
 from __future__ import annotations
 

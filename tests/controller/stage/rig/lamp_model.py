@@ -1,4 +1,4 @@
-"""A lamp that strikes whenever it is told to, and remembers every sin; a clock; a ledger on a disk that may be full."""
+"""A lamp that strikes when asked to, and remembers every violation; a clock; a ledger on a disk that may be full."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RULES = LampRules(warm_up_s=2.0, stable_s=10.0, cool_down_s=5.0, minimum_off_s=8
 
 @dataclass
 class World:
-    """Physical time, and the machine's clock, which begins anew with every boot."""
+    """Physical time, and the machine's clock, which starts again with every boot."""
 
     time_s: float = 1000.0
     booted_s: float = 0.0

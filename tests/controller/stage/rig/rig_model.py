@@ -1,4 +1,4 @@
-"""A stage of models: a camera that writes what it was told, a display that remembers, lamps with a clock."""
+"""A stage of models: a camera that writes what it was asked, a display that remembers, lamps with a clock."""
 
 from __future__ import annotations
 

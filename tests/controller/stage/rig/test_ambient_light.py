@@ -1,4 +1,4 @@
-"""The room's light is told from the projectors' own."""
+"""The room's light is distinguished from the projectors' own."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from tests.controller.stage.rig.rig_model import ModelCamera
 
 @dataclass
 class TellingCamera(ModelCamera):
-    """A camera with a list of mended faults, and a state."""
+    """A camera with a list of repaired faults, and a state."""
 
     mended: list[Notice] = field(default_factory=list)
     state: CameraStatus = field(default_factory=CameraStatus)

@@ -1,4 +1,4 @@
-"""Which way live pictures become light: shaders of a player with windows, or finished frames, without being told."""
+"""Which way live pictures become light: shaders of a player with windows, or finished frames, without being asked."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ most_lux = 2.0
 
 
 class Sensor:
-    """It is as bright as it is told."""
+    """It is as bright as it is asked to be."""
 
     def __init__(self) -> None:
         self.lux = 0.5

@@ -49,7 +49,7 @@ def test_lamps_are_lit_while_the_work_goes_on_and_off_afterwards(models: Models)
 
 
 def test_what_needs_no_stable_light_is_done_while_lamps_become_stable(models: Models) -> None:
-    """In the order of the list otherwise; the state tells whether the lamps are stable."""
+    """In the order of the list otherwise; the state says whether the lamps are stable."""
     (models.folder / "stage.toml").write_text(STAGE + "stable_s = 0.5\n")
     done: list[tuple[str, str]] = []
 

@@ -1,4 +1,4 @@
-"""Debian's gphoto2, which nobody here wrote, as a client of the emulated camera: does it take it for a real one?"""
+"""Debian's gphoto2 by other authors, as a client of the emulated camera: does it take it for a real one?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage for the bench and for Mitsuba 3, a renderer nobody here wrote."""
+"""A stage for the bench and for Mitsuba 3, a renderer by other authors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stages whose projectors stand where they are told to, or are more or fewer than three."""
+"""Stages whose projectors stand where they are asked to, or are more or fewer than three."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated projectors on their LAN port against clients that nobody here wrote: pySDCP, pyjvcprojector,
+"""The emulated projectors on their LAN port against clients by other authors: pySDCP, pyjvcprojector,
 jvc-projector-remote and christie-mseries.
 """
 

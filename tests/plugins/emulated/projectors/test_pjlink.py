@@ -1,4 +1,4 @@
-"""The emulated PJLink projector against a client that nobody here wrote (aiopjlink)."""
+"""The emulated PJLink projector against a client by other authors (aiopjlink)."""
 
 from __future__ import annotations
 

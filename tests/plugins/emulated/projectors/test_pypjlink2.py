@@ -1,4 +1,4 @@
-"""The emulated PJLink projector against another client that nobody here wrote (pypjlink2)."""
+"""The emulated PJLink projector against another client by other authors (pypjlink2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated serial projector, spoken to with pyserial alone and bytes copied from the manuals."""
+"""The emulated serial projector, addressed with pyserial alone and bytes copied from the manuals."""
 
 from __future__ import annotations
 

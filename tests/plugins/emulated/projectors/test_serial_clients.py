@@ -1,4 +1,4 @@
-"""The emulated serial projectors against clients that nobody here wrote: benqprojector and epson-projector."""
+"""The emulated serial projectors against clients by other authors: benqprojector and epson-projector."""
 
 from __future__ import annotations
 

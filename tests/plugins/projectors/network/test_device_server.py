@@ -1,4 +1,4 @@
-"""Serial lines behind device servers that nobody here wrote: pyserial's RFC 2217 server, and Debian's ser2net."""
+"""Serial lines behind device servers by other authors: pyserial's RFC 2217 server, and Debian's ser2net."""
 
 from __future__ import annotations
 

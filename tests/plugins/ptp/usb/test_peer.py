@@ -1,4 +1,4 @@
-"""Our PTP-over-USB client on libgphoto2's virtual camera, by its port layer: containers that nobody here wrote."""
+"""Our PTP-over-USB client on libgphoto2's virtual camera, by its port layer: containers by other authors."""
 
 from __future__ import annotations
 

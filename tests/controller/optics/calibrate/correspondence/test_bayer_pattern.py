@@ -1,4 +1,4 @@
-"""Which colour each camera sample has, told from a photograph alone."""
+"""Which colour each camera sample has, found from a photograph alone."""
 
 from __future__ import annotations
 

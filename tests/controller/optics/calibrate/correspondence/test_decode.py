@@ -231,7 +231,7 @@ def test_sums_in_a_file_give_the_same_to_the_bit_and_leave_the_memory(tmp_path: 
     assert 40 * pixels >= MAPPED_FROM
 
     class Lent(dict[str, FloatImage]):
-        """As a run has them, each read anew: many scenes side by side, for a file is used from some size on."""
+        """As a run has them, each read again: many scenes side by side, for a file is used from some size on."""
 
         def __getitem__(self, name: str) -> FloatImage:
             return np.tile(captures[name], beside)

@@ -1,4 +1,4 @@
-"""The room behind and below an object is told from it; an object alone is left whole."""
+"""The room behind and below an object is distinguished from it; an object alone is left whole."""
 
 from __future__ import annotations
 

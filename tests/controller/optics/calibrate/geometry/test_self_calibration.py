@@ -1,4 +1,4 @@
-"""The geometry against a stage simulated here: a bumpy surface, ray by ray, and pinholes written out anew."""
+"""The geometry against a stage simulated here: a bumpy surface, ray by ray, and pinholes written out again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A veil of the camera's lens is told from light by way of other surfaces: judged by veils of other shapes."""
+"""A veil of the camera's lens is distinguished from light by way of other surfaces: judged by veils of other shapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gloss is told from paint by what a surface mirrors of one projector alone: judged by lobes of other kinds."""
+"""Gloss differs from paint by what a surface mirrors of one projector alone: judged by lobes of other kinds."""
 
 from __future__ import annotations
 

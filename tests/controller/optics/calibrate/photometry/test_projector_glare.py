@@ -1,4 +1,4 @@
-"""A veil of a projector's lens is told from other light in dark parts: judged by veils of other shapes."""
+"""A veil of a projector's lens is distinguished from other light in dark parts: judged by veils of other shapes."""
 
 from __future__ import annotations
 

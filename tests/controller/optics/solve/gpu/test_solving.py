@@ -1,4 +1,4 @@
-"""Solves on a graphics processor reach the optimum of the processor, and of a solver that nobody here wrote."""
+"""Solves on a graphics processor reach the optimum of the processor, and of a solver by other authors."""
 
 from __future__ import annotations
 

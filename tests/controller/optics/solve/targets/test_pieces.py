@@ -1,4 +1,4 @@
-"""Objects that stand apart in the image are told apart, and slivers belong to one of them."""
+"""Objects that stand apart in the image are distinguished, and slivers belong to one of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera's own blur in the transport: what it keeps, and what it is good for."""
+"""The camera's own blur in the transport: what it keeps, and its use."""
 
 from __future__ import annotations
 

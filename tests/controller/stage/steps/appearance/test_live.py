@@ -51,7 +51,7 @@ class Numbers:
 
 
 class Patient(Numbers):
-    """Has its next picture when the one before was shown, however long that takes on a busy machine."""
+    """Has its next picture when the previous one was shown, however long that takes on a busy machine."""
 
     def __init__(self, count: int, *, fails_at: int = -1) -> None:
         super().__init__(count, fails_at=fails_at)

@@ -1,4 +1,4 @@
-"""Appearances on a stage in arrays: what is made, what is left out, and what is told of it."""
+"""Appearances on a stage in arrays: what is made, what is left out, and what is reported of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def untold(fraction: float, note: str) -> None:
 
 
 def stage() -> Subject:
-    """A projector stands where the camera does, so that the object's own paint can be told."""
+    """A projector stands where the camera does, so that the object's own paint can be determined."""
     subject = array_subject()
     subject.geometry = dataclasses.replace(subject.geometry, projectors=(subject.geometry.camera,))
     return subject

@@ -1,4 +1,4 @@
-"""A calibration that is stopped, killed, unplugged and short of disk, and goes on each time, to its end.
+"""A calibration that is stopped, killed, unplugged and short of disk, and continues each time, to its end.
 
 The object is a mesh from a file, and the projectors' lenses bend their pictures. The bench's truth lies elsewhere from
 the moment at which its devices are there.
@@ -220,7 +220,7 @@ def test_a_projector_that_was_unplugged_is_named_and_the_others_are_off(story: S
 def test_a_bench_that_dies_holds_nothing_up(story: Story) -> None:
     chapter = story.chapters["bench gone"]
     assert chapter.seconds < 30
-    assert chapter.lit == dict.fromkeys(NAMES, True)  # nobody could say otherwise
+    assert chapter.lit == dict.fromkeys(NAMES, True)  # no one could say otherwise
 
 
 def test_a_killed_run_leaves_its_lamps_lit_and_the_next_does_not_strike_them_again(story: Story) -> None:
@@ -231,7 +231,7 @@ def test_a_killed_run_leaves_its_lamps_lit_and_the_next_does_not_strike_them_aga
 
 
 def test_only_one_run_was_ever_begun_and_its_photographs_were_taken_once(story: Story) -> None:
-    """But those that were taken while a projector was away, or when the bench died: nobody knows what they show."""
+    """But those that were taken while a projector was away, or when the bench died: no one knows what they show."""
     chapters = list(story.chapters.values())
     assert [len(chapter.shots) for chapter in chapters] == sorted(len(chapter.shots) for chapter in chapters)
     final = shots(run_of(story.stage))
