@@ -68,7 +68,7 @@ class LibraryProcess:
     """Starts the process when it is needed, and again after it ended or was killed. One caller at a time.
 
     ``module``: whose ``main`` runs ``served``; ``library``: its name for people; ``start``: what the worker gets first
-    besides the serial number that the camera must have, "" for any; ``note`` is called after a fault that was
+    in addition to the serial number that the camera must have, "" for any; ``note`` is called after a fault that was
     corrected. ``took_s``: what the library needed for the last request, without the way there and back.
     """
 
@@ -320,7 +320,7 @@ class LibraryCamera:
                 # The process was ended, perhaps also started again by another request: its exposure is forgotten.
                 self.configure(self._settings, deadline=deadline)
             left_s = deadline.left_s()
-            # The worker ends before the caller does: it knows why there is no picture.
+            # The worker ends before the caller does: it knows why no picture came.
             theirs_s = left_s - min(_MARGIN_S, left_s / 5)
             files: list[CapturedFile] = self.process.request(
                 "capture", destination.absolute(), theirs_s, deadline=deadline, repeatable=False

@@ -153,7 +153,7 @@ def tiff_file(
     channels: int,
     exif: Mapping[int, Entry] | None = None,
 ) -> bytes:
-    """A TIFF with one strip of samples of 16 bits; ``special``: tags besides those of its layout; ``exif``: Exif's."""
+    """A TIFF with one strip of samples of 16 bits; ``special``: tags beyond those of its layout; ``exif``: Exif's."""
 
     def entries(strip_at: int, exif_at: int) -> dict[int, Entry]:
         return {

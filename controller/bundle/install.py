@@ -46,7 +46,7 @@ def install(
     revoked: Sequence[bytes] = (),
     accept: Callable[[Index], None] = lambda index: None,
 ) -> Path:
-    """Copy, verify in full, and make current; return the installed file. The one before is kept for ``rollback``.
+    """Copy, verify in full, and make current; return the installed file. The previous one is kept for ``rollback``.
 
     Installing what is current already changes nothing, but gives it its starts again (``fallback``). Files that are
     neither current nor previous are removed. ``accept`` raises to refuse a sound bundle that does not fit.
@@ -58,7 +58,7 @@ def install(
     with exclusive(folder / _LOCK, what_is_running="Another installation"):
         incoming = folder / _INCOMING
         _clear_unfinished(folder)
-        # Refused before a byte is copied: what is no bundle may be endless, and what is hostile may be huge.
+        # Refused before a byte is copied: a file that is not a bundle may be endless, and what is hostile may be huge.
         Bundle.open_trusted(source, trust).close()
         try:
             _copy(source, incoming)
@@ -219,7 +219,7 @@ class Starts:
 
     @classmethod
     def read(cls, folder: Path) -> Starts:
-        """The count of ``folder``; none where there is no file, or the file is not ours."""
+        """The count of ``folder``; none where the file is missing or not ours."""
         return Count(folder).read()
 
     def write(self, folder: Path) -> None:

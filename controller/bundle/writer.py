@@ -70,7 +70,7 @@ class Packing:
 
 @dataclass(frozen=True, slots=True)
 class NewBundle:
-    """What a new bundle says of itself, beside its appearances.
+    """Metadata of a new bundle, beside its appearances.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ PORT: Final = 8377
 
 @dataclass(frozen=True, slots=True)
 class PanelAddress:
-    """Where the panel listens. ``names``: under which browsers may reach it, besides the host; ``broker``: of the
+    """Where the panel listens. ``names``: under which browsers may reach it, beside the host; ``broker``: of the
     building's control.
     """
 

@@ -180,7 +180,7 @@ class Place:
         return self.lines.line(self.path if key is None else (*self.path, key))
 
     def wrong_value(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
-        """``problem`` goes on after the value ("is not ..."); ``allowed`` says what the key may be."""
+        """``problem`` follows the value ("is not ..."); ``allowed`` says what the key may be."""
         return self._error("key-value", key, f"'{key}' = {quoted(value)} {problem}", f"'{key}' is {allowed}.")
 
     def wrong_type(self, key: str, value: object, problem: str, allowed: str) -> UsageError:

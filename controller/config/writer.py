@@ -29,7 +29,7 @@ _HEADING: Final = """\
 
 
 def write_stage(path: Path, content: Mapping[str, Any]) -> None:
-    """Write ``content`` as stage.toml at ``path`` atomically, with a comment above each table saying what it is."""
+    """Write ``content`` as stage.toml at ``path`` atomically, with a comment above each table that describes it."""
     comments = {key: field.description for key, field in StageTables.model_fields.items() if field.description}
     write_atomically(path, (_HEADING + "\n" + toml_text(content, comments)).encode())
 

@@ -162,7 +162,7 @@ LONGEST_PATH_BYTES: Final = 106
 def listening(path: Path, backlog: int) -> socket.socket:
     """A stream socket at ``path``, for this user alone, in the place of what was there.
 
-    It appears there when it takes connections: whoever sees it is not refused. Raises OSError.
+    It appears there when it takes connections: a client that sees it is not refused. Raises OSError.
     """
     before_it_listens = path.with_name(f".{path.name}")
     before_it_listens.unlink(missing_ok=True)

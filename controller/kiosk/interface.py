@@ -90,7 +90,7 @@ class Kiosk(Protocol):
         """Show black with the lamps lit, or the picture again."""
 
     def pause(self, on: bool) -> None:
-        """Stay at the present appearance, or go on from there."""
+        """Stay at the present appearance, or continue from there."""
 
     def brightness(self, percent: float) -> None:
         """Show ``percent`` (0 to 100) of the light, until the stage closes."""

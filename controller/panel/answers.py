@@ -67,7 +67,7 @@ async def run(panel: Panel, operation: Operation, values: Values, who: str) -> A
 
 
 def response(operation: Operation, answer: Any, values: Values) -> Response:
-    """Raises UsageError("picture-unknown") if there is no picture."""
+    """Raises UsageError("picture-unknown") if none exists."""
     kind = operation.answer
     if kind is Answer.NOTHING:
         return JSONResponse({"done": True})

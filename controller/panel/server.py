@@ -23,8 +23,8 @@ ACCEPTING_S = 0.05
 
 
 class _Server(uvicorn.Server):
-    """Leaves no connection behind. Uvicorn does: one that was being accepted when it began to stop stays open, nobody
-    reads it, and a browser that sends its next request there waits for good.
+    """Leaves no connection behind. Uvicorn does: one that was being accepted when it began to stop stays open, no one
+    reads it, and a browser that sends its next request there waits for good.
     """
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -1,6 +1,6 @@
 """Live pictures: frames that another process writes to a shared file (docs/reference/player-protocol.md).
 
-The file holds finished frames, one an output, or targets, of which the output's shaders make frames. Whoever writes
+The file holds finished frames, one an output, or targets, of which the output's shaders make frames. The writer
 holds an flock on it, so that its end is noticed however it ends; the last whole picture stays.
 """
 

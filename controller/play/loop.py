@@ -188,7 +188,7 @@ class Player:
         """Play appearances in turn; ``on_result`` is called for the first. ``rate_hz``: the grid meanwhile;
         ``brightness``: the share of their light, 0..1.
 
-        Raises BundleError if there is no bundle or it has not all of them; then nothing changes.
+        Raises BundleError if the bundle is missing or it has not all of them; then nothing changes.
         """
         self._on_asked()
         decoded = self._loaded()
@@ -341,7 +341,7 @@ class Player:
         return coming.frames is not None
 
     def _skip(self, coming: PendingPresentation, error: BundleError) -> None:
-        """An appearance can't be decoded: say so, keep the picture, and go on with the next of a sequence."""
+        """An appearance can't be decoded: say so, keep the picture, and continue with the next of a sequence."""
         self._skipped += 1
         self._coming = None
         if coming.on_result is not None:

@@ -139,7 +139,7 @@ class FolderSource:
         names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
         if not names:
             return None
-        # Whoever fills the folder may clear it, too.
+        # The program that fills the folder may clear it, too.
         with contextlib.suppress(FileNotFoundError):
             return self._of(names, at_s)
         return None
@@ -271,7 +271,7 @@ def without_password(source: str) -> str:
 class StreamSource:
     """``LiveSource`` of a stream. It never waits, and never ends: a lost stream is opened again every ``RETRY_S``.
 
-    Meanwhile there is no picture, so the last one stays.
+    Meanwhile no picture comes, so the last one stays.
     """
 
     def __init__(self, name: str, open_it: Callable[[], Reader], *, retry_s: float = RETRY_S) -> None:
@@ -335,7 +335,7 @@ class StreamSource:
                         self._take(reader.read())
             except Lost as lost:
                 with self._changed:
-                    # Told once: a stream that stays away is no further bad picture at each attempt.
+                    # Reported once: a stream that stays away is no further bad picture at each attempt.
                     self._lost = str(lost) if self._there else self._lost
                     self._there, self._why = False, str(lost)
                 self._stopped.wait(self._retry_s)

@@ -22,7 +22,7 @@ from hal.errors import DeviceError
 Result = TypeVar("Result")
 
 LOOK_S: Final = 0.1
-"""Time between two looks at whether to go on waiting."""
+"""Time between two looks at whether to keep waiting."""
 MOST_LEFT_BEHIND: Final = 4
 """Calls of one device that may hang at the same time; further ones are refused."""
 

@@ -54,7 +54,7 @@ class SacnDouser:
         return self._sent_closed
 
     def close(self) -> None:
-        """End the stream if this is the last douser of its universe: the node then does what it is set to do."""
+        """End the stream if this is the last douser of its universe: the node then does what its settings say."""
         if not self._over:
             self._over = True
             left(self._target)

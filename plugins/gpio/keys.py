@@ -104,7 +104,7 @@ def check_chip() -> None:
 class Lines:
     """Requested lines and the thread that reads them.
 
-    ``edges``: whether the chip tells of changes by itself; ``silent_s``: a chip that is silent for longer is lost.
+    ``edges``: whether the chip reports changes by itself; ``silent_s``: a chip that is silent for longer is lost.
     """
 
     def __init__(self, chip: Any, request: Any, keys: Mapping[int, int], heard: Callable[[int], None], *,
@@ -161,7 +161,7 @@ class Lines:
                 self._end.wait(_LEVEL_LOOK_S)
 
     def _settle(self) -> None:
-        """Look until each line has been the same for the time of debouncing; tell of those that are pressed since."""
+        """Look until each line has been the same for the time of debouncing; report those that are pressed since."""
         offsets = list(self._keys)
         values, since_s = self._values(offsets), time.monotonic()
         while time.monotonic() < since_s + self._debounce_s and not self._end.wait(_LEVEL_LOOK_S):

@@ -127,7 +127,7 @@ def _days_around(unix_s: float, zone: ZoneInfo) -> list[date]:
 
 STEP_S: Final = 0.1
 LATE_S: Final = 30.0
-"""A cue that could not be done for so long is left out: it would surprise people after a restart."""
+"""A cue that could not be done for so long is dropped: it would surprise people after a restart."""
 BACK_S: Final = 3600.0
 """A clock that is set back by less repeats no cue."""
 _LOG: Final = logging.getLogger("velatura.building")

@@ -163,5 +163,5 @@ def _step(follower: Follower, levels: tuple[int, int, int] | None, verbs: Verbs,
         for verb, values in follower.verbs(levels, verbs.status(), verbs.appearances(), now_s):
             verbs.do(verb, values)
     except VelaturaError:
-        # A stage that is not set up, or that closes at this moment; the desk goes on sending.
+        # A stage that is not set up, or that closes at this moment; the desk keeps sending.
         _LOG.debug("A level could not be followed.", exc_info=True)

@@ -57,7 +57,7 @@ def camera_facts(camera: Device | None, deadline: InSeconds = in_seconds) -> Ite
 
 
 def lens_facts(stage: Path) -> Iterator[Fact]:
-    """What the newest photograph tells of the lens; unknown where none does."""
+    """Lens data of the newest photograph; unknown where none does."""
     for run in sorted((stage / "runs").glob("*"), reverse=True):
         for picture in sorted((run / "captures").rglob("*"), reverse=True):
             if picture.suffix.lower() not in _PICTURES:

@@ -17,7 +17,7 @@ DISK_FULL: Final = "disk-full"
 
 
 NOT_YET: Final = "camera-not-yet"
-"""The code of the refusal of work while nobody knows whether the camera is there: the kiosk has just started."""
+"""The code of the refusal of work while it is unknown whether the camera is there: the kiosk has just started."""
 
 
 class Condition(enum.Enum):

@@ -96,7 +96,7 @@ class OperatorOverrides:
         return self._override.wanted if self._override is not None else self._says(plan)
 
     def would_be_open(self, plan: Plan) -> bool:
-        """As ``open``, if this were the plan: an operator's wish ends when the schedule says something new."""
+        """As ``open``, if this were the plan: an operator's request ends when the schedule says something new."""
         override, says = self._override, self._says(plan)
         return override.wanted if override is not None and override.said in (None, says) else says
 

@@ -219,7 +219,7 @@ class Reconciler:
             self._live.change(black=on, fade_s=fade_s)
 
     def pause(self, on: bool) -> None:
-        """Stay at the present appearance, or go on from there. Raises WorkError("nothing-plays")."""
+        """Stay at the present appearance, or continue from there. Raises WorkError("nothing-plays")."""
         with self._lock:
             name = self._shown() if on else self._live.now.held
             self._live.change(held=name if on else "", first=name)
@@ -229,7 +229,7 @@ class Reconciler:
         with self._lock:
             self._require_open()
             shown = self._player.view.shown
-            # A list starts again with another brightness; it goes on where it is.
+            # A list starts again with another brightness; it continues where it is.
             first = self._live.now.first if shown is None or not shown.appearance else shown.appearance
             self._live.change(brightness=round(share, 3), first=first, fade_s=BRIGHTNESS_FADE_S)
 

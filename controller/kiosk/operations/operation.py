@@ -36,7 +36,7 @@ class Answer(enum.Enum):
     PICTURE = "image/png"
     """The path of a PNG or JPEG."""
     JPEG = "image/jpeg"
-    """Bytes, or None if there is no picture now."""
+    """Bytes, or None if none exists now."""
     PAGE = "text/html"
     """The path of one HTML file."""
     FILE = "application/octet-stream"

@@ -1,7 +1,7 @@
 """Whole solves of targets before they are computed, where a graphics processor makes them fast.
 
 A process of its own solves (`computing`): a driver that ends it ends no kiosk, and its memory goes with it. It stays
-for the next target, until nobody asks, a job of the kiosk needs the memory, or calibration or settings change.
+for the next target, until no one asks, a job of the kiosk needs the memory, or calibration or settings change.
 """
 
 from __future__ import annotations

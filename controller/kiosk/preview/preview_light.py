@@ -79,7 +79,7 @@ def view_picture(stage: Path, run: Path, names: tuple[str, ...]) -> Path:
         with _lock:
             _known.pop(run, None)
             file.with_suffix(".npz").unlink(missing_ok=True)
-    # Whoever paints on it wants a preview next.
+    # A person who paints on it wants a preview next.
     preview_light(stage, run, names)
     return file
 

@@ -162,7 +162,7 @@ def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
 
 
 def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
-    """Write what was asked for and what will come of it; returns the first one in grey, (rows, columns) uint8."""
+    """Write what was asked for and the expected result; returns the first one in grey, (rows, columns) uint8."""
     from controller.stage.report.pictures import to_screen
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())

@@ -40,7 +40,7 @@ def slots_without(stage: Path, missing: Collection[str]) -> Path:
 
 
 def _as_jpeg(png: bytes) -> bytes | None:
-    """None if it is no picture."""
+    """None if it is not a picture."""
     import cv2
     import numpy as np
 
@@ -62,7 +62,7 @@ class BundleStore:
         return chosen(self._stage / "bundles", self._count)
 
     def installed(self) -> Sequence[Path]:
-        """The files of the bundle that plays and of the one before."""
+        """The files of the bundle that plays and of the previous one."""
         folder = self._stage / "bundles"
         return tuple(path for path in (current(folder), previous(folder)) if path is not None)
 
@@ -81,7 +81,7 @@ class BundleStore:
         )
 
     def given_up(self) -> str:
-        """The file's name of the bundle that showed no picture, so that the one before plays; empty if none."""
+        """The file's name of the bundle that showed no picture, so that the previous one plays; empty if none."""
         starts, now = self._count.read(), self.bundle()
         fell_back = starts.given_up is not None and now is not None and starts.bundle == now.name != starts.given_up
         return str(starts.given_up) if fell_back else ""

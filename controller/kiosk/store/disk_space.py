@@ -138,7 +138,7 @@ def _old_runs(stage: Path, keep_runs: int, used: set[str]) -> list[Path]:
         if (run / Journal.FILE).is_file():
             kinds[run_kind(run)].append(run)
     old = [run for runs in kinds.values() for run in runs[keep_runs:] if run.name not in used]
-    # One that was killed may go on.
+    # One that was killed may continue.
     return sorted(run for run in old if outcome_of(run) is not None)
 
 

@@ -85,7 +85,7 @@ class Devices:
         return (*projectors, *(supervisor.row for supervisor in self.others))
 
     def facts(self) -> tuple[Fact, ...]:
-        """What the devices tell of themselves. Seconds; unknown what is missing, or lent to a job."""
+        """What the devices report. Seconds; unknown what is missing, or lent to a job."""
         in_s = self._world.deadline
         found = [fact for one in self.projectors for fact in projector_facts(one.name, one.guard, in_s)]
         mine = self.camera.lent.acquire(blocking=False)

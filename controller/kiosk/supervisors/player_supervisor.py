@@ -85,7 +85,7 @@ class PlayerRun:
 
     ``with_bundle``: it was started with the installed bundle; ``dark``: it has shown no picture yet; ``hello``: its
     answer when it was ready; ``bundles``: the loaded ones by the identity that it tells; ``reached``: what was wanted
-    when it answered last, which may be nothing, in a tuple, None: it has not answered yet; ``turns``: what it was told
+    when it answered last, which may be nothing, in a tuple, None: it has not answered yet; ``turns``: what it was asked
     to show in turn; ``skipped``: people know that it left an appearance out; ``identified`` and ``noticed``: the names
     of the outputs, or which output shows which lines, are on the outputs now. Times in seconds that only go up:
     ``looked_back_s``: when an earlier bundle was looked for.
@@ -347,7 +347,7 @@ class PlayerSupervisor:
 
     def _starts_again(self) -> bool:
         """Whether a player that can't load a bundle is to. One with a picture shows that of another bundle, such as one
-        without some projectors; of the one before it could show all.
+        without some projectors; of the previous one it could show all.
         """
         if self._run.dark:
             return self._run.with_bundle or self._monotonic() - self._run.started_at_s > AGAIN_S

@@ -85,7 +85,7 @@ OBJECT = "object"
 
 
 class View(NamedTuple):
-    """A node of a glTF file without a mesh: ``matrix`` (4, 4) its pose, ``extras`` what it says of itself."""
+    """A node of a glTF file without a mesh: ``matrix`` (4, 4) its pose, ``extras`` its metadata."""
 
     name: str
     matrix: npt.NDArray[np.float64]

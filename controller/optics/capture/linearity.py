@@ -140,7 +140,7 @@ def true_exposures(measured: Sequence[tuple[Sequence[float], Sequence[float]]]) 
 
     Cameras round: one that reports 1/30 s opens for 1/32 s. Each series gives the ratios of its exposures; together
     they are solved for the corrections that are smallest on the whole, since no photograph shows absolute time.
-    A lamp that is not steady changes ratios, too; by how much, the ratios tell that were measured more than once. What
+    A lamp that is not steady changes ratios, too; by how much, the ratios show that were measured more than once. What
     it alone could explain is not corrected.
 
     Parameters

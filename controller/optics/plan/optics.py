@@ -3,7 +3,7 @@
 Every figure follows from the pinhole's Jacobian J, (2, 2), from the surface's tangent plane to pixels: its singular
 values are pixels by metre along the two sides of a pixel's footprint, its determinant pixels by area. A projector sends
 the same flux through every pixel, so light by area is that flux times the determinant; inverse squares, cosines and the
-picture's corners are all in it. What data sheets do not tell is left out: vignetting, lamps that age.
+picture's corners are all in it. Omitted, because no data sheet has them: vignetting, lamps that age.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ EVERY_S: Final = 10.0
 
 
 class Refusals:
-    """``record``: adds a line to the event log. Whoever tries many names or tokens must not push all else out of it."""
+    """``record``: adds a line to the event log. Many wrong names or tokens must not push all else out of it."""
 
     def __init__(self, record: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> None:
         self._record, self._clock = record, clock

@@ -99,7 +99,7 @@ def _controls(topic: str, names: Sequence[str]) -> Iterator[_Entity]:
 
 
 def _reports(state: str, now: KioskState) -> Iterator[_Entity]:
-    """What the stage says of itself."""
+    """The stage's own description."""
 
     def reads(expression: str, **more: Any) -> dict[str, Any]:
         return {"state_topic": state, "value_template": f"{{{{ {expression} }}}}"} | more

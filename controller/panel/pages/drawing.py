@@ -83,7 +83,7 @@ def around(state: KioskState) -> list[dict[str, Any]]:
                 "life": lives.get(place.projector, 0.0), "arc": _arc(x, y, lives.get(place.projector, 0.0)),
             }
         )  # fmt: skip
-    # Without the empty half where nobody stands behind the object.
+    # Without the empty half where no one stands behind the object.
     top = min([44.0, *(one["y"] - 34 for one in drawn)])
     return [one | {"top": round(top)} for one in drawn]
 

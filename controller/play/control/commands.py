@@ -267,7 +267,7 @@ class Commands:
             self._handle(client, line)
 
     def resume(self) -> None:
-        """Go on with what is kept, or else begin with what there is to begin with; black if that can't be played."""
+        """Continue with what is kept, or else begin with what there is to begin with; black if that can't be played."""
         request = self._kept.request() or self._first
         if request is not None:
             with contextlib.suppress(VelaturaError):

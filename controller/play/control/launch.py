@@ -156,7 +156,7 @@ class PlayerProcess:
 
 
 def hello(path: Path, timeout_s: float) -> dict[str, Any]:
-    """What the player that serves ``path`` says of itself; empty while it ends. Raises OSError."""
+    """The description that the player at ``path`` gives; empty while it ends. Raises OSError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(max(0.01, timeout_s))
         channel.connect(str(path))
@@ -233,7 +233,7 @@ _ATTACHED_READY_S: Final = 20.0
 class AttachedPlayer:
     """As ``launch.PlayerProcess``, of a player that another program starts with the arguments in ``options``.
 
-    ``settings``: what it is to be started with; where the file says something else, the file is written and the player
+    ``settings``: what it has to be started with; where the file says something else, the file is written and the player
     ended, and its next start reads it. None: as it is.
     """
 

@@ -118,7 +118,7 @@ def read_phase_map(folder: Path, projector: str) -> tuple[PhaseMap | None, npt.N
 
 
 def _phase_pixels(folder: Path, projector: str) -> Pixels | None:
-    """What the sinusoids told of a projector; None if no phase map is used."""
+    """What the sinusoids showed of a projector; None if no phase map is used."""
     if mode_of(folder) == "paper":
         return None
     pixels = Pixels.read(folder, projector)

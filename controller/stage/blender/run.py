@@ -114,7 +114,7 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 class _Watch:
-    """Reads what Blender says in a thread, so that a stop is heeded while Blender says nothing."""
+    """Reads what Blender says in a thread, so that a stop is followed while Blender says nothing."""
 
     def __init__(self, stream: IO[bytes], log: IO[bytes]) -> None:
         self.share, self.note = 0.0, "starting Blender"

@@ -60,7 +60,7 @@ class LampRecord:
     failed: int = 0
 
     def failed_in(self, boot: str) -> int:
-        """Those failed attempts that count in this boot: a computer that was started anew allows all again."""
+        """Those failed attempts that count in this boot: a computer that was started again allows all again."""
         return self.failed if self.boot == boot else 0
 
 

@@ -289,7 +289,7 @@ class SurfaceTruth:
 class MainsTruth:
     """A relay and whose mains go through it. ``relay``: the board's name in bench/usb.toml; ``feeds``: projectors;
 
-    ``boot_s``: from mains on until they can be spoken to.
+    ``boot_s``: from mains on until they accept commands.
     """
 
     relay: str

@@ -65,7 +65,7 @@ def flickering(lamp: LampTruth, exposure_s: float, rng: np.random.Generator) -> 
 
 
 def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float32]:
-    """A share of the light goes astray in a lens and lies as a veil over the whole picture.
+    """A share of the light is stray light of a lens and lies as a veil over the whole picture.
 
     (1 - share) image + share image * Gaussian, for light (rows, columns, 3); what leaves the picture is lost.
     """

@@ -131,7 +131,7 @@ class VisibleFrames:
                 self._history.append((max(at + self._latency_s, self._history[-1][0]), latest))
 
     def during(self, start_s: float, end_s: float) -> list[tuple[float, VisibleFrameSet | None]]:
-        """The sets that were visible between two times, with their shares of that time (sum 1); None is no picture."""
+        """The sets that were visible between two times, with their shares of it (sum 1); None: without a picture."""
         self.update()
         with self._lock:
             history = list(self._history)

@@ -200,7 +200,7 @@ class EmulatedNetworkProjector(BoardProjector, TcpServer):
     port : TCP port, 0 for any free one (see ``address`` once started)
     gate : makes what comes before the commands, for each connection
     password : of the login; "" for none
-    wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until its mains were cut
+    wedges_below_s : with two commands within this time while it warms or cools, it hangs until its mains were cut
     boot_s : from mains on until it answers
 
     ``faults`` are its knobs, ``scenario`` a script that turns them. ``connections`` counts those that were accepted.

@@ -43,7 +43,7 @@ class PjLinkOddities:
     ``ending`` of its lines; ``salt_digits`` of the random number for the password. ``closes``: it closes the connection
     after each answer; ``closes_unanswered``: a command (such as ``POWR 1``) that it carries out and then closes the
     connection without an answer. ``mutes``: the parameters of AVMT that it accepts. ``second_level_only``: it accepts
-    no MD5 digest, but SHA-256 after ``PJLINK 2`` (class 2, version 2.10). ``chatty``: it tells that it came up
+    no MD5 digest, but SHA-256 after ``PJLINK 2`` (class 2, version 2.10). ``chatty``: it reports that it came up
     before it answers, and pads with NUL.
     """
 

@@ -14,7 +14,7 @@ from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 class EmulatedProjector(Switchable):
     """``faults`` are its knobs, ``scenario`` a script that turns them.
 
-    ``wedges_below_s``: spoken to twice within this time while its lamp warms or cools, it hangs: ``wedged`` is true.
+    ``wedges_below_s``: with two commands within this time while its lamp warms or cools, it hangs: ``wedged`` is true.
     """
 
     def __init__(self, lamp: EmulatedLamp, *, wedges_below_s: float) -> None:

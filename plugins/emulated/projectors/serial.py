@@ -32,7 +32,7 @@ class EmulatedSerialProjector(BoardProjector):
     lamp : its lamp; the optical bench reads the same one
     board : what it does with the bytes; an Optoma of a later model, unless given
     baud : the rate it listens at; at any other the line carries noise both ways
-    wedges_below_s : spoken to twice within this time while it warms or cools, it hangs until its mains were cut
+    wedges_below_s : with two commands within this time while it warms or cools, it hangs until its mains were cut
     boot_s : from mains on until its control board answers
 
     ``faults`` are its knobs, ``scenario`` a script that turns them. ``start`` and ``stop`` it, or use it in a ``with``

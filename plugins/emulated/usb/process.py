@@ -34,7 +34,7 @@ _COUNTS: Final = {"busy": "stalls", "garbage": "garble", "cut": "cut", "drop": "
 class UsbScenario:
     """Plays the events of ``device`` (its name in the script is ``name``) until ``close``.
 
-    A busy device stalls what it is asked; "on_byte" and "on_message" count control requests with their eight bytes of
+    A busy device stalls requests; "on_byte" and "on_message" count control requests with their eight bytes of
     set-up; a lamp it has not.
     """
 

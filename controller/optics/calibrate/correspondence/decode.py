@@ -300,7 +300,7 @@ def _check_order(
 def _steady_share(position_px: FloatImage, agreeing: Mask) -> float:
     """Of adjacent camera pixels in different cells, the share in which the code is not wrong.
 
-    A wrong code is off by whole periods, so that the phases go on as if it were right. From one surface to another
+    A wrong code is off by whole periods, so that the phases continue as if it were right. From one surface to another
     in front of it, phases jump, too: that is no fault, however many edges an object has.
     """
     crossings = jumps = 0

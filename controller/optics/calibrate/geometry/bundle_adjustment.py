@@ -42,7 +42,7 @@ _CAUCHY = 2.4
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentProblem:
-    """What was seen, and what is known beforehand.
+    """What was seen, and what is known in advance.
 
     ``camera_px`` (points, 2); ``projector_px`` (points, N, 2), any value where not ``seen`` (points, N) bool;
     ``camera_prior``, ``camera_sigma`` (4,); ``projector_prior``, ``projector_sigma`` (N, 4) of log f, cx, cy, k1;

@@ -1,4 +1,4 @@
-"""Veiling glare of the camera: light that goes astray in its lens and lies over the whole picture.
+"""Veiling glare of the camera: stray light in its lens that lies over the whole picture.
 
 It is part of the indirect light of white. Light by way of other surfaces is thrown back by the paint, so dark paint
 shows little of it; a veil lies over dark and pale paint alike. Where paints of both kinds lie side by side, what a

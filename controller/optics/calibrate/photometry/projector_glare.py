@@ -1,4 +1,4 @@
-"""Veiling glare of a projector: light that goes astray in its lens and lies over its whole picture.
+"""Veiling glare of a projector: stray light in its lens that lies over its whole picture.
 
 It is seen where the projector's picture is dark beside bright stripes. So is light by way of other surfaces; but a veil
 comes from the lens, so the edge of the projector's own shadow has it on one side alone. Light of other surfaces, and a
@@ -65,7 +65,7 @@ class DarkPart:
     """A picture of the projector, (rows, columns, ...) of the camera.
 
     ``light``: what is seen of it, NaN where not known; ``dark``: pixels on which the projector shines, but shows black
-    around; ``veil``: of white's light, what a lens spreads there of the picture if all light goes astray
+    around; ``veil``: of white's light, what a lens spreads there of the picture if all light is stray
     """
 
     light: FloatImage
@@ -75,7 +75,7 @@ class DarkPart:
 
 @dataclass(frozen=True, slots=True)
 class Glare:
-    """``share`` of the projector's light that goes astray, with its standard error; ``blocks`` that tell it, in so many
+    """``share`` of the projector's light that is stray, with its standard error; ``blocks`` that show it, in so many
     ``groups``.
     """
 

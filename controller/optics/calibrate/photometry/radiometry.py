@@ -2,7 +2,7 @@
 
 Every tile of a picture shows a triple of device values of its own, so that two photographs hold some hundreds to
 thousands of measurements: M r(levels), with M the mixing and r the three responses, divided by white. Where colours
-depend on the paint, the tiles tell that, too. ``tile_fit`` fits all of it. The share of indirect light and the response
+depend on the paint, the tiles show that, too. ``tile_fit`` fits all of it. The share of indirect light and the response
 in direct light alone follow from each other (``tell_direct_light``).
 """
 
@@ -186,7 +186,7 @@ def tell_direct_light(
     ----------
     white : (rows, columns, 3) less the black image, NaN where not known
     start : response and mixing in direct and indirect light together; its response encoded the sinusoids
-    advance : told what part of the work is done, 0 to 1
+    advance : called with what part of the work is done, 0 to 1
 
     Raises what ``measure_radiometry`` raises.
     """

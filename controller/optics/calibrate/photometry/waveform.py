@@ -46,7 +46,7 @@ FEWEST_PIXELS: Final = 48
 MOST_PARTS: Final = 2000
 FEWEST_PARTS: Final = 60
 FRAME_PX: Final = 6
-"""So many projector pixels at the frame's border are left out: there is no wave beyond it."""
+"""So many projector pixels at the frame's border are omitted: there is no wave beyond it."""
 OUTLIER: Final = 5.0
 """Light that differs from the fit by more than so many standard deviations is left out."""
 DARK_NOISE: Final = 0.03

@@ -428,6 +428,6 @@ def update_radiometry(radiometry: Radiometry, gain: tuple[float, float, float]) 
     mixing, paint = radiometry.mixing * np.asarray(gain), radiometry.paint
     if paint is not None:
         paint = paint * np.asarray(gain)[:, None]
-        # White has changed, too, and paint is told by it.
+        # White has changed, too, and paint is determined by it.
         paint = paint @ np.linalg.inv(paint.sum(axis=1))
     return replace(radiometry, mixing=mixing / mixing.sum(axis=1, keepdims=True), paint=paint)

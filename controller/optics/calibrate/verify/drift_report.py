@@ -144,7 +144,7 @@ def _plain(value: Any) -> Any:
 
 
 def _cause(said: str | None) -> DriftCause:
-    return DriftCause.NONE if said in (None, "nobody") else DriftCause(said)  # "nobody": files from before 0.2.0
+    return DriftCause.NONE if said in (None, "nobody") else DriftCause(said)  # ``nobody``: files from before 0.2.0
 
 
 def drift_from_json(content: Mapping[str, Any]) -> Drift:

@@ -61,4 +61,4 @@ COLOURS: Final[dict[ErrorCause, tuple[int, int, int]]] = {
     ErrorCause.INDIRECT: (146, 73, 0),
     ErrorCause.UNEXPLAINED: (255, 255, 255),
 }
-"""Okabe and Ito's palette and a brown, which people with any colour vision tell apart."""
+"""Okabe and Ito's palette and a brown, which people with any colour vision can distinguish."""

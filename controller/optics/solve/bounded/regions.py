@@ -396,9 +396,9 @@ def _centres(transport: LightTransport, pixels: Pixels) -> Pixels:
 class RegionsEngine(Processor):
     """The paper's solver in place of the global one, ``method = "regions"`` in stage.toml; on the processor alone.
 
-    A solve begins anew, whatever ``start`` it has, and takes its own time: ``tolerance`` and ``most_iterations`` don't
-    matter. A solution's ``iterations`` are its regions; it has converged when all of them are solved. Progress is told
-    after each region.
+    A solve starts again, whatever ``start`` it has, and takes its own time: ``tolerance`` and ``most_iterations`` don't
+    matter. A solution's ``iterations`` are its regions; it has converged when all of them are solved. It reports
+    progress after each region.
     """
 
     name = "processor, by regions"

@@ -41,7 +41,7 @@ CELL: Final = 0.012
 LEAST_SIDE_PX: Final = 4
 """A cell's side is at least so many camera pixels."""
 THIN: Final = 0.005
-"""Obstacles narrower than this part of the picture are left out: grazing edges, specks, noise."""
+"""Obstacles narrower than this part of the picture are ignored: grazing edges, specks, noise."""
 QUANTILE: Final = 0.95
 """A cell's obstacle is this quantile of the needs of its pixels."""
 REACH: Final = 0.04

@@ -2,7 +2,7 @@
 
 To first order the model's error is a sum of known images, one for each cause, times its unknown amount: a projector
 that became darker or whose response changed, light that comes back from the surroundings, light of the room, lost
-focus. One appearance can't tell some of them apart; several can, by least squares. Each photograph leaves its normal
+focus. One appearance can't separate some of them; several can, by least squares. Each photograph leaves its normal
 equations, which are few numbers, and those of all are added.
 """
 
@@ -29,7 +29,7 @@ STEP_PX: Final = 2
 CORRELATED: Final = 25.0
 """Values looked at whose errors count as one: what no cause explains has patterns of its own."""
 RIDGE: Final = 1e-6
-"""Of a cause's own energy: keeps causes apart that no photograph tells apart."""
+"""Of a cause's own energy: keeps causes apart that no photograph distinguishes."""
 SURE: Final = 4.0
 """Standard errors from which an amount is reported."""
 LEAST: Final[dict[Kind, float]] = {

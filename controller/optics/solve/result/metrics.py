@@ -1,6 +1,6 @@
 """How near a photographed result is to its target: colour difference, error, sharpness.
 
-A result is judged by three sets of pixels (``evaluation``), so that nothing is hidden by what is left out:
+A result is judged by three sets of pixels (``evaluation``), so that no error is hidden by the choice of pixels:
 
 - in reach: the projectors can make what was asked for there
 - lit: at least one projector lights it, and the target says something there

@@ -158,7 +158,7 @@ class _View:
         return block_light(light, down(indirect, self.grid, self.side), self.whole, self.lit, self.grid, self.side)
 
     def scale(self, factors: Both, light: Both) -> FloatImage:
-        """S (rows, columns, 3), which makes all whites' indirect light of their ``light`` (blocks, 3) what it is."""
+        """S (rows, columns, 3), which makes whites' indirect light of their ``light`` (blocks, 3) the measured one."""
         arriving = np.asarray(factors[0] @ light[0] + factors[1] @ light[1], np.float32)
         falling = up(arriving, self.grid, self.side, self.lit.shape)
         faint = FAINTEST * falling.max(initial=0)
@@ -249,7 +249,7 @@ def beside(part: ProjectorCalibration, frame: FloatImage, lit: Mask) -> FloatIma
 
 
 def _even(grid: tuple[int, int]) -> FloatImage:
-    """All blocks give the same to all: surroundings that nobody sees, and glare in lenses."""
+    """All blocks give the same to all: surroundings that no one sees, and glare in lenses."""
     count = grid[0] * grid[1]
     return np.full((count, count), 1 / count, np.float32)
 

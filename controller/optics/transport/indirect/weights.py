@@ -156,7 +156,7 @@ def block_light(
 def fit_weights(
     terms: Sequence[Term], whites: Sequence[BlockLight], stripes: Sequence[BlockLight], blocks: BlockGrid
 ) -> FloatImage:  # fmt: skip
-    """The factor (terms,) >= 0 of each term that tells pictures' indirect light apart best.
+    """The factor (terms,) >= 0 of each term that separates pictures' indirect light best.
 
     What surfaces make of falling light follows from all whites together, so a picture's light is predicted as its part
     of what falls, times theirs. Least squares by ``blocks``, relative to the light; the part's

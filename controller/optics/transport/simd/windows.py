@@ -95,7 +95,7 @@ def _generate_sum(context: Any, builder: Any, signature: Any, args: Any, *, shea
     total = cgutils.alloca_once_value(builder, FLOAT(0))  # type: ignore[no-untyped-call]
 
     def add_columns(column: Any, vector: Any) -> None:
-        # two, because each sum waits for the one before
+        # two, because each sum waits for the previous one
         parts = [cgutils.alloca_once(builder, vector) for _ in range(2)]  # type: ignore[no-untyped-call]
         for part in parts:
             builder.store(splat(vector, 0.0), part)

@@ -1,4 +1,4 @@
-"""Records what another program says to a device: it connects to a port here, and all bytes go on to the device.
+"""Records what another program says to a device: it connects to a port here, and all bytes are passed to the device.
 
 ``kind`` "pjlink" and "tcp" are byte streams. "ptpip" is a camera with two connections, whose operations are recorded as
 containers of PTP over USB, as the driver ``ptp`` records them.
