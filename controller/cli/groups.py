@@ -33,7 +33,7 @@ INSTALLED: Final = "Of other distributions"
 """The title of the commands that an installed distribution declares."""
 ENTRY_POINTS: Final = "velatura.commands"
 """Each names a function that ``group`` accepts."""
-LAB: Final = ("study", "benchmark", "simulate")
+LAB: Final = ("study", "compare", "simulate")
 """Commands of the distribution velatura-lab."""
 LONGEST_SENTENCE: Final = 200
 """Characters, far more than any first sentence has."""

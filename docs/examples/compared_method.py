@@ -1,7 +1,7 @@
 # %% [markdown]
-# A method for `velatura benchmark`: every projector shows one even colour, the best for the mean of the target.
+# A method for `velatura compare`: every projector shows one even colour, the best for the mean of the target.
 #
-#     velatura benchmark --method docs/examples/compared_method.py:even_colour --method ours --scene dark
+#     velatura compare --method docs/examples/compared_method.py:even_colour --method ours --scene dark
 
 # %%
 from __future__ import annotations

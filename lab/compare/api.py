@@ -1,4 +1,4 @@
-"""Entering a method of your own in ``velatura benchmark``.
+"""Entering a method of your own in ``velatura compare``.
 
 A method is a function. It gets a stage, measures it with photographs of patterns of its choice, and returns a second
 function, which makes the frames of one target::

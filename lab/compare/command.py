@@ -1,4 +1,4 @@
-"""``velatura benchmark``."""
+"""``velatura compare``."""
 
 from __future__ import annotations
 

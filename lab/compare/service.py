@@ -1,4 +1,4 @@
-"""`velatura benchmark`: methods on fixed emulated scenes, judged by photographs. Finished work is not repeated."""
+"""`velatura compare`: methods on fixed emulated scenes, judged by photographs. Finished work is not repeated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lab.study.subject.photographing import RigPhotographer
 from lab.study.subject.scenes import Scene
 from lab.study.subject.subject import ReachableTarget, Subject
 
-KIND: Final = "benchmark"
+KIND: Final = "compare"
 """Of the steps, and the folder in a run with their results."""
 SHOTS: Final = "study"
 """The kind of photographs that experiments and methods take (``RigPhotographer``)."""
