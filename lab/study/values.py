@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from controller.core.arrays import ByteImage
-from controller.core.storage import sha256_of
 from lab.study.subject.subject import Subject
 
 Cell = str | int | float | bool | None
@@ -90,9 +91,26 @@ class Experiment:
     dots: bool = False
 
     def code_sha256(self) -> str:
-        """Hash of the module that the function stands in: an experiment that was changed is done again."""
+        """Hash of what the function's module does: an experiment that was changed is done again.
+
+        Imports and docstrings do not count: modules that move, and better words, change no result.
+        """
         source = inspect.getsourcefile(self.run)
-        return "" if source is None else sha256_of(Path(source))
+        return "" if source is None else hashlib.sha256(_statements(Path(source)).encode()).hexdigest()
+
+
+def _statements(source: Path) -> str:
+    """The lines of a module, without its imports, docstrings and empty lines."""
+    text = source.read_text("utf-8")
+    left_out = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    kept = (line for number, line in enumerate(text.splitlines(), 1) if number not in left_out)
+    return "\n".join(line for line in kept if line.strip())
 
 
 def column(table: ResultTable, name: str) -> Sequence[Cell]:
