@@ -32,9 +32,9 @@ STATES: Final = {
     "degraded": (mark("Playing with problems"), "warn"),
     "fault": (mark("Fault"), "bad"),
 }
+"""Label and style of each state."""
 NOTHING_YET: Final = mark("Nothing to show yet")
 UNKNOWN_TIME: Final = mark("at an unknown time")
-"""Label and style of each state."""
 
 EVENTS_SHOWN: Final = 200
 OPEN: Final = ("powering", "warming", "ready", "calibrating", "playing", "degraded")

@@ -1,4 +1,5 @@
-"""What an engine does, and the one that every computer has: block coordinate descent over the projectors.
+"""What an engine does, and the one that every computer has: block coordinate descent over the projectors
+(paper eqs 2 and 3).
 
 A sweep is one Gauss-Seidel pass: each projector takes a projected gradient step against what the others show by then,
 scaled by a diagonal preconditioner that bounds its own part of the Hessian alone; with n projectors alike that is n

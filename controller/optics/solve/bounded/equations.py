@@ -26,7 +26,7 @@ from controller.optics.transport.planes import planes_above
 
 TOLERANCE: Final = 3e-5
 """Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
-calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0004)."""
+calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0008)."""
 MOST_ITERATIONS: Final = 1000
 
 
@@ -148,13 +148,13 @@ def squared_edge_weights(transport: LightTransport, wanted: FloatImage) -> tuple
         transport.forward_planes(ones, projectors=(n, n + 1), out=light)
         observed = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, span]
         faint = float(FAINTEST * observed.max(initial=0))
-        _squared(target, observed, faint, span.start, rows, columns, across, down)
+        _write_edge_weights(target, observed, faint, span.start, rows, columns, across, down)
     return across, down
 
 
 @compiled()
-def _squared_alike(target: float, observed: float, other: float, other_observed: float, faint: float) -> int:
-    """In steps."""
+def _edge_weight(target: float, observed: float, other: float, other_observed: float, faint: float) -> int:
+    """alpha^2 of eq. 3 between two adjacent pixels, in steps of 1 / ``EDGE_WEIGHT_STEPS``; 0 beside faint light."""
     if observed <= faint or other_observed <= faint:
         return 0
     a, b = target / observed, other / other_observed
@@ -164,7 +164,7 @@ def _squared_alike(target: float, observed: float, other: float, other_observed:
 
 
 @compiled(parallel=True)
-def _squared(
+def _write_edge_weights(
     target: FloatImage,
     observed: FloatImage,
     faint: float,
@@ -182,10 +182,10 @@ def _squared(
                 k = start + i
                 here, seen = target[c, k], observed[c, i]
                 if x + 1 < columns:
-                    across[c, k] = _squared_alike(here, seen, target[c, k + 1], observed[c, i + 1], faint)
+                    across[c, k] = _edge_weight(here, seen, target[c, k + 1], observed[c, i + 1], faint)
                 if y + 1 < rows:
                     below = k + columns, i + columns
-                    down[c, k] = _squared_alike(here, seen, target[c, below[0]], observed[c, below[1]], faint)
+                    down[c, k] = _edge_weight(here, seen, target[c, below[0]], observed[c, below[1]], faint)
 
 
 def build_problem(

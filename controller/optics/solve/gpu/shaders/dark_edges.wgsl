@@ -1,4 +1,4 @@
-// Edges beside dark pixels count nothing, as in bounded/gradient.py; the majoriser holds the data's part.
+// Edges (eq. 3) beside dark pixels count nothing, as in bounded/gradient.py; the majoriser holds the data's part.
 @group(0) @binding(1) var<storage, read> majoriser: array<f32>;
 @group(0) @binding(2) var<storage, read_write> edge_weights: array<u32>;
 

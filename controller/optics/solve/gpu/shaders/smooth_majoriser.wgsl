@@ -1,4 +1,4 @@
-// Adds twice the weights of a pixel's edges to the majoriser, dark pixels too, and adds all of it up.
+// Adds twice the weights of a pixel's edges (eq. 3) to the majoriser, dark pixels too, and adds all of it up.
 @group(0) @binding(1) var<storage, read_write> majoriser: array<f32>;
 @group(0) @binding(2) var<storage, read> edge_weights: array<u32>;
 

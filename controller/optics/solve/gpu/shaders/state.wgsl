@@ -1,4 +1,4 @@
-// What a solve carries from sweep to sweep; see descent.py for their order there.
+// What a solve carries from sweep to sweep; see bounded/engine.py for their order there.
 struct State {
   inertia: f32,
   momentum: f32,
