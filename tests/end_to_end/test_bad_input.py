@@ -139,8 +139,8 @@ def test_a_mesh_that_is_none_is_refused_before_anything_is_written(tmp_path: Pat
     ("words", "code"),
     [
         (["--object", "nowhere.obj"], "object-missing"),
-        (["--size", "huge"], "size-unknown"),
-        (["--room", "cellar"], "setting-wrong"),
+        (["--size", "huge"], "wrong-use"),
+        (["--room", "cellar"], "wrong-use"),
         (["--seed", "many"], "wrong-use"),
         (["--seed", "-1"], "wrong-use"),
         (["--seed", "99999999999999999999"], "wrong-use"),

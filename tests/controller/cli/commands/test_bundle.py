@@ -101,12 +101,12 @@ def test_a_key_is_private_and_the_shown_lines_make_the_stage_trust_it(
     assert key.stat().st_mode & 0o777 == 0o600
     assert key.with_name("stage.key.pub").exists()
     before = key.read_bytes()
-    assert told(capsys, "keys", stage, code=2)["code"] == "key-exists"
+    assert told(capsys, "bundle", "key", stage, code=2)["code"] == "key-exists"
     assert key.read_bytes() == before
-    second = told(capsys, "keys", stage, "--name", "second")
+    second = told(capsys, "bundle", "key", stage, "--name", "second")
     assert len(second["trusted_keys"]) == 2, "the key that is trusted already stays so"
-    assert told(capsys, "keys", stage / "nowhere", code=2)["code"] == "stage-missing"
-    assert told(capsys, "keys", stage, "--name", "../x", code=2)["code"] == "key-name"
+    assert told(capsys, "bundle", "key", stage / "nowhere", code=2)["code"] == "stage-missing"
+    assert told(capsys, "bundle", "key", stage, "--name", "../x", code=2)["code"] == "key-name"
 
 
 def test_the_lines_for_a_further_key_take_the_place_of_the_first(

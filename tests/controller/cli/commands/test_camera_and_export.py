@@ -113,6 +113,8 @@ def test_a_transport_is_cropped_by_the_command(tmp_path: Path, capsys: pytest.Ca
 
 def test_wrong_formats_and_folders_are_refused(calibrated: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["export", str(calibrated), "--format", "fbx", "--json"]) == 2
-    assert answer(capsys)["error"]["code"] == "export-format-unknown"
+    refused = answer(capsys)["error"]
+    assert refused["code"] == "wrong-use"
+    assert "'glb', 'ply'" in refused["what"]
     assert run(["export", str(calibrated / "no"), "--json"]) == 2
     assert answer(capsys)["error"]["code"] == "not-calibrated"
