@@ -115,6 +115,6 @@ def test_wrong_formats_and_folders_are_refused(calibrated: Path, capsys: pytest.
     assert run(["export", str(calibrated), "--format", "fbx", "--json"]) == 2
     refused = answer(capsys)["error"]
     assert refused["code"] == "wrong-use"
-    assert "'glb', 'ply'" in refused["what"]
+    assert "'glb', 'ply'" in str(refused["what"])
     assert run(["export", str(calibrated / "no"), "--json"]) == 2
     assert answer(capsys)["error"]["code"] == "not-calibrated"
