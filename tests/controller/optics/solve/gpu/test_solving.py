@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -260,7 +260,11 @@ def test_a_second_base_and_a_second_stage_take_the_place_of_the_first(engine: Gp
 # what a device refuses
 
 
-def solved(stage: tuple[Calibration, LightTransport], engine: GpuEngine | None, **more: object) -> Sequence[FloatImage]:
+def solved(
+    stage: tuple[Calibration, LightTransport],
+    engine: GpuEngine | None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Sequence[FloatImage]:
     calibration, transport = stage
     target = unreachable_in_parts(transport, calibration.black)
     return solve_bounded(
@@ -268,8 +272,7 @@ def solved(stage: tuple[Calibration, LightTransport], engine: GpuEngine | None, 
         target,
         calibration.black,
         SolveSettings(tolerance=0, most_iterations=30),
-        SolveContext(engine=engine),
-        **more,
+        SolveContext(engine=engine, progress=progress),
     ).frames
 
 
