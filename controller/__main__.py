@@ -11,6 +11,7 @@ from controller.cli.plain_install import run_without_commands
 from controller.core.extras import EXTRA_OF
 
 try:
+    import pydantic  # noqa: F401 - the kiosk's operations, of which commands are made, need it
     import typer
 except ModuleNotFoundError as missing:  # an installation with only the player
     if missing.name not in EXTRA_OF:

@@ -169,7 +169,7 @@ def stage(tmp_path: Path) -> Path:
 def test_without_an_extra_every_command_works_or_names_it(
     missing: tuple[str, ...], stage: Path, tmp_path: Path
 ) -> None:
-    blocked = of_extras(*missing) - {"typer"}
+    blocked = of_extras(*missing) - {"typer", "pydantic", "pydantic_core"}  # without these, there are no commands
     commands = list(cheap(stage, tmp_path).values())
     skipped = ("doctor", "init")  # they look at every bus of this machine
     commands = [words for words in commands if words[0] not in skipped]

@@ -15,7 +15,7 @@ from hal.errors import DeviceError
 
 ENDS_WITH_INPUT = """
 import signal, time
-from controller.stage.bench import terminated_when_input_ends
+from controller.stage.sessions.bench import terminated_when_input_ends
 asked = []
 signal.signal(signal.SIGTERM, lambda *_: asked.append("asked to end"))
 terminated_when_input_ends()
