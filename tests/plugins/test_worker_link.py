@@ -60,7 +60,7 @@ class Doing(threading.Event):
 def test_what_waits_for_a_call_that_was_left_behind_is_not_done_after_the_closing() -> None:
     board, go, moved = Board(), threading.Event(), threading.Event()
     with pytest.raises(DeviceTimeout):
-        board.call(lambda opened: go.wait(30), deadline=in_seconds(0.3))
+        board.call(lambda opened: go.wait(30), deadline=in_seconds(0.02))
 
     def close() -> None:
         board.close()
@@ -133,7 +133,7 @@ def test_a_device_that_cannot_be_opened_yet_is_tried_for_a_while() -> None:
 def test_a_call_after_the_closing_is_refused_at_once_though_another_hangs() -> None:
     board, go = Board(), threading.Event()
     with pytest.raises(DeviceTimeout):
-        board.call(lambda opened: go.wait(30), deadline=in_seconds(0.3))
+        board.call(lambda opened: go.wait(30), deadline=in_seconds(0.02))
     board.close()
     with pytest.raises(DeviceGone):
         board.call(lambda opened: None, deadline=in_seconds(30))
