@@ -31,7 +31,7 @@ from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
 from controller.run.progress import Reporter
 from controller.stage.sessions.run import leave_runtime_folder, stage_lock
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from hal.notices import Level
 
 RETRY_S: Final = 5.0
@@ -110,7 +110,7 @@ def serve(
                         reporter.say(f"The kiosk {stage.name} is running.")
                     _wait(kiosk, cancel, over=_Correction(kiosk, service))
                 kiosk.detach()
-            except (VelaturaError, DeviceError) as error:
+            except CodedError as error:
                 if first and not setup:
                     raise
                 missing = not (stage / FILE).exists()

@@ -26,7 +26,7 @@ from controller.kiosk.serving import serving
 from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import State
 from hal.deadline import Stop
-from hal.errors import DeviceError
+from hal.errors import CodedError, DeviceError
 from lab.simulate.disk import STAGE, watched
 from lab.simulate.jobs import SimulatedJobs
 from lab.simulate.monitors.expectation import Calendar
@@ -271,7 +271,7 @@ class Life:
                         self.later(RENEWS_S, partial(self._serves, self.program))
                 kiosk.detach()
                 self.monitor.disturb(0.0)
-            except (VelaturaError, DeviceError) as error:
+            except CodedError as error:
                 kiosk.attach(None, f"{error.what} {error.remedy}")
                 # Nothing else of it runs, and whatever happens ends the pause.
                 world.scheduler.stretch = min(world.scheduler.stretch * CALMER, CALM[2])

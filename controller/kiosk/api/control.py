@@ -17,7 +17,7 @@ from typing import Any, Final
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
 from controller.core.storage import listening, runtime_path
 from controller.kiosk.operations.dispatch import CALLER
-from hal.errors import DeviceError
+from hal.errors import CodedError
 
 NAME: Final = "kiosk.sock"
 LONGEST_LINE: Final = 1 << 20
@@ -83,7 +83,7 @@ class ControlServer:
             return _error("request-wrong", "The request is unknown.", "See docs/reference/http-api.md.")
         try:
             return {"ok": True, "result": plain(operation(**request))}
-        except (VelaturaError, DeviceError) as error:
+        except CodedError as error:
             return _error(error.code, error.what, error.remedy)
         except TypeError as error:
             return _error(

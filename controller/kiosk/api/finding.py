@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 from controller.config.writer import toml_text
-from controller.core.errors import VelaturaError
 from controller.core.text import printable
 from controller.kiosk.interface import FoundDevice, TriedDevice
 from controller.kiosk.service import Service
@@ -19,7 +18,7 @@ from controller.run.progress import Silent
 from controller.stage.doctor.examine import Tools, examine
 from controller.stage.doctor.values import Examination
 from hal.deadline import in_seconds
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from hal.finding import Found
 from hal.notices import Level, Notice
 from hal.registry import OpenContext, load_drivers, open_device
@@ -95,13 +94,13 @@ def try_device(stage: Path, key: str, *, tools: Tools | None = None) -> TriedDev
         drivers = tools.drivers if tools is not None and tools.drivers is not None else load_drivers(benches=False)
         driver = drivers.get(device.kind, device.driver)
         opened = open_device(driver, dict(device.settings), OpenContext(stage=stage), in_seconds(20.0))
-    except (DeviceError, VelaturaError) as error:
+    except CodedError as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")
     try:
         identity = opened.identity(deadline=in_seconds(10.0))
         text = printable(f"{identity.maker} {identity.model} {identity.serial}".strip())
         return TriedDevice(True, f"The device answers: {text}.")
-    except (DeviceError, VelaturaError) as error:
+    except CodedError as error:
         return TriedDevice(False, f"{error.what} {error.remedy}")
     finally:
         opened.close()

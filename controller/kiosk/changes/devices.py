@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from controller.config.models import StageTables
-from controller.core.errors import VelaturaError
 from controller.core.text import printable
 from controller.kiosk.changes.inventory import Fact
 from controller.kiosk.outputs import Connected
 from hal.deadline import Deadline, in_seconds
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from hal.interfaces import Device, WatchedCamera
 from hal.values import DeviceIdentity
 
@@ -119,7 +118,7 @@ def _asked(question: Callable[..., Any] | None, deadline: InSeconds) -> Any:
         return None
     try:
         return question(deadline=deadline(ASK_S))
-    except (DeviceError, VelaturaError):
+    except CodedError:
         return None
 
 

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
+from controller.core.errors import SEND_DIAGNOSTICS
 from controller.kiosk.decide.interfaces import Finished, Request
 from controller.kiosk.interface import Job, JobStep
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.world import Thread, World
 from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from hal.notices import Level, Notice
 
 TITLES: Final[Mapping[str, str]] = {
@@ -167,7 +167,7 @@ class JobRunner:
             finished = self._handlers[request.kind].do(request, reporter, cancel)
         except Cancelled as error:
             finished = Finished(request, Notice(error.code, error.what, error.remedy), failed=True)
-        except (VelaturaError, DeviceError) as error:
+        except CodedError as error:
             finished = Finished(request, Notice(error.code, error.what, error.remedy, Level.ERROR), failed=True)
         except BaseException as error:  # noqa: BLE001 - the last boundary of this thread: the kiosk reports it and continues
             finished = _crashed(request, error)

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.world import Lock, World
 from hal.deadline import Deadline
-from hal.errors import DeviceError
+from hal.errors import CodedError, DeviceError
 from hal.interfaces import Device
 from hal.notices import Level, Notice
 
@@ -80,7 +79,7 @@ class DeviceSupervisor:
             values = self._look(self._device, self._deadline(LOOK_S))
             self._row = replace(self._row, values=values)
             self._recovered()
-        except (DeviceError, VelaturaError) as error:
+        except CodedError as error:
             self._lost(Notice(error.code, error.what, error.remedy, Level.ERROR))
         finally:
             if self._closed:

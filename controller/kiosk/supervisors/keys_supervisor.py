@@ -6,10 +6,9 @@ import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from controller.core.errors import VelaturaError
 from controller.kiosk.interface import DeviceRow
 from controller.run.state_machine import State
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from hal.interfaces import ButtonPanel
 from hal.notices import Level, Notice
 
@@ -47,7 +46,7 @@ class KeysSupervisor:
         with contextlib.ExitStack() as stack:
             try:
                 panel = stack.enter_context(self._open())
-            except (DeviceError, VelaturaError) as error:
+            except CodedError as error:
                 self._trouble(error)
                 return
             commands = technicians_keys(*self._presses)
@@ -71,7 +70,7 @@ class KeysSupervisor:
         if opened is not None:
             opened.close()
 
-    def _trouble(self, error: DeviceError | VelaturaError | None) -> None:
+    def _trouble(self, error: CodedError | None) -> None:
         before, self._problem = self._problem, None
         if error is not None:
             self._problem = Notice(error.code, error.what, error.remedy, Level.WARNING)

@@ -14,7 +14,7 @@ from controller.optics.capture.acquire import DISK_CODES
 from controller.stage.rig.lamp_guard import LampGuard, fatal_faults, faulty
 from controller.stage.rig.lamp_ledger import Clock, SystemClock
 from hal.deadline import Deadline, in_seconds
-from hal.errors import DeviceError, DeviceRefused
+from hal.errors import CodedError, DeviceError, DeviceRefused
 from hal.notices import Level, Notice
 from hal.values import Power, ProjectorStatus
 
@@ -157,7 +157,7 @@ class ProjectorSupervisor:
             status = guard.status(deadline=self._deadline(ANSWER_S))
             for notice in guard.notices():
                 self._tell(Notice(notice.code, notice.text, "", Level.WARNING))
-        except (DeviceError, VelaturaError) as error:
+        except CodedError as error:
             self._silent(error)
             return
         self._silent_since_s = None
@@ -172,7 +172,7 @@ class ProjectorSupervisor:
                 self._light(guard, status)
             else:
                 self._darken(guard, status)
-        except (DeviceError, VelaturaError) as error:
+        except CodedError as error:
             self._answers_since_s = None
             self._see(self._view.condition, status, Notice.of(error, level=Level.ERROR))
         self._keep_failed(guard)
@@ -205,7 +205,7 @@ class ProjectorSupervisor:
         except DeviceError as error:
             self._tell(replace(Notice.of(error, level=Level.ERROR), level=Level.WARNING))
 
-    def _silent(self, error: DeviceError | VelaturaError) -> None:
+    def _silent(self, error: CodedError) -> None:
         now_s = self._clock.now_s()
         self._answers_since_s = None
         if self._silent_since_s is None:
@@ -225,7 +225,7 @@ class ProjectorSupervisor:
         if guard is None or now_s - self._silent_since_s >= limit_s:
             self._lost(error)
 
-    def _lost(self, error: DeviceError | VelaturaError) -> None:
+    def _lost(self, error: CodedError) -> None:
         maybe_lit = self._guard.may_be_lit if self._guard is not None else self._view.maybe_lit
         if self._guard is not None:
             self._release(self._guard)

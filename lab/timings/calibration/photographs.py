@@ -19,7 +19,6 @@ from typing import Final
 
 import numpy as np
 
-from controller.core.errors import VelaturaError
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
@@ -28,7 +27,7 @@ from controller.stage.services.calibrate import calibrate
 from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
-from hal.errors import DeviceError
+from hal.errors import CodedError
 from lab.timings import Row, at_least, at_most
 from lab.timings.tools.judge import map_errors, noise_free, random_errors
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
@@ -67,7 +66,7 @@ def _of_room(size: str, room: str, seeds: Sequence[int]) -> Iterator[Row]:
         try:
             for which, figure, values in _of_stage(size, seed, room):
                 found.setdefault((which, figure), []).extend(values)
-        except (VelaturaError, DeviceError) as error:
+        except CodedError as error:
             failed.append(f"seed {seed}: {error.what}")
     done = stages - len(failed)
     yield at_least(f"{room}: stages calibrated", done, stages, unit=f"of {stages}", how="; ".join(failed))
