@@ -1,1 +1,3 @@
-"""What judges the product and no stage runs: the paper's `study`, `compare`, `simulate` and `timings`."""
+"""What judges the product and no stage runs: the paper's `study`, `compare`, `simulate`, `timings`, and more emulated
+devices.
+"""

@@ -16,17 +16,27 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
-from hal.runtime.files import read_text
 from hal.tape import read_tape
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.faults import ScenarioPlayer, read_scenario
-from plugins.emulated.core.truth import FOLDER, CameraTruth, LampTruth, ObjectTruth, read_truth, write_truth
+from plugins.emulated.core.shot import Expose
+from plugins.emulated.core.truth import (
+    FOLDER,
+    USB_FILE,
+    BenchTruth,
+    CameraTruth,
+    LampTruth,
+    ObjectTruth,
+    read_truth,
+    write_truth,
+)
 from plugins.emulated.optics.bumps import bumps_of, write_bumps
 from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_engine, read_room, read_stands
 from plugins.emulated.optics.objects import default_object, load_object
@@ -42,10 +52,8 @@ from plugins.emulated.optics.staging import (
 from plugins.emulated.projectors.boards import DEFAULT_BOARD, board_named, projector_on_its_wire, quick_profile
 from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.projector import BoardProjector
 from plugins.emulated.tape import serve_tape
-from plugins.emulated.usb.bench import UsbDevices, read_usb
-from plugins.emulated.usb.camera import STAGE_CAMERA, ExposureServer
-from plugins.emulated.usb.mains import Mains, boot_times, check_mains
 
 if TYPE_CHECKING:
     from plugins.emulated.optics.world import World
@@ -198,14 +206,13 @@ def _start(
     # Not at the top: a stage that is only prepared casts no rays, and all that these need takes a second to import.
     from plugins.emulated.optics.world import World
 
-    truth, usb = read_truth(stage), read_usb(stage)
-    on_usb = any(device.kind == STAGE_CAMERA for device in usb)
-    if not on_usb:
+    truth = read_truth(stage)
+    usb = _usb_devices(stage, truth)
+    if usb is None or not usb.have_camera:
         _require_free(truth.camera.command_port, truth.camera.event_port)
     if script is None and truth.scenario:
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
-    check_mains(truth.mains, truth.projectors, usb)
     for family in {projector.board for projector in truth.projectors}:
         board_named(family)
         with _explained(stage):
@@ -221,8 +228,8 @@ def _start(
         world = stack.enter_context(World(stage, truth, lamps, progress=progress))
     world.warm()
     _follow_bumps(world, out)
-    boot_s = boot_times(truth.mains)
-    wires = {}
+    boot_s = {name: one.boot_s for one in truth.mains for name in one.feeds}
+    wires: dict[str, BoardProjector] = {}
     for projector, lamp in zip(truth.projectors, lamps, strict=True):
         wire = projector_on_its_wire(stage, projector, lamp, boot_s.get(projector.name, 0.0))
         wires[projector.name] = wire
@@ -233,19 +240,42 @@ def _start(
     covered = {one.name: lamp for one, lamp in zip(truth.projectors, lamps, strict=True)}
     for node in dmx_nodes(truth.dousers, covered, out.douser):
         out.served("douser", "dmx", stack.enter_context(node).address)
-    if not on_usb:
+    if usb is None or not usb.have_camera:
         camera = stack.enter_context(_network_camera(world, truth.camera))
         out.served("camera", "camera", camera.address)
     out.served("display", "display", str(stage / truth.frames))
-    if usb:
-        camera_settings = stack.enter_context(ExposureServer(world.expose)).camera(truth.camera) if on_usb else None
-        text = read_text(script) if script is not None else ""
-        bus = stack.enter_context(UsbDevices(usb, text, stage_camera=camera_settings))
-        for device in usb:
-            out.served(device.name, device.kind, "usb")
-        stack.enter_context(Mains(truth.mains, wires, bus.moves, out.mains))
-        out.environment(bus.environment)
+    if usb is not None:
+        usb.serve(stack, wires, world.expose, out, script)
     return world
+
+
+class UsbDevices(Protocol):
+    """What ``usb`` of ``extensions`` makes of a stage and its truth; it raises DeviceError where these are wrong."""
+
+    @property
+    def have_camera(self) -> bool:
+        """Whether the stage's camera is one of them."""
+        ...
+
+    def serve(
+        self,
+        stack: contextlib.ExitStack,
+        projectors: Mapping[str, BoardProjector],
+        expose: Expose,
+        out: OutputLines,
+        scenario: Path | None,
+    ) -> None:
+        """Plug them in until ``stack`` ends, and let their relays switch the mains of projectors."""
+        ...
+
+
+def _usb_devices(stage: Path, truth: BenchTruth) -> UsbDevices | None:
+    if not truth.mains and not (stage / USB_FILE).exists():
+        return None
+    devices: UsbDevices = extension("usb", asked_by=f"An emulated USB device ({USB_FILE}, or [[mains]] in bench.toml)")(
+        stage, truth
+    )
+    return devices
 
 
 def _timing(lamp: LampTruth) -> LampTiming:

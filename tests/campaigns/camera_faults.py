@@ -27,11 +27,11 @@ from typing import Any, Final, Protocol
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.values import ExposureSettings
+from lab.emulated.usb.bus import environment
+from lab.emulated.usb.camera import numbered_files
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
-from plugins.emulated.usb.bus import environment
-from plugins.emulated.usb.camera import numbered_files
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import PtpLink
 from plugins.ptp.shot import Timing

@@ -27,11 +27,11 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
+from lab.emulated.usb.bus import environment
+from lab.emulated.usb.camera import numbered_files
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
-from plugins.emulated.usb.bus import environment
-from plugins.emulated.usb.camera import numbered_files
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.gphoto2.camera import open_camera
 
 __all__ = ["FLAVOURS", "SIZE", "Flavour", "Peer", "Way", "network_peer", "usb_peer"]

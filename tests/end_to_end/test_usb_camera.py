@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.core.truth import read_truth
-from plugins.emulated.usb.bench import FILE
+from plugins.emulated.core.truth import USB_FILE, read_truth
 from tests.campaigns.mini_stage import prepare_mini
 from tests.campaigns.wired_kiosk import tether
 from tests.end_to_end.program import Command, velatura, wrong_code
@@ -19,7 +18,7 @@ PULLED_AT_S = range(4, 240, 6)
 def test_a_stage_is_calibrated_by_a_camera_on_usb_whose_cable_is_pulled(tmp_path: Path) -> None:
     stage = prepare_mini(tmp_path)
     tether(stage)
-    (stage / FILE).write_text('[[device]]\nname = "camera"\nkind = "stage-camera"\n')
+    (stage / USB_FILE).write_text('[[device]]\nname = "camera"\nkind = "stage-camera"\n')
     script = tmp_path / "cable.toml"
     events = (f'[[event]]\ndo = "unplug"\ndevice = "camera"\nat_s = {at_s}\nfor_s = 0.5\n' for at_s in PULLED_AT_S)
     script.write_text("".join(events))

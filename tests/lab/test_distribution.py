@@ -10,6 +10,8 @@ import pytest
 
 from controller import __main__ as shell
 from controller.cli import groups
+from hal.errors import DeviceError
+from plugins.emulated.core import extensions
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "lab" / "pyproject.toml").read_text())
@@ -25,6 +27,15 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert PROJECT["project"]["version"] == version
     assert all(requirement.endswith(f"=={version}") for requirement in PROJECT["project"]["dependencies"])
+
+
+@pytest.mark.parametrize("part", ["usb", "mitsuba"])
+def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert EntryPoint(part, PROJECT["project"]["entry-points"][extensions.GROUP][part], extensions.GROUP).load()
+    monkeypatch.setattr(extensions, "entry_points", lambda group, name: ())
+    with pytest.raises(DeviceError, match="needs the distribution velatura-lab") as refused:
+        extensions.extension(part, asked_by="This stage")
+    assert refused.value.code == "bench-part-missing"
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, commands: dict[str, str]) -> None:

@@ -14,10 +14,10 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
+from lab.emulated.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.boards import BOARDS, login_of, quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.network import GATES, EmulatedNetworkProjector
-from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.network.driver import open_network_projector
 from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector

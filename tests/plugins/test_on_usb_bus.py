@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.usb.bus import PRELOAD, environment
+from lab.emulated.usb.bus import PRELOAD, environment
 
 FOLDER = Path(__file__).parent / "on_usb_bus"
 ROOT = FOLDER.parents[2]

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from plugins.emulated.usb.device import INTERRUPT, Endpoint, Stall, UsbNames
-from plugins.emulated.usb.hid import FEATURE, EmulatedHidDevice
+from lab.emulated.usb.device import INTERRUPT, Endpoint, Stall, UsbNames
+from lab.emulated.usb.hid import FEATURE, EmulatedHidDevice
 
 _REPORTS: Final = (0x02, 0x03, 0x04, 0x05, 0x06, 0x20)
 _CONFIG, _GET, _SET, _VERSION, _SMBUS, _LOCK = _REPORTS

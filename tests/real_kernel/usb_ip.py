@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import Final
 
-from plugins.emulated.usb.device import EmulatedUsbDevice, SetupPacket, Stall
+from lab.emulated.usb.device import EmulatedUsbDevice, SetupPacket, Stall
 
 _HOST: Final = Path("/sys/devices/platform/vhci_hcd.0")
 _HIGH_SPEED: Final = 3

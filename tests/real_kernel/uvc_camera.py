@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from plugins.emulated.usb.device import BULK, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
+from lab.emulated.usb.device import BULK, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 
 WIDTH, HEIGHT = 64, 48
 INTERVAL_S: Final = 0.1

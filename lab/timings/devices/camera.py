@@ -18,9 +18,9 @@ from typing import Any
 from hal.codecs.ptp import ip as ptp_ip
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp.values import parse_handles
+from lab.emulated.usb.bus import environment
 from lab.timings import Row, at_least, at_most, timed
 from lab.timings.tools.synthetic import CAMERA
-from plugins.emulated.usb.bus import environment
 
 FLAVOURS = ("generic", "eos-new", "eos-old")
 SMALL_FILE = 4096

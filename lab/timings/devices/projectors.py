@@ -12,9 +12,9 @@ from hal.codecs.projectors.serial_protocol import query_bytes
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
+from lab.emulated.pjlink import EmulatedPjLinkProjector
 from lab.timings import Row, Timing, at_most, timed
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.profile_files import load_profile

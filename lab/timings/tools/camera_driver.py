@@ -19,8 +19,8 @@ from statistics import median
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
+from lab.emulated.usb.process import UsbBusProcess
 from lab.timings import timed
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.ptp.camera import open_camera
 
 EXPOSURE_S = 1 / 30

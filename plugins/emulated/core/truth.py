@@ -63,6 +63,7 @@ Three: TypeAlias = tuple[float, float, float]
 Matrix: TypeAlias = tuple[Three, Three, Three]
 FILE_NAME: Final = "bench.toml"
 FOLDER: Final = "bench"
+USB_FILE: Final = f"{FOLDER}/usb.toml"
 ENGINES: Final = ("direct", "radiosity", "mitsuba")
 """Of light between surfaces."""
 

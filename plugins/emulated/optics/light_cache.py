@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from hal.runtime.caches import cache_folder
 
@@ -23,6 +24,7 @@ MOST_BYTES: Final = 3 << 30
 """Of all kept files together. The newest one is kept, whatever its size."""
 UNFINISHED_S: Final = 3600.0
 """A file that was not finished for longer than this is of a bench that was killed."""
+_PARTS: Final = ("data", "indices", "indptr", "shape")
 
 
 def light_folder(otherwise: Path) -> Path:
@@ -72,6 +74,17 @@ def write_arrays(folder: Path, kind: str, key: str, arrays: Mapping[str, npt.NDA
             _remove_oldest(folder, path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def sparse_arrays(name: str, matrix: sparse.csr_matrix) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a sparse matrix, from which ``sparse_matrix`` makes it again."""
+    return {f"{name}_{part}": np.asarray(getattr(matrix, part)) for part in _PARTS}
+
+
+def sparse_matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> sparse.csr_matrix:
+    """Raises ValueError or KeyError where ``arrays`` has no such matrix."""
+    data, indices, starts, shape = (arrays[f"{name}_{part}"] for part in _PARTS)
+    return sparse.csr_matrix((data, indices, starts), shape=tuple(shape))
 
 
 def _path(folder: Path, kind: str, key: str) -> Path:

@@ -9,8 +9,8 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.finding import Found, Known, SearchScope
+from lab.emulated.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.finding import network
 
 

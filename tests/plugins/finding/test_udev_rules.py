@@ -14,10 +14,10 @@ from StreamDeck.ProductIDs import USBVendorIDs
 
 from hal.codecs import hid as hid_reports
 from hal.codecs.ptp.usb import STILL_IMAGE_CLASS
-from plugins.emulated.usb.bus import UsbBus
-from plugins.emulated.usb.camera import numbered_camera
-from plugins.emulated.usb.device import EmulatedUsbDevice, UsbNames
-from plugins.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
+from lab.emulated.usb.bus import UsbBus
+from lab.emulated.usb.camera import numbered_camera
+from lab.emulated.usb.device import EmulatedUsbDevice, UsbNames
+from lab.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
 from plugins.finding import hid, serial_ports, usb_cameras
 from tests.plugins.finding.udev_rules import Given, Part, given, parse
 

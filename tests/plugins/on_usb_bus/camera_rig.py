@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from hal.deadline import in_seconds
+from lab.emulated.usb.camera import numbered_files
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.core.shot import ShotSettings
-from plugins.emulated.usb.camera import numbered_files
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.ptp.still import PtpCamera
 from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 from tests.plugins.ptp.ptp_rig import FLAVOURS, PATIENT, SHORT

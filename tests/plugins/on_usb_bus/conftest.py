@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 
 collect_ignore_glob = [] if "UMOCKDEV_DIR" in os.environ else ["test_*.py"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plugins.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
+from lab.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 
 
 class EchoDevice(EmulatedUsbDevice):

@@ -10,7 +10,7 @@ import pytest
 from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.ptp.camera import open_camera
 from plugins.ptp.still import PtpCamera
 from tests.plugins.on_usb_bus.camera_rig import bus, lasting_bus

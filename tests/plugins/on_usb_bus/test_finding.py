@@ -11,7 +11,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.finding import Found, SearchScope
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.finding import access, hid, usb_cameras
 
 

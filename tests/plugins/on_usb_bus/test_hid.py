@@ -17,8 +17,8 @@ from controller.stage.rig.ambient_light import AmbientLightLimit
 from hal.conformance import LightSensorConformance, PowerSwitchConformance
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.bench import EmulatedBench
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.hid.light_sensor import ColorHugLightSensor
 from plugins.hid.link import BACKENDS
 from plugins.hid.relay import RelayBoard

@@ -19,7 +19,7 @@ from controller.stage.rig.key_panel import KeyService, key_picture, technicians_
 from hal.conformance import ButtonPanelConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.hid import stream_deck
 from plugins.hid.stream_deck import StreamDeckPanel
 

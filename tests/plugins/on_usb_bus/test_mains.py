@@ -15,12 +15,12 @@ from controller.stage.rig.power import Circuit, close_circuits, light, open_circ
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused
 from hal.registry import OpenContext
+from lab.emulated.usb.mains import Mains
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.core.truth import MainsTruth
 from plugins.emulated.projectors.boards import quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
-from plugins.emulated.usb.mains import Mains
-from plugins.emulated.usb.process import UsbBusProcess
 from plugins.hid.relay import RelayBoard
 from plugins.projectors.serial import open_serial_projector
 from tests.controller.stage.rig.lamp_model import Shelf

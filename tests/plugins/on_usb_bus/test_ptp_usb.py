@@ -10,7 +10,7 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.ptp.body import PictureStorage
 from plugins.ptp.camera import open_camera
 from plugins.ptp.usb.bus import UsbAddress, UsbFinder, usb_cameras

@@ -12,7 +12,7 @@ import pytest
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout
 from hal.values import ExposureSettings
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from plugins.ptp.still import PtpCamera
 from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 from tests.plugins.on_usb_bus.camera_rig import Rig, bus, lasting_bus, rig, running

@@ -12,7 +12,7 @@ import pytest
 import usb.core
 import usb.util
 
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 
 ECHO = "tests.plugins.on_usb_bus.echo:EchoDevice"
 VENDOR_OUT, VENDOR_IN = 0x40, 0xC0

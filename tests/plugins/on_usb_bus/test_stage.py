@@ -14,7 +14,7 @@ from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession, StageWork
 from hal.errors import DeviceRefused
 from hal.registry import Drivers, load_drivers
-from plugins.emulated.usb.process import UsbBusProcess
+from lab.emulated.usb.process import UsbBusProcess
 from tests.controller.stage.sessions.run_models import STAGE, Models
 
 TABLES = """

@@ -9,9 +9,9 @@ patch as diffuse light does, so no separate test of visibility is needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numba
 import numpy as np
@@ -21,6 +21,7 @@ from scipy import sparse
 from hal.runtime.jit import compiled
 from plugins.emulated.core.truth import BenchTruth, CameraTruth, ProjectorTruth
 from plugins.emulated.optics.indirect.patches import CLEAR_M, Hits, Patches, patches_of
+from plugins.emulated.optics.light_cache import sparse_arrays, sparse_matrix
 from plugins.emulated.optics.objects import Scene
 from plugins.emulated.optics.rays import Progress, directions
 
@@ -122,6 +123,19 @@ class Transfer:
             if image is not None:
                 direct += self.direct(index, image)
         return self.returned(direct)
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """See ``transfers.LightTransfer``."""
+        arrays = {"projectors": np.array(len(self.arrive)), "back": self.back, "cells": self.cells}
+        for n, matrix in enumerate(self.arrive):
+            arrays |= sparse_arrays(f"arrive{n}", matrix)
+        return arrays | sparse_arrays("blend", self.blend)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """See ``transfers.LightTransfer``."""
+        arrive = tuple(sparse_matrix(arrays, f"arrive{n}") for n in range(int(arrays["projectors"])))
+        return cls(arrive, arrays["back"], arrays["cells"], sparse_matrix(arrays, "blend"))
 
     def direct(self, projector: int, emitted: FloatImage) -> FloatImage:
         """Irradiance (L, 3) on the patches of what a projector's pixels (rows, columns, 3) send out."""

@@ -14,8 +14,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hal.errors import DeviceError
+from lab.emulated.paths import traced_transfer
 from plugins.emulated.core.truth import BenchTruth
-from plugins.emulated.optics.indirect.paths import traced_transfer
 from plugins.emulated.optics.indirect.radiosity import scattering_of, transfer_of
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.objects import StageObject

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from hal.errors import DeviceError
+from lab.emulated.usb.bench import UsbDeviceTruth
+from lab.emulated.usb.mains import check_mains
 from plugins.emulated.core.truth import BenchTruth, MainsTruth, read_truth, write_truth
-from plugins.emulated.usb.bench import UsbDeviceTruth
-from plugins.emulated.usb.mains import boot_times, check_mains
 
 BOARD = UsbDeviceTruth("cupboard", "relay", channels=2)
 LIGHT = UsbDeviceTruth("dark", "light")
@@ -23,7 +23,6 @@ def test_it_is_kept_in_bench_toml(tiny_truth: BenchTruth, tmp_path: Path) -> Non
         write_truth(tmp_path, truth)
         assert read_truth(tmp_path) == truth
     check_mains(mains, tiny_truth.projectors, (BOARD, LIGHT))
-    assert boot_times(mains) == {"left": 12.0, "right": 12.0, "above": 0.0}
 
 
 @pytest.mark.parametrize(

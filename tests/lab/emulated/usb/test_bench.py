@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from hal.errors import DeviceError
-from plugins.emulated.usb.bench import FILE, UsbDevices, read_usb
+from lab.emulated.usb.bench import UsbDevices, read_usb
+from plugins.emulated.core.truth import USB_FILE
 
 USB = """
 [[device]]
@@ -31,8 +32,8 @@ print(sorted(one["product_string"] for one in hid.enumerate()))
 
 
 def written(folder: Path, text: str) -> Path:
-    (folder / FILE).parent.mkdir(parents=True, exist_ok=True)
-    (folder / FILE).write_text(text)
+    (folder / USB_FILE).parent.mkdir(parents=True, exist_ok=True)
+    (folder / USB_FILE).write_text(text)
     return folder
 
 

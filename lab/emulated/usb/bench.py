@@ -16,13 +16,12 @@ from typing import Annotated, Any, Final, Self
 from hal.errors import DeviceError
 from hal.runtime.caches import SHORTEST, temporary
 from hal.runtime.files import read_text
+from lab.emulated.usb.bus import PRELOAD, environment
+from lab.emulated.usb.camera import STAGE_CAMERA
+from lab.emulated.usb.process import KINDS, UsbBusProcess
 from plugins.emulated.core.tables import Between, load
-from plugins.emulated.core.truth import FOLDER
-from plugins.emulated.usb.bus import PRELOAD, environment
-from plugins.emulated.usb.camera import STAGE_CAMERA
-from plugins.emulated.usb.process import KINDS, UsbBusProcess
+from plugins.emulated.core.truth import USB_FILE
 
-FILE: Final = f"{FOLDER}/usb.toml"
 _SETTINGS: Final[Mapping[str, tuple[str, ...]]] = {
     "relay": ("serial", "channels"),
     "light": ("serial", "lux"),
@@ -56,7 +55,7 @@ class UsbTruth:
 
 def read_usb(stage: Path) -> tuple[UsbDeviceTruth, ...]:
     """The USB devices of a stage; none without the file. Raises DeviceError as ``tables.load``, or "usb-kind"."""
-    path = stage / FILE
+    path = stage / USB_FILE
     if not path.exists():
         return ()
     try:
@@ -87,7 +86,7 @@ def read_usb(stage: Path) -> tuple[UsbDeviceTruth, ...]:
 class UsbDevices:
     """The bus with its devices plugged in, in a process of its own; a context.
 
-    ``stage_camera``: what ``usb_stage_camera.Exposures.camera`` tells, for the device that is one;
+    ``stage_camera``: what ``camera.ExposureServer.camera`` tells, for the device that is one;
     ``environment``: variables that a program needs to see them. Raises DeviceError
     ("usb-no-preload") where the preload library is missing.
     """

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection, Listener
 from typing import Any, Final, Self
 
+from lab.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 from plugins.emulated.cameras.body import CameraNames, EmulatedBody
 from plugins.emulated.cameras.camera import BODIES, Flavour
 from plugins.emulated.cameras.wire import BUSY, OK, Gone, PtpOutcome
 from plugins.emulated.core.faults import FaultCounts
 from plugins.emulated.core.shot import Expose, ShotFiles, ShotSettings
 from plugins.emulated.core.truth import CameraTruth
-from plugins.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 
 IN, OUT, EVENTS = 0x81, 0x02, 0x83
 _PACKET: Final = 512

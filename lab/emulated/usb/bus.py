@@ -39,10 +39,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Self
 
-from plugins.emulated.usb.device import EmulatedUsbDevice
-from plugins.emulated.usb.files import Plugged
-from plugins.emulated.usb.hid import EmulatedHidDevice, HidrawFile
-from plugins.emulated.usb.umockdev_server import CallFailed, Node, OpenFile, UmockdevServer
+from lab.emulated.usb.device import EmulatedUsbDevice
+from lab.emulated.usb.files import Plugged
+from lab.emulated.usb.hid import EmulatedHidDevice, HidrawFile
+from lab.emulated.usb.umockdev_server import CallFailed, Node, OpenFile, UmockdevServer
 
 _HUB: Final = "sys/devices/pci0000:00/0000:00:14.0/usb1"
 _MAGIC: Final = 0xFEEDCAFE

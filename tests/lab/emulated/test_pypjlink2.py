@@ -11,8 +11,8 @@ from pypjlink import MUTE_VIDEO
 from pypjlink import Projector as PyPjLink
 from pypjlink.projector import ProjectorError
 
+from lab.emulated.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector
 
 
 @contextlib.contextmanager

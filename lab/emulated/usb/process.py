@@ -1,7 +1,7 @@
 """The emulated USB bus as a process of its own, and the handle that starts and commands it.
 
 The bus must not live in the process that uses it: hidapi waits while it holds Python's interpreter lock. Commands and
-answers are lines of JSON on the child's standard input and output: ``python -m plugins.emulated.usb.process DIR``.
+answers are lines of JSON on the child's standard input and output: ``python -m lab.emulated.usb.process DIR``.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from lab.emulated.usb.bus import UsbBus
+from lab.emulated.usb.camera import STAGE_CAMERA, numbered_camera, stage_camera
+from lab.emulated.usb.device import EmulatedUsbDevice
+from lab.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
 from plugins.emulated.core.faults import ACTIONS, LAMP_ACTIONS, Scenario, ScenarioPlayer, parse_scenario
-from plugins.emulated.usb.bus import UsbBus
-from plugins.emulated.usb.camera import STAGE_CAMERA, numbered_camera, stage_camera
-from plugins.emulated.usb.device import EmulatedUsbDevice
-from plugins.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
 
 USB_ACTIONS: Final = tuple(deed for deed in ACTIONS if deed not in LAMP_ACTIONS)
 """Those of ``faults.ACTIONS`` that can happen to a USB device."""

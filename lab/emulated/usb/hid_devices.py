@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from plugins.emulated.usb.device import INTERRUPT, Endpoint, Stall, UsbNames
-from plugins.emulated.usb.hid import FEATURE, INPUT, OUTPUT, EmulatedHidDevice
+from lab.emulated.usb.device import INTERRUPT, Endpoint, Stall, UsbNames
+from lab.emulated.usb.hid import FEATURE, INPUT, OUTPUT, EmulatedHidDevice
 
 _ON, _OFF, _ALL_ON, _ALL_OFF, _SET_SERIAL = 0xFF, 0xFD, 0xFE, 0xFC, 0xFA
 _SERIAL_LENGTH: Final = 5

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from plugins.emulated.usb.device import INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
-from plugins.emulated.usb.umockdev_server import CallFailed, Memory
+from lab.emulated.usb.device import INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
+from lab.emulated.usb.umockdev_server import CallFailed, Memory
 
 INPUT, OUTPUT, FEATURE = 1, 2, 3
 _GET_REPORT, _SET_REPORT, _SET_IDLE = 1, 9, 10

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from plugins.emulated.usb.device import EmulatedUsbDevice, SetupPacket, Stall
-from plugins.emulated.usb.umockdev_server import CallFailed, Memory
+from lab.emulated.usb.device import EmulatedUsbDevice, SetupPacket, Stall
+from lab.emulated.usb.umockdev_server import CallFailed, Memory
 
 
 class _Call(enum.IntEnum):

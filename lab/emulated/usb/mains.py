@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from hal.errors import DeviceError
+from lab.emulated.usb.bench import UsbDeviceTruth
 from plugins.emulated.core.servers import BackgroundDevice
-from plugins.emulated.core.truth import FILE_NAME, MainsTruth, ProjectorTruth
+from plugins.emulated.core.truth import FILE_NAME, USB_FILE, MainsTruth, ProjectorTruth
 from plugins.emulated.projectors.projector import BoardProjector
-from plugins.emulated.usb.bench import FILE, UsbDeviceTruth
 
 _TICK_S: Final = 0.02
 Moves = Callable[[str, int], Sequence[tuple[int, bool]]]
@@ -76,16 +76,11 @@ def check_mains(
     for number, one in enumerate(circuits, start=1):
         place = (one.relay, one.channel)
         if one.channel > boards.get(one.relay, 0):
-            raise _wrong(number, f"{FILE} has no relay {one.channel} of a board {one.relay!r}")
+            raise _wrong(number, f"{USB_FILE} has no relay {one.channel} of a board {one.relay!r}")
         if place in wired or not names.issuperset(one.feeds) or not fed.isdisjoint(one.feeds):
             raise _wrong(number, "a relay or a projector is wired twice, or a projector does not exist")
         wired.add(place)
         fed.update(one.feeds)
-
-
-def boot_times(circuits: Sequence[MainsTruth]) -> dict[str, float]:
-    """Seconds that each projector behind a relay takes to boot."""
-    return {name: one.boot_s for one in circuits for name in one.feeds}
 
 
 def _wrong(number: int, why: str) -> DeviceError:

@@ -11,10 +11,10 @@ its process.
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from scipy import sparse
 
 from hal.errors import DeviceError
 from plugins.emulated.core.truth import BenchTruth
+from plugins.emulated.optics.light_cache import sparse_arrays, sparse_matrix
 from plugins.emulated.optics.objects import Scene, StageObject, scene_of
 from plugins.emulated.optics.rays import SHADOW_BIAS_M, Progress, arriving, directions
 
@@ -169,6 +170,30 @@ class TracedTransfer:
                     cells[:, channel] += part @ means[:, channel]
         return np.asarray(self.blend @ cells, dtype=np.float32)
 
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """See ``plugins.emulated.optics.indirect.transfers.LightTransfer``."""
+        arrays = {"group": np.array(self.group)}
+        for n, part in enumerate(self.parts):
+            for channel, matrix in enumerate(part):
+                arrays |= sparse_arrays(f"part{n}{channel}", matrix)
+        return arrays | sparse_arrays("blend", self.blend)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """As above."""
+        group = tuple(int(side) for side in arrays["group"])
+        parts = tuple(
+            tuple(sparse_matrix(arrays, f"part{n}{channel}") for channel in range(3)) for n in range(len(group))
+        )
+        return cls(parts, group, sparse_matrix(arrays, "blend"))
+
+    @classmethod
+    def work_out(
+        cls, truth: BenchTruth, thing: StageObject, pixels: npt.NDArray[np.int32], progress: Progress
+    ) -> TracedTransfer:
+        """As ``trace``, in a process of its own. Raises DeviceError ``engine-missing``, ``engine-failed``."""
+        return traced_transfer(truth, thing, pixels, progress)
+
 
 def grouped(image: FloatImage, side: int) -> FloatImage:
     """(groups, 3): the means of ``side`` x ``side`` pixels; at the right and lower edge of those that are left."""
@@ -182,7 +207,7 @@ def grouped(image: FloatImage, side: int) -> FloatImage:
 def trace(truth: BenchTruth, thing: StageObject, pixels: npt.NDArray[np.int32], progress: Progress) -> TracedTransfer:
     """Trace ``truth.paths`` paths from each cell; ``pixels``: ``Samples.pixels``.
 
-    Use ``tracing.traced_transfer``, which does this in a process of its own. Raises DeviceError ``engine-missing``.
+    Use ``traced_transfer``, which does this in a process of its own. Raises DeviceError ``engine-missing``.
     """
     scene = scene_of(thing, truth.surfaces)
     rng = np.random.default_rng([truth.seed, 6])
@@ -319,7 +344,7 @@ POLL_S: Final = 0.5
 def traced_transfer(
     truth: BenchTruth, thing: StageObject, pixels: npt.NDArray[np.int32], progress: Progress
 ) -> TracedTransfer:
-    """As ``traced.trace``. Raises DeviceError ``engine-missing``, ``engine-failed``."""
+    """As ``trace``. Raises DeviceError ``engine-missing``, ``engine-failed``."""
     ours, theirs = multiprocessing.Pipe()
     process = multiprocessing.get_context("spawn").Process(
         target=_run, args=(theirs, truth, thing, pixels), daemon=True
@@ -350,6 +375,3 @@ def _run(parent: Connection, truth: BenchTruth, thing: StageObject, pixels: npt.
         parent.send(trace(truth, thing, pixels, parent.send))
     except DeviceError as error:
         parent.send({"code": error.code, "what": error.what, "remedy": error.remedy})
-
-
-__all__ = ["traced_transfer"]

@@ -1,0 +1,26 @@
+"""Parts of the bench that other distributions bring, by the entry-point group ``velatura.bench``.
+
+``usb``: what ``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``); ``mitsuba``: an engine of indirect light
+(``plugins.emulated.optics.indirect.transfers.LightTransfer``). Both are in velatura-lab.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+from hal.errors import DeviceError
+
+GROUP: Final = "velatura.bench"
+
+
+def extension(name: str, *, asked_by: str) -> Any:
+    """The class of this name. ``asked_by``: what in a stage needs it. Raises DeviceError ``bench-part-missing``."""
+    for entry in entry_points(group=GROUP, name=name):
+        return entry.load()
+    raise DeviceError(
+        "bench-part-missing",
+        what=f"{asked_by} needs the distribution velatura-lab, which is not installed.",
+        remedy="Run `pip install velatura-lab` in Velatura's environment, "
+        "or `pip install --editable lab` in a copy of the source.",
+    )
