@@ -350,6 +350,8 @@ class Service:
         return KeysSupervisor(table.driver, opened, presses, lambda: self.reconciler.machine.state, self.log.add)
 
     def _recalibrate(self) -> None:
-        # The log has the refusal; a key can't show it.
-        with contextlib.suppress(WorkError):
+        try:
             self.reconciler.submit(Request("quick", light=True))
+        except WorkError as error:
+            # A key can't show it.
+            self.log.add(Notice("refused", f"Key panel: Quick recalibration. Refused: {error.what}", "", Level.WARNING))

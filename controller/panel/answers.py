@@ -17,7 +17,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.operations.fields import Sent, Values, parse
-from controller.kiosk.operations.operation import Answer, Effect, Operation
+from controller.kiosk.operations.operation import Answer, Operation
 from controller.panel.context import Panel
 from hal.errors import DeviceError
 
@@ -52,16 +52,14 @@ def failure(error: Failure) -> Response:
 async def run(panel: Panel, operation: Operation, values: Values, who: str) -> Any:
     """Run an operation in a thread; keys of uploaded targets become their files. Raises what it raises.
 
-    The event log has ``who`` asked for it, unless it only looks.
+    The event log has who did it, and what was refused, unless it only looks.
     """
     targets = [field.name for field in operation.fields if field.sent is Sent.TARGET]
 
     def do() -> Any:
-        if operation.effect is not Effect.LOOKS:
-            # Before, because some of them end the log's service.
-            panel.kiosk.record("done-by", operation.done_by(who, values))
-        files = {name: panel.targets.path(values[name]) for name in targets}
-        return operation.function(panel.holders[operation.holder], **values | files)
+        with operation.logged(panel.kiosk.record, who, values):
+            files = {name: panel.targets.path(values[name]) for name in targets}
+            return operation.function(panel.holders[operation.holder], **values | files)
 
     return await panel.in_thread(do)
 

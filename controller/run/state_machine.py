@@ -72,6 +72,10 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.PLAYING, Event.DEGRADE): State.DEGRADED,
     (State.DEGRADED, Event.RECOVERED): State.READY,
     (State.DEGRADED, Event.RECALIBRATE): State.CALIBRATING,
+    # Every lamp is dark, and comes again.
+    (State.READY, Event.START): State.POWERING,
+    (State.PLAYING, Event.START): State.POWERING,
+    (State.DEGRADED, Event.START): State.POWERING,
     # Stopping is allowed in every state with a lit lamp, and always leads to cooling.
     (State.POWERING, Event.STOP): State.COOLING,
     (State.WARMING, Event.STOP): State.COOLING,

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,13 +22,14 @@ from controller.kiosk.operations.accounts import Accounts
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.schedule import check_schedule, expanded
+from controller.kiosk.state import EventLevel
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
 from controller.run.progress import Phase, Progress, Reporter
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Cancelled
-from hal.notices import Notice
+from hal.notices import Level, Notice
 
 LEVELS: Final = ("info", "warning", "error")
 LONG_S: Final = 600.0
@@ -47,14 +49,15 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
         return plain(operation.function(_holder(operation, folder), **values))
     # A starting kiosk reads these files before it answers, and would miss a change.
     with stage_lock(folder):
-        _record(folder, operation.done_by(f"User {user_name(os.getuid())}, while no kiosk ran", values))
-        return plain(operation.function(_holder(operation, folder), **values))
+        who = f"User {user_name(os.getuid())}, while no kiosk ran"
+        with operation.logged(partial(_record, folder), who, values):
+            return plain(operation.function(_holder(operation, folder), **values))
 
 
-def _record(folder: Path, text: str) -> None:
-    """Add a line to the event log, as a running kiosk does before it changes something."""
+def _record(folder: Path, code: str, text: str, level: EventLevel) -> None:
+    """Add a line to the event log, as a running kiosk does."""
     with contextlib.closing(EventLog(folder / EventLog.FILE)) as log:
-        log.add(Notice("done-by", text))
+        log.add(Notice(code, text, "", Level(level)))
 
 
 def _holder(operation: Operation, folder: Path) -> object:

@@ -120,8 +120,8 @@ class Verbs:
         values = self.values(verb, sent)
         self._rates.take(source)
         named = f"{self._who} ({source})" if source else self._who
-        self._kiosk.record("done-by", operation.done_by(named, values))
-        operation.function(self._kiosk, **values)
+        with operation.logged(self._kiosk.record, named, values):
+            operation.function(self._kiosk, **values)
 
     def subscribe(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Call ``callback`` (quick, from any thread) after every change of the state; returns what ends that."""

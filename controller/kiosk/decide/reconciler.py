@@ -55,6 +55,10 @@ class ContentSelector:
         self._empty = wanted and not installed
         return wanted and installed
 
+    def picture(self, plan: Plan) -> str:
+        """The appearance that is wanted now, or first; the same while it is black. Empty if nothing is installed."""
+        return self._wanted(self._chosen(plan)).appearance
+
     def of(self, plan: Plan, missing: frozenset[str]) -> Showing:
         """What to show without the projectors ``missing``; missing frames are requested once per bundle."""
         live = self._live.now
@@ -216,7 +220,7 @@ class Reconciler:
         with self._lock:
             if on:
                 self._require_open()
-            self._live.change(black=on, fade_s=fade_s)
+            self._live.change(black=on, first=self._first(), fade_s=fade_s)
 
     def pause(self, on: bool) -> None:
         """Stay at the present appearance, or continue from there. Raises WorkError("nothing-plays")."""
@@ -228,10 +232,12 @@ class Reconciler:
         """Show this share of the light, until the stage closes. Raises WorkError("nothing-plays") while closed."""
         with self._lock:
             self._require_open()
-            shown = self._player.view.shown
-            # A list starts again with another brightness; it continues where it is.
-            first = self._live.now.first if shown is None or not shown.appearance else shown.appearance
-            self._live.change(brightness=round(share, 3), first=first, fade_s=BRIGHTNESS_FADE_S)
+            self._live.change(brightness=round(share, 3), first=self._first(), fade_s=BRIGHTNESS_FADE_S)
+
+    def _first(self) -> str:
+        """Where a list continues that starts again: with another brightness, or after black."""
+        shown = self._player.view.shown
+        return self._live.now.first if shown is None or not shown.appearance else shown.appearance
 
     def _require_open(self) -> None:
         if not self.overrides.open(self._plan):
@@ -241,10 +247,10 @@ class Reconciler:
         self._require_open()
         shown = self._player.view.shown
         if self._live.now.held or shown is None or not shown.appearance:
-            wanted = self._content.of(self._plan, frozenset())
-            if not (self._live.now.held or wanted.appearance):
+            name = self._live.now.held or self._content.picture(self._plan)
+            if not name:
                 raise _nothing_plays()
-            return self._live.now.held or wanted.appearance
+            return name
         return shown.appearance
 
     def light_for(self, seconds: float, *, closed_too: bool = False) -> None:

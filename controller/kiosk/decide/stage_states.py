@@ -44,6 +44,7 @@ class StageStates:
         self.missing = frozenset[str]()
         self._since_s = monotonic()
         self._attempts, self._silent = 0, frozenset[str]()
+        self._retry = False
 
     def follow(self, views: Sequence[ProjectorView], player: Notice | None, need: LightNeed) -> None:
         """Change to the next state if the devices or ``need`` ask for it. ``player``: the player's problem."""
@@ -52,6 +53,8 @@ class StageStates:
             if need.light:
                 self.go(Event.START, "light is needed")
         elif state is State.COOLING:
+            if need.light:
+                self.machine.explain("It opens when the lamps have cooled.")
             self._cool(views)
         elif state is State.FAULT:
             self._recover(views, need.light)
@@ -84,8 +87,9 @@ class StageStates:
         if player is not None:
             reasons = f"{player.what} {reasons}".strip()
         self.missing = frozenset(view.name for view in views if not view.shines)
-        if not shining and not any(view.coming for view in views):
-            self.go(Event.FAIL, reasons or "No lamp gives light.")
+        if not shining:
+            coming = any(view.coming for view in views)
+            self.go(Event.START if coming else Event.FAIL, reasons or "No lamp gives light.")
         elif state is State.DEGRADED:
             if not reasons and not self.missing:
                 self.go(Event.RECOVERED, "every projector gives light again")
@@ -113,8 +117,10 @@ class StageStates:
                 self.go(Event.STOP, "closed")
         elif self._answers_again(views):
             self.go(Event.START, f"a projector answers again. Before: {self.machine.reason}")
-        elif any(view.condition is Condition.LIT for view in views) or self._waited(
-            RETRY_S[min(self._attempts, len(RETRY_S) - 1)]
+        elif (
+            self._retry
+            or any(view.condition is Condition.LIT for view in views)
+            or self._waited(RETRY_S[min(self._attempts, len(RETRY_S) - 1)])
         ):
             self._attempts += 1
             # Lamps take minutes, and until then people ask why it is dark.
@@ -130,12 +136,12 @@ class StageStates:
         return self._monotonic() - self._since_s >= seconds
 
     def retry_now(self) -> None:
-        """Leave FAULT at the next step, whatever is left of its waiting time."""
-        self._since_s = min(self._since_s, self._monotonic() - RETRY_S[-1])
+        """Leave FAULT at the next step, whatever is left of its waiting time. No other state has anything to retry."""
+        self._retry = self.machine.state is State.FAULT
 
     def go(self, event: Event, reason: str) -> None:
         """Raises as ``Machine.handle``."""
-        self._since_s, self._silent = self._monotonic(), frozenset()
+        self._since_s, self._silent, self._retry = self._monotonic(), frozenset(), False
         self.machine.handle(event, reason)
         if event in (Event.PLAY, Event.COOLED):
             self._attempts = 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.kiosk.operations.fields import Values, parse
-from controller.kiosk.operations.operation import Effect, Operation
+from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import AT_SOCKET
 
 CALLER: Final = ContextVar("CALLER", default="unknown")
@@ -40,9 +40,10 @@ def _bound(operation: Operation, holder: Any, kiosk: Any) -> Callable[..., Any]:
 
     def call(*arguments: Any, **sent: Any) -> Any:
         values = local_values(operation, dict(zip(names, arguments, strict=False)) | sent)
-        if operation.effect is not Effect.LOOKS and kiosk is not None:
-            kiosk.record("done-by", operation.done_by(f"User {CALLER.get()}", values))
-        return operation.function(holder, **values)
+        if kiosk is None:
+            return operation.function(holder, **values)
+        with operation.logged(kiosk.record, f"User {CALLER.get()}", values):
+            return operation.function(holder, **values)
 
     return call
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,8 +14,12 @@ from typing import Annotated, Any, Final, Literal, get_type_hints
 
 from controller.kiosk.operations.fields import Field, Sent, Values
 from controller.kiosk.roles import Role
+from controller.kiosk.state import EventLevel
+from hal.errors import CodedError
 
 Where = Literal["body", "path", "query"]
+Record = Callable[[str, str, EventLevel], object]
+"""Adds a line to the event log: code, text, level."""
 
 
 class Effect(enum.Enum):
@@ -181,10 +186,25 @@ class Operation:
         """``done``, with the values in it."""
         return self.done.format_map(values)
 
-    def done_by(self, who: str, values: Values) -> str:
-        """A line for the event log; it has names, and no other values."""
+    @contextlib.contextmanager
+    def logged(self, record: Record, who: str, values: Values) -> Iterator[None]:
+        """Log that ``who`` did it, once it is done, or that it was refused; nothing if it only looks. The line has
+        names, and no other values.
+        """
         named = ", ".join(str(values[key]) for key in ("name", "projector", "role", "kind") if values.get(key))
-        return f"{who}: {self.about} ({named})." if named else f"{who}: {self.about}."
+        line = f"{who}: {self.about} ({named})." if named else f"{who}: {self.about}."
+        changes = self.effect is not Effect.LOOKS
+        try:
+            yield
+        except Exception as error:
+            if changes:
+                reason = (
+                    error.what if isinstance(error, CodedError) else f"An unexpected error ({type(error).__name__})."
+                )
+                record("refused", f"{line} Refused: {reason}", "warning")
+            raise
+        if changes:
+            record("done-by", line, "info")
 
 
 _PLAIN: Final = Names()

@@ -177,6 +177,7 @@ class Entrance:
         try:
             await anyio.to_thread.run_sync(change, limiter=self._panel.hashing)
         except UsageError as error:
+            self._panel.kiosk.record("refused", f"{visitor.name}: {about}. Refused: {error.what}", "warning")
             if typed is not None:
                 return await self._again(visitor, error, typed)
             return await self._redirect(visitor, "/accounts", "error", f"{error.what} {error.remedy}")

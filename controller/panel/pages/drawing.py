@@ -51,7 +51,7 @@ def flags(state: KioskState) -> frozenset[str]:
         "open": state.state in OPEN, "closed": state.state in CLOSED, "busy": busy, "stops": stops,
         "set-up": not state.needs_setup, "calibrated": any(grade.kept for grade in state.grades),
         "playable": state.bundle is not None, "identifying": state.identifying, "in-turn": state.in_turn,
-        "failed": bool(state.failures), "plays": state.state in PLAYS and bool(state.playing),
+        "failed": bool(state.failures), "plays": state.state in PLAYS and (bool(state.playing) or state.black),
         "black": state.black, "paused": state.paused,
         "made": made and state.job is not None and state.job.appearance != state.playing,
     }  # fmt: skip

@@ -53,6 +53,7 @@ VALUES: Final = (
 REASONS: Final = (
     _("The stage is not set up yet."), _("No lamp gives light."), _("No lamp gave light in time."),
     _("It starts when the lamps are lit and steady."), _("The stage is recalibrated."),
+    _("It opens when the lamps have cooled."),
     _("Nothing has moved or dimmed since the calibration."),
 )  # fmt: skip
 SOURCES: Final = {

@@ -290,6 +290,29 @@ class Contract:
         assert math.isfinite(state.since_unix_s)
         assert all(math.isfinite(lamp.hours) for lamp in state.lamps)
 
+    def test_black_shows_nothing_and_has_ways_back(self, stage: Stage) -> None:
+        def after(op: str, **sent: Any) -> tuple[bool, bool, str]:
+            ask(stage, op, sent)
+            stage.settle()
+            now = stage.kiosk.snapshot()
+            return now.black, now.paused, now.playing
+
+        assert after("play", name=PLAYING) == (False, False, PLAYING)
+        assert after("black", on=True) == (True, False, "")
+        assert after("black", on=True) == (True, False, "")
+        assert after("black", on=False) == (False, False, PLAYING)
+        after("black", on=True)
+        assert after("next") == (False, False, OTHER)
+        after("black", on=True)
+        assert after("pause", on=True) == (True, True, "")
+        assert after("black", on=False) == (False, True, OTHER)
+        after("black", on=True)
+        assert after("pause", on=False) == (True, False, "")
+        assert after("brightness", percent=50) == (True, False, "")
+        assert after("play", name=PLAYING) == (False, False, PLAYING)
+        after("black", on=True)
+        assert after("rotate")[0] is False
+
 
 def shows_names_after(stage: Stage) -> bool:
     stage.kiosk.identify(True)

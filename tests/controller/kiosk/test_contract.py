@@ -15,12 +15,14 @@ import pytest
 from controller.bundle.describe import png
 from controller.bundle.install import current, install
 from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
+from controller.core.errors import UsageError
 from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
+from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.schedule import WEEKDAYS
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
@@ -44,7 +46,11 @@ class Real:
     folder: Path
 
     def settle(self) -> None:
-        self.kiosk.service.changed()
+        service = self.kiosk.service
+        service.reconciler.step()
+        # The player shows what is wanted.
+        vars(service.player)["_view"] = PlayerView(service.player.want)
+        service.changed()
 
 
 @dataclass
@@ -127,6 +133,15 @@ class TestStageKiosk(Contract):
             cancel.set()
             service.hurry()
             thread.join()
+
+    def test_the_socket_logs_what_was_done_and_what_was_refused(self, stage: Real) -> None:
+        ask = socket_table(stage.kiosk.holders())
+        ask["play"](OTHER)
+        with pytest.raises(UsageError):
+            ask["play"]("no such")
+        told = {row.code: row.text.partition(": ")[2] for row in stage.kiosk.events()}
+        assert told["done-by"] == f"Show this appearance now ({OTHER})."
+        assert told["refused"].startswith("Show this appearance now (no such). Refused: The installed bundle")
 
     def test_a_closed_stage_that_computes_says_so(self, stage: Real) -> None:
         kiosk, service = stage.kiosk, stage.kiosk.service

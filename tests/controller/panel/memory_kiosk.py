@@ -59,7 +59,7 @@ class MemoryKiosk(MemoryWork):
         run: str = "first", toml: str = TOML,
     ) -> None:  # fmt: skip
         super().__init__(step_s, examples.state(names[0]))
-        self._folder = pictures
+        self._folder, self._before = pictures, names[0]
         pictures.mkdir(parents=True, exist_ok=True)
         # Requests draw side by side, each into a file of its own.
         self._drawings = itertools.count()
@@ -119,13 +119,15 @@ class MemoryKiosk(MemoryWork):
     def next(self, fade_s: float | None = None) -> None:
         self._require_open()
         names = list(self._appearances)
-        playing = self._state.playing
+        playing = self._before if self._state.black else self._state.playing
         self._show(names[(names.index(playing) + 1) % len(names) if playing in names else 0])
 
     def black(self, on: bool, fade_s: float | None = None) -> None:
         if on:
             self._require_open()
-        self.change(black=on)
+            self._before = self._state.playing or self._before
+        if on != self._state.black:
+            self.change(black=on, playing="" if on else self._before)
 
     def pause(self, on: bool) -> None:
         self._require_open()
@@ -136,7 +138,8 @@ class MemoryKiosk(MemoryWork):
         self.change(brightness=percent)
 
     def rotate(self) -> None:
-        self.change(in_turn=True, state="playing", reason="Playing as asked.")
+        self._show(self._state.playing or self._before)
+        self.change(in_turn=True, paused=False)
 
     def record(self, code: str, what: str, level: EventLevel = "info") -> None:
         self.recorded.append((code, what))

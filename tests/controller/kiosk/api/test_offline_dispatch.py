@@ -146,7 +146,10 @@ def test_the_log_names_who_changes_something_while_no_kiosk_runs(tmp_path: Path)
     assert call(stage, "events") == []
     call(stage, "set-schedule", time_zone="UTC", rows=[], drift_check="")
     call(stage, "add-account", name="otto", role="operator", password="a long enough one")
+    with pytest.raises(UsageError):
+        call(stage, "remove-account", name="nobody")
     user = pwd.getpwuid(os.getuid()).pw_name
+    assert "Refused: " in next(row["text"] for row in call(stage, "events") if row["code"] == "refused")
     lines = [row["text"] for row in call(stage, "events") if row["code"] == "done-by"]
     assert [line.split(",")[0] for line in lines] == [f"User {user}"] * 2
     assert "otto" in lines[1]

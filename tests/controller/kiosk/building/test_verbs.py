@@ -35,6 +35,7 @@ def test_each_verb_changes_what_is_shown_and_says_who_did_it(kiosk: MemoryKiosk)
     assert (verbs.status().black, kiosk.asked[-1]) == (False, ("play", ("marble", 1)))
     verbs.do("close")
     assert code_of(verbs, "next") == "nothing-plays"
+    assert kiosk.recorded[-1] == ("refused", "OSC: Show the next appearance. Refused: The stage is closed.")
     assert code_of(verbs, "restore", {"backup": "x"}) == "verb-unknown"
     assert code_of(verbs, "brightness", "101") == "field-wrong"
     assert code_of(verbs, "play", '{"name": ') == "body-wrong"

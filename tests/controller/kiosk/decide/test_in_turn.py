@@ -94,6 +94,17 @@ def test_the_next_one_is_where_the_list_goes_on_and_a_pause_holds_it(kiosk: Kios
     assert kiosk.player.want == ALL
 
 
+def test_a_list_continues_after_black_where_it_was(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.reconciler.next()
+    kiosk.run(2)
+    kiosk.reconciler.black(True)
+    kiosk.run(2)
+    kiosk.reconciler.black(False)
+    kiosk.run(2)
+    assert kiosk.player.want == Showing(BUNDLE, "marble", (TURNS[1], TURNS[0]))
+
+
 def test_black_and_brightness_last_over_a_restart_and_end_when_the_stage_closes(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
     kiosk.run(2)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -48,6 +49,45 @@ def test_stops_on_request_and_cools_and_starts_again_only_when_asked(kiosk: Kios
     kiosk.reconciler.open()
     kiosk.run_until(State.PLAYING)
     assert not kiosk.sins
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whoever_opens_and_closes_at_any_moment_breaks_nothing_and_is_told_the_truth(kiosk: Kiosk, seed: int) -> None:
+    random = Random(seed)
+    dark_steps = 0
+    for _ in range(200):
+        if (press := random.random()) < 0.1:
+            (kiosk.reconciler.open if press < 0.05 else kiosk.reconciler.shut)()
+        for supervisor in kiosk.supervisors:
+            if random.random() < 0.4:  # some projectors answer late
+                supervisor.step()
+        kiosk.reconciler.step()
+        kiosk.world.time_s += STEP_S
+        assert kiosk.state is not State.FAULT, kiosk.reconciler.machine.reason
+        shows = kiosk.state in (State.READY, State.PLAYING, State.DEGRADED)
+        dark_steps = dark_steps + 1 if shows and not kiosk.lit else 0
+        assert dark_steps < 8, kiosk.told
+    assert not kiosk.sins
+
+
+def test_an_opening_right_after_a_closing_waits_for_the_lamps_and_says_so(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    kiosk.reconciler.shut()
+    kiosk.run(1)
+    kiosk.reconciler.open()
+    kiosk.run(1)
+    assert (kiosk.state, kiosk.reconciler.machine.reason) == (State.COOLING, "It opens when the lamps have cooled.")
+    kiosk.run_until(State.PLAYING)
+    assert "error" not in [row.level for row in kiosk.log.after(0)]
+
+
+def test_a_stage_whose_lamps_somebody_switched_off_says_that_they_are_switched_on_again(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    for lamp in kiosk.lamps.values():
+        lamp.go_dark()
+    kiosk.run(2)
+    assert kiosk.state is State.POWERING
+    kiosk.run_until(State.PLAYING)
 
 
 def test_a_request_that_is_refused_keeps_nothing_of_the_ones_before(kiosk: Kiosk) -> None:

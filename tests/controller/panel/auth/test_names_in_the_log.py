@@ -46,16 +46,21 @@ def test_log_ins_failures_accounts_tokens_settings_and_restores_are_in_the_log_b
         for path, sent in (
             ("/accounts/add", {"name": "nora", "password": PASSWORD, "role": "viewer"}),
             ("/accounts/role", {"name": "nora", "role": "operator"}),
+            ("/accounts/add", {"name": "nora", "password": PASSWORD, "role": "viewer"}),
+            ("/do/remove-appearance", {"name": "marble", "sure": "yes"}),
             ("/tokens/add", {"name": "robot", "role": "viewer"}),
             ("/tokens/remove", {"name": "robot", "sure": "yes"}),
             ("/accounts/remove", {"name": "nora", "sure": "yes"}),
             ("/do/save-settings", {"text": fresh.kiosk.settings(), "sure": "yes"}),
         ):
-            assert tina.post(path, data={"csrf": token, **sent}).status_code in (200, 303), path
+            assert tina.post(path, data={"csrf": token, **sent}).status_code in (200, 303, 422), path
         restore = {"csrf": token, "sure": "yes"}
         tina.post("/do/restore", data=restore, files={"file": ("b.tar.gz", b"no backup")})
     with fresh.client() as machine:
         machine.post(f"{PREFIX}/identify", json={"on": True}, headers=fresh.token(Role.OPERATOR))
+        assert (
+            machine.post(f"{PREFIX}/play", json={"name": "no"}, headers=fresh.token(Role.OPERATOR)).status_code == 404
+        )
     lines = told(fresh)
     for expected in (
         "A log-in as tina from 127.0.0.1 was refused.",
@@ -66,10 +71,15 @@ def test_log_ins_failures_accounts_tokens_settings_and_restores_are_in_the_log_b
         "tina: Remove the token robot.",
         "tina: Remove the account nora.",
         "tina: Check stage.toml, save it, and apply it.",
-        "tina: Replace settings, calibration and appearances with a backup.",
+        "tina: Replace settings, calibration and appearances with a backup. Refused: This file is not a backup.",
+        "tina: Remove an appearance (marble). Refused: It is playing, or scheduled.",
+        "tina: Add the account nora (viewer). Refused: The account 'nora' exists already.",
     ):
         assert expected in lines, lines
     assert any(line.startswith("Token t") and "projector's name" in line for line in lines)
+    refused = [what for code, what in in_memory(fresh).recorded if code == "refused"]
+    assert any("Show this appearance now (no). Refused: There is no such appearance." in line for line in refused)
+    assert [what for code, what in in_memory(fresh).recorded if code == "done-by" and "Refused" in what] == []
     assert not any(PASSWORD in line for line in lines)
 
 
