@@ -93,7 +93,7 @@ def merge_brackets(
     images : of one size, (rows, columns, 3) float32, 0 at black and 1 at full scale, NaN where saturated
         (``Developed.image``)
     exposures_s : exposure time of each image, seconds, above 0
-    noise : the camera's; without it that of a 12-bit APS-C camera
+    noise : the camera's; without it, as the images themselves show it
 
     Returns
     -------

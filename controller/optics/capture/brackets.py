@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,12 +35,21 @@ FEWEST_WHITES = 2
 """One exposure alone would not show the camera's noise, or whether it is linear."""
 FLICKER = 0.02
 """A longer exposure may show this share less than shorter ones: lamps are not steady."""
-SPREADS = 3.0
-"""Standard deviations by which a longer exposure may be below what shorter ones predict."""
+SPREADS = 6.0
+"""Standard deviations by which a longer exposure may be below what shorter ones predict.
+
+Noise alone must never exceed it: what is then left is a short exposure that is too bright by chance, often many times.
+"""
+SPREADS_IF_SURE, SURE = 2.5, 0.05
+"""Standard deviations where shorter exposures predict a sample with a smaller relative spread: chance does no harm."""
 AT_ONCE = 1 << 18
 """Samples of each image that are merged in one go."""
-ROUNDED = 0.5 / 255
-"""Of full scale: the error of a sample of 8 bits, where nothing is known of the camera's noise."""
+ROUNDED = 1 / 255 / math.sqrt(12)
+"""Of full scale: the error of a sample of 8 bits, the least where nothing is known of the camera's noise."""
+DARK_LEVEL = 0.25
+"""Of full scale: below it, the mean of a sample and three neighbours holds no clipped light."""
+LEVELS = ((0.03, DARK_LEVEL), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9))
+SOME_SAMPLES, FEWEST_SAMPLES = 200_000, 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +71,18 @@ def merge_brackets(
     The variance is taken from a first estimate of the radiance and not from each value itself: a value that noise
     made small would otherwise get more weight, and the mean would be too dark.
 
-    A sample that is clearly darker than shorter exposures predict does not count. It is clipped, or mixed with clipped
-    neighbours by a picture that was made smaller, and does not say so: the longest exposure has the most weight.
+    A sample that is darker than shorter exposures predict, by more than noise can explain, does not count. It is
+    clipped, or mixed with clipped neighbours by a picture that was made smaller, and does not say so: the longest
+    exposure has the most weight.
 
     Parameters
     ----------
     images : (rows, columns, 3) float32, 0 at black and 1 at full scale, NaN where saturated
     exposures_s : of each image, > 0
+    noise : the camera's; without it, as the exposures themselves show it
 
     Raises UsageError("bracket-mismatch").
     """
-    rounded, noise = (ROUNDED, CameraNoise()) if noise is None else (0.0, noise)
     if not images or len(images) != len(exposures_s) or len({image.shape for image in images}) != 1:
         raise UsageError(
             "bracket-mismatch",
@@ -82,34 +93,60 @@ def merge_brackets(
         raise UsageError(
             "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
         )
+    noise = noise or _noise_of(images, exposures_s)
     flat = [np.ascontiguousarray(image, np.float32).reshape(-1) for image in images]
     radiance, sigma = np.empty_like(flat[0]), np.empty_like(flat[0])
     # a part at a time, which stays in the cache
     for part in strips(len(radiance), AT_ONCE):
-        _merge([image[part] for image in flat], exposures_s, noise, rounded, radiance[part], sigma[part])
+        _merge([image[part] for image in flat], exposures_s, noise, radiance[part], sigma[part])
     return MergedBracket(radiance.reshape(images[0].shape), sigma.reshape(images[0].shape))
 
 
+def _noise_of(images: Sequence[FloatImage], exposures_s: Sequence[float]) -> CameraNoise:
+    """As neighbouring exposures show it; no less than a good camera's, rounded to 8 bits.
+
+    A shorter exposure a is q times the longer b, and their difference's variance q (1 + q) b shot + (1 + q^2) read^2.
+    Clipped light that does not say so makes b too small, and black makes a too large: above the middle only the spread
+    below it counts, and in the dark only that above it.
+    """
+    read, shot = math.inf, math.inf
+    rising = sorted(range(len(images)), key=lambda n: exposures_s[n])
+    for first, second in itertools.pairwise(rising):
+        q = exposures_s[first] / exposures_s[second]
+        a, b = (images[n].reshape(-1)[:: max(1, images[n].size // SOME_SAMPLES)] for n in (first, second))
+        for low, high in LEVELS:
+            off = (a - np.float32(q) * b)[(b > low) & (b < high) & np.isfinite(a)]
+            if off.size < FEWEST_SAMPLES:
+                continue
+            below, middle, above = np.percentile(off, (15.87, 50, 84.13))
+            if low < DARK_LEVEL:
+                read = min(read, float(above - middle) / math.hypot(1, q))
+            else:
+                left = (middle - below) ** 2 - (1 + q * q) * min(read, middle - below) ** 2
+                shot = min(shot, float(left) / (q * (1 + q) * low))
+    least = CameraNoise()
+    read = max(read if math.isfinite(read) else 0.0, math.hypot(least.read, ROUNDED))
+    return CameraNoise(max(shot if math.isfinite(shot) else 0.0, least.shot), read)
+
+
 def _merge(
-    images: Sequence[FloatImage], exposures_s: Sequence[float], noise: CameraNoise, rounded: float,
-    radiance: FloatImage, sigma: FloatImage,
-) -> None:  # fmt: skip
+    images: Sequence[FloatImage],
+    exposures_s: Sequence[float],
+    noise: CameraNoise,
+    radiance: FloatImage,
+    sigma: FloatImage,
+) -> None:
     """Fill ``radiance`` and ``sigma`` for some samples (samples,) of each image."""
-    counting = _counting(images, exposures_s, noise, rounded)
+    counting = _counting(images, exposures_s, noise)
     estimate, _ = _weighted(images, exposures_s, counting, np.zeros_like(radiance), noise)
     radiance[:], weight = _weighted(images, exposures_s, counting, np.maximum(np.nan_to_num(estimate), 0), noise)
     with np.errstate(divide="ignore"):
         sigma[:] = np.where(weight > 0, 1 / np.sqrt(weight), np.float32(np.nan))
 
 
-def _counting(
-    images: Sequence[FloatImage], exposures_s: Sequence[float], noise: CameraNoise, rounded: float
-) -> list[Mask]:
-    """Which samples of each image count: measured, and not clearly below what shorter exposures predict.
-
-    ``rounded``: spread that ``noise`` does not have, of full scale
-    """
-    still = np.float32(noise.read**2 + rounded**2)
+def _counting(images: Sequence[FloatImage], exposures_s: Sequence[float], noise: CameraNoise) -> list[Mask]:
+    """Which samples of each image count: measured, and not clearly below what shorter exposures predict."""
+    still = np.float32(noise.read**2)
     counting = [np.zeros(image.shape, np.bool_) for image in images]
     total, weights = np.zeros_like(images[0]), np.zeros_like(images[0])
     for n in sorted(range(len(images)), key=lambda n: exposures_s[n]):
@@ -137,7 +174,8 @@ def _count(
             longer, predicted = seconds / np.sqrt(weight), total[k] / weight * seconds
             light = shot * max(predicted, np.float32(0))
             spread = np.sqrt((light / longer + still) * (longer * longer) + light + still)
-            good = not value < below * predicted - np.float32(SPREADS) * spread
+            spreads = SPREADS_IF_SURE if spread < np.float32(SURE) * predicted else SPREADS
+            good = not value < below * predicted - np.float32(spreads) * spread
         counts[k] = good
         if good:
             total[k] += value * seconds

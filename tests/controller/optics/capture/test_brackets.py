@@ -86,6 +86,44 @@ def test_light_that_was_clipped_before_a_picture_was_made_smaller_does_not_count
     assert off < 0.5 * off_theirs
 
 
+FIVE, FOUR, APART = [4.0**k for k in range(-4, 1)], [4.0**k for k in range(-3, 1)], [1 / 16, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("times", "noise", "bits", "darkest"),
+    [
+        (FIVE, CameraNoise(1 / 30_000, 6 / 30_000), 12, 3e-5),
+        (FIVE, NOISE, 12, 2e-4),
+        (APART, CameraNoise(1 / 30_000, 6 / 30_000), 12, 3e-4),
+        (FOUR, CameraNoise(0, 0.006), 8, 1e-3),
+        (FOUR, CameraNoise(0.001, 0.003), 8, 1e-3),
+        (APART, CameraNoise(0, 0.0005), 8, 2e-3),
+    ],
+)
+def test_noise_alone_takes_no_exposure_out_of_a_bracket(
+    times: list[float], noise: CameraNoise, bits: int, darkest: float
+) -> None:
+    """A short exposure that is bright by chance must not overrule a long one. With 8 bits, the noise is unknown."""
+    lightest = 0.9 / times[0]
+    truth = np.geomspace(darkest * lightest, lightest, 500, dtype=np.float32)[None, :, None].repeat(400, 0).repeat(3, 2)
+    random, full = np.random.default_rng(8), 2**bits - 1
+    images = []
+    for seconds in times:
+        signal = truth * seconds
+        value = signal + np.sqrt(noise.shot * signal + noise.read**2) * random.standard_normal(signal.shape)
+        value = np.round(value * full) / full
+        value = np.clip(value, 0, None) if bits == 8 else value  # a file of whole numbers has nothing below black
+        images.append(np.where(value < 1, value, np.nan).astype(np.float32))
+    merged = merge_brackets(images, times, noise=None if bits == 8 else noise).radiance
+    off = merged / truth
+    usable = np.max([np.where(truth * t < 0.9, truth * t, 0) for t in times], axis=0)
+    sure = np.sqrt(noise.shot * usable + noise.read**2) < 0.12 * usable
+    assert sure.mean() > 0.8
+    assert np.abs(off - 1)[sure].max() < 0.5
+    for part in np.array_split(np.arange(500), 5):
+        assert off[:, part][sure[:, part]].mean() == pytest.approx(1, abs=0.004)
+
+
 @pytest.mark.parametrize("change", [0.97, 1.0, 1.03, 1.5])
 def test_a_flickering_lamp_takes_no_exposure_out_of_the_bracket(change: float) -> None:
     """Nor does light that came on during the longer one: only what clipping does is looked for."""
