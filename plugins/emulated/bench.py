@@ -23,7 +23,8 @@ from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
 from hal.tape import read_tape
 from plugins.emulated.cameras.body import CameraNames
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from plugins.emulated.cameras.camera import PtpIpCamera
+from plugins.emulated.cameras.generic import EmulatedGenericBody
 from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.faults import ScenarioPlayer, read_scenario
 from plugins.emulated.core.shot import Expose
@@ -290,15 +291,11 @@ def _write_fast_profile(stage: Path, family: str) -> None:
         path.write_text(quick_profile(times, base=family, stable_s=FAST_LAMP.stable_s), encoding="utf-8")
 
 
-def _network_camera(world: World, truth: CameraTruth) -> EmulatedPtpCamera:
+def _network_camera(world: World, truth: CameraTruth) -> PtpIpCamera:
     # The world spends the exposure time itself, since it must know what is visible meanwhile.
-    return EmulatedPtpCamera(
-        world.expose,
-        ports=(truth.command_port, truth.event_port),
-        names=CameraNames(serial=truth.serial_number),
-        time_scale=0.0,
-        raw=truth.raw,
-    )
+    names = CameraNames(serial=truth.serial_number)
+    body = EmulatedGenericBody(world.expose, names=names, time_scale=0.0, raw=truth.raw)
+    return PtpIpCamera(body, (truth.command_port, truth.event_port))
 
 
 def _follow_bumps(world: World, out: OutputLines) -> None:

@@ -175,13 +175,13 @@ def _wrong_setting(key: str, value: object, allowed: str) -> PluginError:
 DRIVER: Final = Driver(
     kind="camera",
     name="ptp",
-    summary="Still cameras with PTP over USB or the network (PTP/IP): standard ones, Canon EOS, Nikon, Sony.",
+    summary="Still cameras with PTP over USB or the network (PTP/IP): standard ones and Canon EOS.",
     open=open_camera,
     settings={
         "address": "usb:SERIAL, usb:VENDOR:PRODUCT, usb:PORT, usb: for any, or ptpip:HOST:COMMANDPORT[:EVENTPORT]",
         "serial": "serial number that the camera must have (default: any)",
         "target": '"computer" (default) or "card": where a Canon EOS stores its pictures first',
-        "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false; not Sony)",
+        "raw_and_jpeg": "true to get a JPEG with each RAW file, if the camera can (default false)",
         "picture_s": "seconds that a picture may take beyond twice its exposure (default 15): more for large files",
         "keep_on_card": "true to keep pictures on the card after the transfer (default false)",
     },

@@ -10,7 +10,7 @@ from hal.deadline import Deadline
 from hal.values import CameraCapabilities, CameraStatus, ExposureSettings
 from plugins.camera_files import PendingFile
 from plugins.ptp.body import Channel, PictureStorage, nearest, no_live_view, no_such_file, still_waiting
-from plugins.ptp.link import LinkEvent, Reply, camera_busy, card_full, refused
+from plugins.ptp.link import camera_busy, card_full, refused
 from plugins.ptp.shot import Picture, Shot
 
 _MANUAL: Final = 1
@@ -85,9 +85,12 @@ class GenericBody:
         while True:
             # At each attempt: while the camera was busy, an earlier picture may have been finished.
             shot.known = self._channel.handles(deadline)
-            self.events(deadline)
+            self._channel.link.events()
             wanted = (self._raw_format if self._raw else Format.JPEG) if self._format_selectable else 0
-            reply = self.press(shot, wanted or 0, deadline)
+            shot.fire()
+            patience_s = self._channel.timing.answer_s + 2 * shot.exposure_s
+            capture = (Operation.INITIATE_CAPTURE, 0, wanted or 0)
+            reply = self._channel.once(*capture, patience_s=patience_s, deadline=deadline)
             if reply.ok:
                 return
             shot.not_fired()
@@ -100,20 +103,6 @@ class GenericBody:
                 raise camera_busy("take a picture")
             give_up.sleep(pause_s)
             pause_s = min(0.5, 2 * pause_s)
-
-    def press(self, shot: Shot, wanted: int, deadline: Deadline) -> Reply:
-        """Release the shutter; ``wanted``: the format of the picture, 0 for the camera's own choice."""
-        shot.fire()
-        patience_s = self._channel.timing.answer_s + 2 * shot.exposure_s
-        return self._channel.once(Operation.INITIATE_CAPTURE, 0, wanted, patience_s=patience_s, deadline=deadline)
-
-    def events(self, deadline: Deadline) -> list[LinkEvent]:
-        """The events that have come since the last call."""
-        return self._channel.link.events()
-
-    def wait(self, deadline: Deadline) -> None:
-        """Wait until there may be an event."""
-        self._channel.link.wait_event(_LISTING_EVERY_S, deadline=deadline)
 
     def collect(self, shot: Shot, *, deadline: Deadline) -> list[Picture]:
         """Wait for the events; if they are late, or were lost with a connection, list the card instead."""
@@ -137,12 +126,12 @@ class GenericBody:
             if shot.overdue(timing):
                 raise shot.missing()
             still_waiting(deadline)
-            self.wait(deadline)
+            self._channel.link.wait_event(_LISTING_EVERY_S, deadline=deadline)
 
     def _follow_events(self, shot: Shot, deadline: Deadline) -> bool:
         """Read the camera's events; True once the capture is complete."""
         complete = False
-        for event in self.events(deadline):
+        for event in self._channel.link.events():
             if event.code == EventCode.OBJECT_ADDED and event.parameters:
                 self._look_at(shot, {event.parameters[0]}, deadline)
             elif event.code == EventCode.STORE_FULL and not shot.found:

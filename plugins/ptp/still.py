@@ -26,23 +26,23 @@ from plugins.ptp.body import Body, Channel, PictureStorage
 from plugins.ptp.canon.body import EosBody
 from plugins.ptp.generic import GenericBody
 from plugins.ptp.link import Diary, PtpLink, refused
-from plugins.ptp.nikon import NikonBody
 from plugins.ptp.shot import Picture, Shot, Timing
-from plugins.ptp.sony import SonyBody
 
-_SONY: Final = frozenset({Operation.SONY_CONNECT, Operation.SONY_PRESS, Operation.SONY_GET_ALL_PROPERTIES})
+GPHOTO2_MAKERS: Final = ("Nikon", "NIKON", "Sony")
+"""What the names of makers begin with; on the network their cameras call themselves MTP devices."""
 
 
 def choose_body(channel: Channel, info: DeviceInfo, storage: PictureStorage) -> Body:
-    """What releases the camera. Raises DeviceRefused("camera-no-remote-release")."""
+    """What releases the camera. Raises DeviceRefused."""
     eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
     if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
         return EosBody(channel, storage)
-    if info.vendor_extension == Vendor.NIKON and Operation.NIKON_GET_EVENT in info.operations:
-        return NikonBody(channel, info, storage)
-    # On the network they call themselves MTP devices.
-    if (info.vendor_extension == Vendor.SONY or info.manufacturer.startswith("Sony")) and info.operations >= _SONY:
-        return SonyBody(channel)
+    if info.vendor_extension in (Vendor.NIKON, Vendor.SONY) or info.manufacturer.startswith(GPHOTO2_MAKERS):
+        raise DeviceRefused(
+            "camera-needs-gphoto2",
+            what=f"The {info.model or 'camera'} has commands of its maker, which this driver does not know.",
+            remedy='Write driver = "gphoto2" into its table in stage.toml; libgphoto2 knows it.',
+        )
     if Operation.INITIATE_CAPTURE in info.operations:
         return GenericBody(channel, info, storage)
     raise DeviceRefused(

@@ -27,10 +27,10 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from lab.emulated.usb.bus import environment
 from lab.emulated.usb.camera import numbered_files
 from lab.emulated.usb.process import UsbBusProcess
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.gphoto2.camera import open_camera
 

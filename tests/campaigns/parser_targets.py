@@ -35,7 +35,6 @@ from hal.codecs.projectors.serial_protocol import (
 )
 from hal.codecs.ptp import eos as ptp_eos
 from hal.codecs.ptp import ip as ptp_ip
-from hal.codecs.ptp import makers
 from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
@@ -68,8 +67,6 @@ def targets(folder: Path) -> dict[str, Target]:
         "ptp-datasets": Target(_ptp_dataset, _datasets()),
         "ptp-ip": Target(_ptp_ip, _packets()),
         "eos-records": Target(_eos, _records()),
-        "nikon": Target(_nikon, (b"\x02\0\x02\x40\1\0\0\0\x0d\x40\0\0\0\0", bytes(384) + b"\xff\xd8\xff\xe0")),
-        "sony": Target(makers.parse_sony_properties, _SONY),
         "serial-answers": Target(_serial, _answers()),
         "pjlink-answers": Target(_pjlink, tuple(bytes([n]) + answer for n, answer in enumerate(_PJLINK))),
         "logins": Target(_login, _GREETINGS, (ProtocolError, DeviceRefused, DeviceBusy)),
@@ -181,24 +178,6 @@ _REPORTS = (
     b"\x03\0BITFT\0\0\x03",
     b"\x01" + bytes([1, 3, 0, 16, 0, 0, 0]),
     b"\x02" + hid_reports.SensorSettings().pack(),
-)
-
-
-def _nikon(data: bytes) -> None:
-    """Every parser gets all the bytes."""
-    refused = None
-    for parse in (makers.parse_nikon_events, makers.parse_nikon_codes, makers.parse_nikon_view):
-        try:
-            parse(data)
-        except ProtocolError as error:
-            refused = error
-    if refused is not None:
-        raise refused
-
-
-_SONY: Final = (
-    struct.pack("<II", 1, 0) + struct.pack("<HHBBIIBH3I", 0xD20D, 6, 1, 1, 9, 9, 2, 3, 0x1000A, 0x100FA, 0x12C000A),
-    struct.pack("<II", 1, 0) + struct.pack("<HHBBHHBH2HH2H", 0x5007, 4, 1, 1, 9, 9, 2, 2, 400, 560, 2, 400, 560),
 )
 
 

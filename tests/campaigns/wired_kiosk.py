@@ -22,13 +22,13 @@ from controller.kiosk.decide.stage_states import Limits
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.run.state_machine import State
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from lab.emulated.usb.bus import environment
 from lab.emulated.usb.camera import STAGE_CAMERA, ExposureServer, UsbCameraFaults
 from lab.emulated.usb.mains import Mains
 from lab.emulated.usb.process import KINDS, UsbBusProcess
 from lab.timings.devices.serve import install_grey
 from plugins.emulated.cameras.body import CameraFaults, CameraNames
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.core.truth import MainsTruth, read_truth
 from plugins.emulated.projectors.lamp import LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector

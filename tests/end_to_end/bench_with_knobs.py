@@ -14,8 +14,8 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated import bench
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.projectors import boards
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.serial import EmulatedSerialProjector

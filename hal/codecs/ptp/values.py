@@ -29,10 +29,7 @@ class Vendor(enum.IntEnum):
 
 
 class Operation(enum.IntEnum):
-    """Operation codes (ISO 15740 10.4) and those of Canon EOS, Nikon and Sony (as libgphoto2 documents them).
-
-    Makers use the same codes for different operations.
-    """
+    """Operation codes (ISO 15740 10.4) and those of Canon EOS (as libgphoto2 documents them)."""
 
     GET_DEVICE_INFO = 0x1001
     OPEN_SESSION = 0x1002
@@ -62,19 +59,6 @@ class Operation(enum.IntEnum):
     EOS_RELEASE_ON = 0x9128
     EOS_RELEASE_OFF = 0x9129
     EOS_GET_VIEWFINDER = 0x9153
-    NIKON_CHANGE_MODE = 0x90C2
-    NIKON_GET_EVENT = 0x90C7
-    NIKON_DEVICE_READY = 0x90C8
-    NIKON_VENDOR_PROPERTIES = 0x90CA
-    NIKON_START_VIEW = 0x9201
-    NIKON_END_VIEW = 0x9202
-    NIKON_GET_VIEW = 0x9203
-    NIKON_CAPTURE_TO_CARD = 0x9207
-    SONY_CONNECT = 0x9201
-    SONY_DEVICE_INFO = 0x9202
-    SONY_SET_PROPERTY = 0x9205
-    SONY_PRESS = 0x9207
-    SONY_GET_ALL_PROPERTIES = 0x9209
 
 
 class Answer(enum.IntEnum):
@@ -127,7 +111,7 @@ RAW_FORMATS: Final = (Format.DNG, Format.CANON_CR2, Format.CANON_CR3, Format.CAN
 
 
 class Property(enum.IntEnum):
-    """Device properties (ISO 15740 13.3.5), and Nikon's."""
+    """Device properties (ISO 15740 13.3.5)."""
 
     BATTERY_LEVEL = 0x5001
     F_NUMBER = 0x5007
@@ -135,7 +119,6 @@ class Property(enum.IntEnum):
     EXPOSURE_PROGRAM = 0x500E
     EXPOSURE_INDEX = 0x500F
     COMPRESSION = 0x5004
-    NIKON_SHUTTER = 0xD100
 
 
 def broken(what: str) -> ProtocolError:
@@ -190,13 +173,6 @@ class Reader:
         """A PTP string: a count byte, then UTF-16 with a terminator (ISO 15740 5.3.3), made printable."""
         text = bytes(self.take(2 * self.number("B"))).decode("utf-16-le", errors="replace")
         return printable(text.split("\0", 1)[0])
-
-    def peek_u16(self) -> int:
-        """The next 16-bit number, which stays to be read."""
-        at = self._at
-        value = self.number("H")
-        self._at = at
-        return value
 
     def take(self, count: int) -> memoryview:
         """The next ``count`` bytes."""

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection, Listener
 from typing import Any, Final, Self
 
+from lab.emulated.cameras.camera import BODIES, Flavour
 from lab.emulated.usb.device import BULK, INTERRUPT, EmulatedUsbDevice, Endpoint, SetupPacket, Stall, UsbNames
 from plugins.emulated.cameras.body import CameraNames, EmulatedBody
-from plugins.emulated.cameras.camera import BODIES, Flavour
 from plugins.emulated.cameras.wire import BUSY, OK, Gone, PtpOutcome
 from plugins.emulated.core.faults import FaultCounts
 from plugins.emulated.core.shot import Expose, ShotFiles, ShotSettings
@@ -78,7 +78,7 @@ class _Request:
 
 
 class EmulatedUsbCamera(EmulatedUsbDevice):
-    """See ``EmulatedUsbDevice``; arguments as for ``plugins.emulated.cameras.camera.EmulatedPtpCamera``.
+    """See ``EmulatedUsbDevice``; arguments as for ``lab.emulated.cameras.camera.EmulatedPtpCamera``.
 
     ``usb_serial`` False: the USB descriptor tells no serial number, as on older bodies.
     """

@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 
 

@@ -9,13 +9,10 @@ import struct
 import threading
 import time
 import uuid
-from typing import Final, Literal, Self
+from typing import Final, Self
 
 from hal.errors import DeviceError
-from plugins.emulated.cameras.body import CameraFaults, CameraNames, EmulatedBody
-from plugins.emulated.cameras.eos import EmulatedEosBody, EmulatedOldEosBody
-from plugins.emulated.cameras.generic import EmulatedGenericBody, EmulatedNikonBody
-from plugins.emulated.cameras.sony import EmulatedSonyBody
+from plugins.emulated.cameras.body import EmulatedBody
 from plugins.emulated.cameras.wire import (
     CANCEL,
     EVENT,
@@ -36,16 +33,7 @@ from plugins.emulated.cameras.wire import (
     send_data,
 )
 from plugins.emulated.core.servers import HOST, Switchable
-from plugins.emulated.core.shot import Expose
 
-Flavour = Literal["generic", "eos-new", "eos-old", "nikon", "sony"]
-BODIES: Final = {
-    "generic": EmulatedGenericBody,
-    "eos-new": EmulatedEosBody,
-    "eos-old": EmulatedOldEosBody,
-    "nikon": EmulatedNikonBody,
-    "sony": EmulatedSonyBody,
-}
 _TAKEOVER_S: Final = 0.5
 
 
@@ -232,32 +220,6 @@ class PtpIpCamera(Switchable):
         if events is not None:
             with contextlib.suppress(Gone):
                 send(events, EVENT, struct.pack(f"<HI{len(parameters)}I", code, 0, *parameters))
-
-
-class EmulatedPtpCamera(PtpIpCamera):
-    """A camera of a ``flavour`` on PTP/IP.
-
-    Parameters
-    ----------
-    flavour : "generic" (standard PTP), "eos-new" (9128/9129) or "eos-old" (910F: the operations of an EOS 400D),
-        "nikon" (9207 and 90C7), "sony" (protocol 3)
-    ports : see ``PtpIpCamera``
-    expose, names, time_scale, raw, faults : see ``EmulatedBody``
-    """
-
-    def __init__(
-        self,
-        expose: Expose,
-        *,
-        flavour: Flavour = "generic",
-        ports: tuple[int, int] = (0, 0),
-        names: CameraNames | None = None,
-        time_scale: float = 1.0,
-        raw: bool = True,
-        faults: CameraFaults | None = None,
-    ) -> None:
-        body = BODIES[flavour](expose, names=names, time_scale=time_scale, raw=raw, faults=faults)
-        super().__init__(body, ports)
 
 
 def _end(connection: socket.socket) -> None:

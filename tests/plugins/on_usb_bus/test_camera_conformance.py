@@ -41,11 +41,3 @@ class TestEosNew(EveryFlavour):
 
 class TestEosOld(EveryFlavour):
     flavour = "eos-old"
-
-
-class TestNikon(EveryFlavour):
-    flavour = "nikon"
-
-
-class TestSony(EveryFlavour):
-    flavour = "sony"

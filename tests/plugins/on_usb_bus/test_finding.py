@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,17 @@ def test_a_camera_is_found_by_its_serial_number_and_nothing_is_sent_to_it(bus: U
     assert {problem.code for problem in found.problems} <= {"camera-may-be-taken"}
     assert found.settings["address"].startswith("usb:")
     assert bus.get("camera", "body.exposures") == 0
+
+
+def test_a_camera_with_commands_of_its_maker_is_proposed_with_libgphoto2(bus: UsbBusProcess, tmp_path: Path) -> None:
+    bus.add("camera", "camera", flavour="nikon")
+    (found,) = looked("usb", tmp_path)
+    assert (found.driver, found.settings) == ("gphoto2", {})
+    bus.add("other", "camera", flavour="sony")
+    bus.add("third", "camera", flavour="eos-new")
+    addresses = {one.driver: str(one.settings["address"]) for one in looked("usb", tmp_path)}
+    assert set(addresses) == {"gphoto2", "ptp"}
+    assert re.fullmatch(r"usb:[0-9]{3},[0-9]{3}", addresses["gphoto2"])
 
 
 def test_a_program_that_takes_cameras_is_named(bus: UsbBusProcess, tmp_path: Path) -> None:

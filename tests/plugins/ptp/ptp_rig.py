@@ -13,14 +13,14 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.values import ExposureSettings
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.ptp.body import PictureStorage
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 
-FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old", "nikon", "sony")
+FLAVOURS: tuple[Flavour, ...] = ("generic", "eos-new", "eos-old")
 PATIENT = Timing(answer_s=20.0, busy_s=20.0, margin_s=20.0, grace_s=0.1, come_back_s=20.0, reconnect_s=20.0,
                  keep_alive_s=0.05)  # fmt: skip
 """Nothing but ``grace_s`` is waited for without success where a camera answers, however loaded the machine is."""

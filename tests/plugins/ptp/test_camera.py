@@ -13,17 +13,18 @@ from hal.conformance import CameraConformance
 from hal.deadline import in_seconds
 from hal.errors import (
     DeviceError,
+    DeviceRefused,
     PluginError,
 )
 from hal.registry import OpenContext
 from hal.values import ExposureSettings, FileKind
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.ptp.body import PictureStorage
 from plugins.ptp.camera import DRIVER, open_camera
 from plugins.ptp.ip import PtpIpAddress
 from plugins.ptp.still import PtpCamera
-from tests.plugins.ptp.ptp_rig import SHORT, Rig, Studio, card_rig, left_behind, rig, running
+from tests.plugins.ptp.ptp_rig import SHORT, Rig, Studio, card_rig, connect, left_behind, rig, running
 
 __all__ = ["card_rig", "rig"]
 
@@ -68,8 +69,7 @@ def test_a_picture_has_the_bytes_of_the_camera_and_the_settings_that_were_confir
 def test_a_raw_picture_comes_alone_and_with_its_own_suffix(rig: Rig, tmp_path: Path) -> None:
     rig.driver.configure(ExposureSettings(0.125, 200, raw=True), deadline=in_seconds(20))
     files = rig.driver.capture(tmp_path / "shot", deadline=in_seconds(20))
-    suffix = {"Nikon Corporation": ".nef", "Sony Corporation": ".arw"}.get(rig.emulator.body.names.maker, ".dng")
-    assert [(file.path.name, file.kind) for file in files] == [(f"shot{suffix}", FileKind.RAW)]
+    assert [(file.path.name, file.kind) for file in files] == [("shot.dng", FileKind.RAW)]
     assert files[0].path.read_bytes().startswith(b"II*\0")
 
 
@@ -158,7 +158,7 @@ class SlowStudio(Studio):
         return super().expose(settings)
 
 
-@pytest.mark.parametrize("flavour", ["generic", "eos-new", "sony"])
+@pytest.mark.parametrize("flavour", ["generic", "eos-new"])
 def test_a_camera_that_works_long_on_a_picture_gets_the_time_that_it_is_given(flavour: Flavour, tmp_path: Path) -> None:
     with EmulatedPtpCamera(SlowStudio().expose, flavour=flavour, time_scale=0.0) as emulator:
         for picture_s, code in ((1, "camera-no-picture"), (30, "")):
@@ -173,6 +173,16 @@ def test_a_camera_that_works_long_on_a_picture_gets_the_time_that_it_is_given(fl
                     camera.capture(tmp_path / "late", deadline=in_seconds(60))
                 assert caught.value.code == code
             camera.close()
+
+
+@pytest.mark.parametrize("flavour", ["nikon", "sony"])
+def test_a_camera_with_commands_of_its_maker_is_left_to_libgphoto2(flavour: Flavour) -> None:
+    with EmulatedPtpCamera(Studio().expose, flavour=flavour) as emulator:
+        with pytest.raises(DeviceRefused) as refused:
+            connect(emulator)
+        assert refused.value.code == "camera-needs-gphoto2"
+        assert emulator.body.names.model in refused.value.what
+        assert 'driver = "gphoto2"' in refused.value.remedy
 
 
 def test_the_driver_explains_every_setting_and_ignores_what_is_not_its_own() -> None:

@@ -17,8 +17,8 @@ from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from hal.interfaces import LiveViewCamera, WatchedCamera
 from hal.values import ExposureSettings
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.body import CameraFaults
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.wire import GENERAL_ERROR
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire
 from plugins.ptp.shot import Timing

@@ -22,8 +22,8 @@ from hal.errors import (
 )
 from hal.registry import OpenContext
 from hal.values import ExposureSettings
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.cameras.body import CameraNames
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.ptp.camera import open_camera
 from tests.plugins.ptp.ptp_rig import (
     FLAVOURS,

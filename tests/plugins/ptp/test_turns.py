@@ -13,7 +13,7 @@ import pytest
 
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import MOST_IN_MEMORY, Diary, Reply, Sink
 from plugins.ptp.still import PtpCamera

@@ -24,9 +24,9 @@ from controller.kiosk.world import World
 from hal.deadline import Deadline, in_seconds
 from hal.registry import OpenContext
 from hal.values import DeviceIdentity, Power
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from lab.emulated.pjlink import PjLinkOddities
 from plugins.emulated.cameras.body import CameraNames
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.projectors.boards import BOARDS
 from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.body import EmulatedBody
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.wire import OK
 from tests.plugins.ptp.ptp_rig import Studio
 

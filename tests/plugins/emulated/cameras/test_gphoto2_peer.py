@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from plugins.emulated.cameras.camera import BODIES
+from lab.emulated.cameras.camera import BODIES
 from tests.campaigns.camera_peers import FLAVOURS, SIZE, Flavour, Peer, Way, network_peer, usb_peer
 
 

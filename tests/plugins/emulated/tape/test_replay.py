@@ -18,8 +18,8 @@ from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.tape import Tape, read_tape
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
+from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from lab.emulated.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of, quick_profile
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector

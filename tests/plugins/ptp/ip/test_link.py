@@ -17,8 +17,8 @@ import pytest
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.transcript import Direction, Transcript, parse_transcript
+from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.body import CameraFaults
-from plugins.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire, readable
 from plugins.ptp.link import LinkEvent
 from tests.plugins.ptp.ptp_rig import Studio
