@@ -17,8 +17,11 @@ from hal.notices import Notice
 
 PATIENCE_S: Final = 5.0
 _OUTPUT: Final = re.compile(
-    r"^(\S{1,64}) connected (?:primary )?(?:(\d{1,5})x(\d{1,5})\+(\d{1,5})\+(\d{1,5}))?", re.MULTILINE
+    r"^(\S{1,64}) connected (?:primary )?(?:(\d{1,5})x(\d{1,5})\+(\d{1,5})\+(\d{1,5})(?: \(0x\w+\))?([\w ]*))?",
+    re.MULTILINE,
 )
+_TRANSFORM: Final = re.compile(r"^\tTransform:((?:\s+-?[\d.]+){9})", re.MULTILINE)
+_UNSCALED: Final = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
@@ -28,7 +31,7 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
         return []
     try:
         done = subprocess.run(  # noqa: S603 - a program of the system, without arguments from outside
-            [program, "--query"], capture_output=True, text=True, errors="replace", check=False,
+            [program, "--verbose"], capture_output=True, text=True, errors="replace", check=False,
             timeout=max(0.1, deadline.within(PATIENCE_S).left_s()),
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
@@ -41,10 +44,12 @@ def find(wanted: SearchScope, deadline: Deadline) -> Sequence[Found]:
 
 
 def parse_outputs(text: str) -> list[Found]:
-    """The connected outputs in the text of ``xrandr --query``."""
-    found = []
-    for match in _OUTPUT.finditer(text):
-        name, (width, height, left, top) = printable(match[1]), match.groups()[1:]
+    """The connected outputs in the text of ``xrandr --query`` or ``--verbose``."""
+    found: list[Found] = []
+    places: dict[str, tuple[int, int, int, int]] = {}
+    matches = list(_OUTPUT.finditer(text))
+    for match, end in zip(matches, [*(other.start() for other in matches[1:]), len(text)], strict=True):
+        name, width = printable(match[1]), match[2]
         if width is None:
             dark = Notice.warning(
                 "output-off",
@@ -53,9 +58,29 @@ def parse_outputs(text: str) -> list[Found]:
             )
             found.append(Found("display", name, "output, off", identity=name, problems=(dark,)))
             continue
-        table = {"name": name, "width_px": int(width), "height_px": int(height)}
-        what = f"output of {width}x{height} at +{left}+{top}"
-        found.append(Found("display", name, what, "display", "player", {"outputs": [table]}, name))
+        wide, high, left, top = (int(match[number]) for number in range(2, 6))
+        problems = []
+        transform = _TRANSFORM.search(text, match.end(), end)
+        scaled = transform is not None and [float(number) for number in transform[1].split()] != _UNSCALED
+        if match[6].split() not in ([], ["normal"]) or scaled:
+            problems.append(Notice.warning(
+                "output-changed",
+                f"Output {name} is {'scaled' if scaled else 'turned'} by the X server, which changes its pixels.",
+                f"Run xrandr --output {name} --rotate normal --reflect normal --scale 1x1.",
+            ))  # fmt: skip
+        over = [other for other, (x, y, width_px, height_px) in places.items()
+                if x < left + wide and left < x + width_px and y < top + high and top < y + height_px]  # fmt: skip
+        if over:
+            problems.append(Notice.warning(
+                "output-overlaps", f"Output {name} shows the same part of the screen as {', '.join(over)}.",
+                f"Place it beside them: xrandr --output {name} --right-of the last of the others.",
+            ))  # fmt: skip
+        places[name] = left, top, wide, high
+        table = {"name": name, "width_px": wide, "height_px": high}
+        what = f"output of {wide}x{high} at +{left}+{top}"
+        found.append(
+            Found("display", name, what, "display", "player", {"outputs": [table]}, name, problems=tuple(problems))
+        )
     return found
 
 

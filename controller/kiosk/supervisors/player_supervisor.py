@@ -393,10 +393,13 @@ def _outputs_problem(status: dict[str, Any]) -> Notice | None:
     if not (names := status.get("missing_outputs")):
         return None
     if len(names) == 1:
-        what = f"The output {names[0]} of this computer is off, or has another size: its projector gets no picture."
+        what = f"The output {names[0]} of this computer is off, or not as it should be: its projector gets no picture."
     else:
-        what = f"The outputs {', '.join(names)} of this computer are off, or have another size."
-    remedy = "Check the video cable, and that the projector is on. The picture comes back by itself."
+        what = f"The outputs {', '.join(names)} of this computer are off, or not as they should be."
+    remedy = (
+        "Check the video cable, and that the projector is on. `velatura doctor` says if the output is turned, scaled, "
+        "of another size or over another one. The picture comes back by itself."
+    )
     return Notice(OUTPUT_GONE, what, remedy, Level.ERROR)
 
 

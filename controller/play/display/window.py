@@ -16,6 +16,8 @@ from controller.core.errors import UsageError
 from controller.play.display.x11 import Connector
 from controller.play.frames import OutputSize
 
+LOOK_S: Final = 2.0
+"""Between two looks at the gamma ramps."""
 _MOST_RATES_APART_HZ: Final = 0.01
 """Outputs of one window that are farther apart drift by a frame in less than two minutes."""
 
@@ -42,18 +44,15 @@ def find_connectors(
     return found
 
 
-def fits(size: OutputSize, connector: Connector | None) -> bool:
-    """Whether this output can show pictures of this size, pixel by pixel."""
-    return connector is not None and (connector.width_px, connector.height_px) == (size.width_px, size.height_px)
-
-
 def unfit(
     sizes: Sequence[OutputSize],
     where: Mapping[str, str],
     found: Mapping[str, Connector],
     connectors: Sequence[Connector],
 ) -> dict[str, UsageError]:
-    """By our name, why an output can't show its pictures: UsageError("output-missing" or "output-size-differs")."""
+    """By our name, why an output can't show its pictures: UsageError("output-missing", "output-size-differs",
+    "output-changed" or "output-overlaps").
+    """
     wrong = {}
     for size in sizes:
         wanted, connector = where.get(size.name, size.name), found.get(size.name)
@@ -64,14 +63,33 @@ def unfit(
                 what=f"The X server has no output {wanted}; it has {has or 'none'}.",
                 remedy="Check the cable and stage.toml, and force the output on if the projector is off.",
             )
-        elif not fits(size, connector):
+        elif connector.changed:
+            wrong[size.name] = UsageError(
+                "output-changed",
+                what=f"Output {size.name} is {connector.changed} by the X server, which changes its pixels.",
+                remedy=f"Run xrandr --output {connector.name} --rotate normal --reflect normal --scale 1x1.",
+            )
+        elif (connector.width_px, connector.height_px) != (size.width_px, size.height_px):
             wrong[size.name] = UsageError(
                 "output-size-differs",
                 what=f"Output {size.name} is {connector.width_px}x{connector.height_px}, but stage.toml says "
                 f"{size.width_px}x{size.height_px}.",
                 remedy="Set the output's mode with xrandr, or correct stage.toml and calibrate again.",
             )
+        elif others := [name for name, other in found.items() if name != size.name and _overlap(connector, other)]:
+            wrong[size.name] = UsageError(
+                "output-overlaps",
+                what=f"Output {size.name} shows the same part of the screen as {', '.join(others)}.",
+                remedy=f"Place it beside them: xrandr --output {connector.name} --right-of the last of the others.",
+            )
     return wrong
+
+
+def _overlap(one: Connector, other: Connector) -> bool:
+    """Whether they show a common part of the screen, as clones do."""
+    across = min(one.x + one.width_px, other.x + other.width_px) - max(one.x, other.x)
+    down = min(one.y + one.height_px, other.y + other.height_px) - max(one.y, other.y)
+    return across > 0 and down > 0
 
 
 def check_rates(found: Mapping[str, Connector]) -> None:
@@ -107,8 +125,8 @@ class WindowOutput:
 
     Outputs are found by their connector's name (``xrandr``: DP-1, HDMI-2) or their display's serial number. If none of
     them is there, but others are, and none was asked for by ``where``, they lie side by side from the upper left
-    corner, in stage order, until one of them comes. An output that is away, or has another size, stays black; when it
-    is back it shows what the others show.
+    corner, in stage order, until one of them comes. An output that is away, of another size, turned, scaled, or over
+    another one stays black; when it is as it should be it shows what the others show.
     """
 
     def __init__(self, sizes: Sequence[OutputSize], where: Mapping[str, str] | None = None) -> None:
@@ -125,8 +143,7 @@ class WindowOutput:
         self._missing: tuple[str, ...] = ()
         if not self._beside:
             self._missing = self._checked(found, connectors)
-            for connector in found.values():
-                self._server.make_plain(connector)
+        self._make_plain(found)
         self._places = self._placed(found)
         try:
             self._window = _open_window(self._extent(), self._server.kept)
@@ -160,14 +177,21 @@ class WindowOutput:
         check_rates({name: connector for name, connector in found.items() if name not in wrong})
         return tuple(wrong)
 
+    def _make_plain(self, found: Mapping[str, Connector]) -> None:
+        """A driver may give an output that returns its old gamma ramp back, and another program may set one, for
+        which there is no event.
+        """
+        self._found, self._looked_s = found, time.monotonic()
+        for name, connector in found.items():
+            if name not in self._missing:
+                self._server.make_plain(connector)
+
     def _placed(self, found: Mapping[str, Connector]) -> tuple[tuple[int, int] | None, ...]:
         """Upper left corner of each output on the X screen, None for one that is not there as it should be."""
         if self._beside:
             return tuple((sum(s.width_px for s in self._sizes[:number]), 0) for number in range(len(self._sizes)))
-        connectors = [found.get(size.name) for size in self._sizes]
         return tuple(
-            (connector.x, connector.y) if connector is not None and fits(size, connector) else None
-            for size, connector in zip(self._sizes, connectors, strict=True)
+            None if size.name in self._missing else (found[size.name].x, found[size.name].y) for size in self._sizes
         )
 
     def _extent(self) -> tuple[int, int]:
@@ -244,6 +268,8 @@ class WindowOutput:
     def pump(self) -> None:
         if self._server.changed():
             self._follow()
+        elif time.monotonic() - self._looked_s > LOOK_S:
+            self._make_plain(self._found)
         self._window.dispatch_events()
         if self._damaged and not self.continued:
             self._damaged = False
@@ -253,18 +279,17 @@ class WindowOutput:
 
     def _follow(self) -> None:
         """Outputs came, went or moved: place the window and the pictures again."""
-        found, _ = self._find()
+        found, connectors = self._find()
         # With all cables out at the start, the stage's outputs look like outputs without names.
         self._beside = self._beside and not found
         if self._beside:
             return
+        wrong = unfit(self._sizes, self._where, found, connectors)
+        for name in wrong.keys() - set(self._missing):
+            log(f"{wrong[name].what} {wrong[name].remedy}")
+        self._missing = tuple(wrong)
         before, self._places = self._places, self._placed(found)
-        names = [size.name for size in self._sizes]
-        self._missing = tuple(name for name, place in zip(names, self._places, strict=True) if place is None)
-        for name, place in zip(names, self._places, strict=True):
-            if place is not None:
-                # A driver may give an output that returns its old gamma ramp back.
-                self._server.make_plain(found[name])
+        self._make_plain(found)
         if self._places != before:
             self._window.set_size(*self._extent())
             self._window.set_location(0, 0)

@@ -14,6 +14,8 @@ from ctypes import POINTER, byref, c_int, c_ubyte, c_ulong, c_ushort, c_void_p
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 from pyglet.libs.x11 import xlib, xrandr
 
 from controller.core.errors import WorkError
@@ -25,11 +27,23 @@ _NOTIFY_EVERYTHING: Final = 0b1111
 """RandR: screen, CRTC, output and property changes."""
 _GAMMA_TOLERANCE: Final = 0x0100
 """One step of an 8-bit value in the 16 bits of a gamma ramp."""
+_UPRIGHT: Final = 1
+"""RandR: neither rotated nor reflected. A Rotation has 16 bits, and pyglet reads 32."""
+_UNSCALED: Final = [0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x10000]
 _LONGEST_PROPERTY_WORDS: Final = 8192
 _ONE_PLAYER: Final = b"_VELATURA_PLAYER"
 _PROCESS: Final = b"_NET_WM_PID"
 _PREDECESSOR_S: Final = 1.0
 """Until the server has noticed that a player which was just killed is gone."""
+
+
+class _Transforms(ctypes.Structure):
+    """XRRCrtcTransformAttributes; matrices (3, 3) in 16.16 fixed point."""
+
+    _fields_ = (
+        ("pending", c_int * 9), ("pending_filter", c_void_p), ("pending_count", c_int), ("pending_values", c_void_p),
+        ("current", c_int * 9), ("current_filter", c_void_p), ("current_count", c_int), ("current_values", c_void_p),
+    )  # fmt: skip
 
 
 class _Gamma(ctypes.Structure):
@@ -56,6 +70,7 @@ _change_property = _bind(
     "XRRChangeOutputProperty", None, _DISPLAY, c_ulong, c_ulong, c_ulong, c_int, c_int, c_void_p, c_int
 )
 _select_input = _bind("XRRSelectInput", None, _DISPLAY, c_ulong, c_int)
+_get_transform = _bind("XRRGetCrtcTransform", c_int, _DISPLAY, c_ulong, POINTER(POINTER(_Transforms)))
 _gamma_size = _bind("XRRGetCrtcGammaSize", c_int, _DISPLAY, c_ulong)
 _get_gamma = _bind("XRRGetCrtcGamma", POINTER(_Gamma), _DISPLAY, c_ulong)
 _set_gamma = _bind("XRRSetCrtcGamma", None, _DISPLAY, c_ulong, POINTER(_Gamma))
@@ -67,7 +82,8 @@ _free_gamma = _bind("XRRFreeGamma", None, POINTER(_Gamma))
 class Connector:
     """An output of the X server that shows a part of its screen.
 
-    ``serials``: names that identify its display (``edid.serial_names``); ``rate_hz``: of its mode.
+    ``serials``: names that identify its display (``edid.serial_names``); ``rate_hz``: of its mode; ``changed``: how it
+    changes the picture, "turned" or "scaled", or empty.
     """
 
     name: str
@@ -79,6 +95,7 @@ class Connector:
     rate_hz: float
     output: int
     crtc: int
+    changed: str = ""
 
 
 class XServer:
@@ -164,8 +181,18 @@ class XServer:
         pixels = mode.hTotal * mode.vTotal if mode else 0
         rate_hz = mode.dotClock / pixels if pixels else 0.0
         serials = serial_names(self._property(output, "EDID"))
-        yield Connector(name, serials, found.x, found.y, found.width, found.height, rate_hz, output, crtc)
+        changed = "turned" if found.rotation & 0xFFFF != _UPRIGHT else "scaled" if self._is_scaled(crtc) else ""
+        yield Connector(name, serials, found.x, found.y, found.width, found.height, rate_hz, output, crtc, changed)
         xrandr.XRRFreeCrtcInfo(place)
+
+    def _is_scaled(self, crtc: int) -> bool:
+        """Whether it scales or bends the picture (RandR 1.3, transforms)."""
+        attributes = POINTER(_Transforms)()
+        if not _get_transform(self._address, crtc, byref(attributes)) or not attributes:
+            return False
+        scaled = list(attributes.contents.current) != _UNSCALED
+        xlib.XFree(attributes)
+        return scaled
 
     def _property(self, output: int, name: str) -> bytes:
         """An output's property, empty where it has none of this name. Items of 32 bits are c_ulong, as in Xlib."""
@@ -202,22 +229,16 @@ class XServer:
         ramp = _get_gamma(self._address, crtc) if _gamma_size(self._address, crtc) > 1 else None
         if not ramp:
             return True
-        size = ramp.contents.size
-        channels = (ramp.contents.red, ramp.contents.green, ramp.contents.blue)
-        plain = all(
-            abs(channel[place] - place * 0xFFFF // (size - 1)) <= _GAMMA_TOLERANCE
-            for channel in channels
-            for place in range(size)
-        )
+        channels = _channels(ramp.contents)
+        plain = bool((abs(channels - _plain_ramp(ramp.contents.size)) <= _GAMMA_TOLERANCE).all())
         _free_gamma(ramp)
         return plain
 
     def _set_plain_gamma(self, crtc: int) -> None:
         size = _gamma_size(self._address, crtc)
         ramp = _alloc_gamma(size)
-        for place in range(size):
-            value = place * 0xFFFF // (size - 1)
-            ramp.contents.red[place] = ramp.contents.green[place] = ramp.contents.blue[place] = value
+        for channel in (ramp.contents.red, ramp.contents.green, ramp.contents.blue):
+            np.ctypeslib.as_array(channel, (size,))[:] = _plain_ramp(size)
         _set_gamma(self._address, crtc, ramp)
         _free_gamma(ramp)
         xlib.XSync(self._display, 0)
@@ -235,6 +256,14 @@ class XServer:
         """Tell a compositing window manager to leave this window alone (EWMH, _NET_WM_BYPASS_COMPOSITOR)."""
         set_number(self._display, window, b"_NET_WM_BYPASS_COMPOSITOR", 1)
         xlib.XSync(self._display, 0)
+
+
+def _channels(ramp: Any) -> npt.NDArray[np.int64]:
+    return np.array([channel[: ramp.size] for channel in (ramp.red, ramp.green, ramp.blue)], np.int64)
+
+
+def _plain_ramp(size: int) -> npt.NDArray[np.int64]:
+    return np.arange(size) * 0xFFFF // (size - 1)
 
 
 def _power_saving() -> Callable[[c_void_p], int] | None:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ import pytest
 from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.core.errors import WorkError
 from controller.play.control.launch import PlayerProcess
+from controller.play.display.window import unfit
+from controller.play.display.x11 import Connector
+from controller.play.frames import OutputSize
+from hal.deadline import in_seconds
+from hal.finding import SearchScope
+from plugins.finding.outputs import find, parse_outputs
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.display.xorg import CONNECTORS, HEIGHT, WIDTH, Outputs, edid, running_server
 from tests.controller.play.wire import Frames, Pictures, Wire, noise
@@ -119,6 +126,68 @@ def test_what_can_not_be_right_is_refused_with_its_reason(outputs: Outputs, play
     for connector in ("DUMMY0", "DUMMY1"):
         outputs.set_edid(connector, edid("twin"))
     assert "DUMMY0 and DUMMY1 have the same serial number twin" in refusal(play, where={**WHERE, "P2": "twin"})
+
+
+@pytest.mark.parametrize("left", [0, WIDTH // 2])
+def test_outputs_that_show_one_part_of_the_screen_are_named_at_the_start_and_later(
+    outputs: Outputs, play: Start, left: int
+) -> None:
+    outputs.place("DUMMY1", left)
+    problems = [notice for found in find(SearchScope(Path()), in_seconds(20)) for notice in found.problems]
+    assert "DUMMY1 shows the same part of the screen as DUMMY0" in problems[0].what
+    with Wire(play().socket) as wire:
+        assert wire.ask("status")["missing_outputs"] == ["P1", "P2"]
+        assert wire.ask("play", appearance="3")["ok"]
+        assert not outputs.picture(0).any(), "rather dark than the picture of another projector"
+        assert np.array_equal(outputs.picture(2 * WIDTH), noise(SIZES, 3)["Prój3"])
+        outputs.reset()
+        assert comes_true(lambda: same(shown(outputs), noise(SIZES, 3)))
+        assert wire.ask("status")["missing_outputs"] == []
+        outputs.place("DUMMY1", left)
+        assert comes_true(lambda: wire.ask("status")["missing_outputs"] == ["P1", "P2"])
+
+
+def test_outputs_that_all_show_the_same_are_refused(outputs: Outputs, play: Start) -> None:
+    for connector in CONNECTORS:
+        outputs.place(connector, 0)
+    assert "P1 shows the same part of the screen as P2, Prój3" in refusal(play)
+
+
+@pytest.mark.parametrize("how", ["turned", "scaled"])
+def test_an_output_that_the_server_turns_or_scales_is_named(how: str) -> None:
+    """The dummy driver can do neither."""
+    upright = Connector("DP-1", (), 0, 0, WIDTH, HEIGHT, 60.0, 1, 1)
+    sizes, where = [OutputSize("P1", WIDTH, HEIGHT)], {"P1": "DP-1"}
+    assert unfit(sizes, where, {"P1": upright}, [upright]) == {}
+    changed = replace(upright, changed=how)
+    error = unfit(sizes, where, {"P1": changed}, [changed])["P1"]
+    assert (error.code, how in error.what, "DP-1" in error.remedy) == ("output-changed", True, True)
+
+
+def test_the_doctor_names_an_output_that_is_turned_or_scaled() -> None:
+    lines = [
+        "DP-1 connected primary 1920x1080+0+0 (0x48) {} (normal left inverted right x axis y axis) 0mm x 0mm",
+        "\tTransform:  {} 0.000000 0.000000",
+        "\t            0.000000 1.000000 0.000000",
+        "\t            0.000000 0.000000 1.000000",
+        "\t           filter: ",
+    ]
+
+    def told(rotation: str, scale: str) -> list[str]:
+        text = "\n".join(lines).format(rotation, scale)
+        return [notice.what.split()[3] for one in parse_outputs(text) for notice in one.problems]
+
+    assert told("normal", "1.000000") == []
+    assert told("left", "1.000000") == ["turned"]
+    assert told("normal X axis", "1.000000") == ["turned"]
+    assert told("normal", "0.500000") == ["scaled"]
+
+
+def test_a_gamma_ramp_that_another_program_sets_meanwhile_is_taken_away(outputs: Outputs, play: Start) -> None:
+    with Wire(play().socket) as wire:
+        wire.ask("play", appearance="2")
+        outputs.xrandr("--output", "DUMMY2", "--gamma", "1:1:2")
+        assert comes_true(lambda: gammas() == ["1.0:1.0:1.0"] * 3)
 
 
 def test_an_output_that_goes_is_named_and_shows_the_picture_when_it_is_back(outputs: Outputs, play: Start) -> None:
