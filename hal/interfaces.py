@@ -50,7 +50,7 @@ class Projector(Device, Protocol):
     def capabilities(self) -> ProjectorCapabilities: ...
 
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
-        """Power, faults and lamp hours as the device answers now; never a stored answer."""
+        """Power and faults as the device answers now, never a stored answer; lamp hours may be an hour old."""
 
     def switch_on(self, *, deadline: Deadline) -> None:
         """Ask for power on; returns once the device has accepted (it may still warm up).

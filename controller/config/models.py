@@ -104,6 +104,12 @@ class ProjectorTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
     output: Name = Field(description="the name of the display output that feeds this projector")
     driver: Name = Field(description='the name of a projector driver, e.g. "serial"')
+    ask_lit_s: float = Field(
+        default=15.0, ge=1, le=60, description="seconds between two questions to a lit projector, 1 to 60"
+    )
+    ask_dark_s: float = Field(
+        default=18.0, ge=1, le=60, description="seconds between two questions to a dark projector, 1 to 60"
+    )
     douser: DouserTable | None = Field(default=None, description="the table [projectors.douser]")
 
 

@@ -12,7 +12,6 @@ import hmac
 import random
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -43,8 +42,9 @@ class PjLinkOddities:
     ``ending`` of its lines; ``salt_digits`` of the random number for the password. ``closes``: it closes the connection
     after each answer; ``closes_unanswered``: a command (such as ``POWR 1``) that it carries out and then closes the
     connection without an answer. ``mutes``: the parameters of AVMT that it accepts. ``second_level_only``: it accepts
-    no MD5 digest, but SHA-256 after ``PJLINK 2`` (class 2, version 2.10). ``chatty``: it reports that it came up
-    before it answers, and pads with NUL.
+    no MD5 digest, but SHA-256 after ``PJLINK 2`` (class 2, version 2.10). ``digest_each``: it wants the digest with
+    each command of a connection. ``dark_answer``: what it answers to the question for its power in standby. ``chatty``:
+    it reports that it came up before it answers, and pads with NUL.
     """
 
     answers: Mapping[str, bytes | None] = field(default_factory=dict)
@@ -56,6 +56,8 @@ class PjLinkOddities:
     closes_unanswered: str = ""
     mutes: tuple[bytes, ...] = (b"10", b"11", b"20", b"21", b"30", b"31")
     second_level_only: bool = False
+    digest_each: bool = False
+    dark_answer: bytes = b"0"
     chatty: bool = False
 
 
@@ -96,8 +98,9 @@ class PjLinkBoard:
             return _SECOND[name]
         if name in (b"INPT", b"AVMT") and not self._lamp.burning:
             return b"ERR3"
+        power = self.odd.dark_answer if self._lamp.phase is LampPhase.STANDBY else _POWER[self._lamp.phase]
         state: dict[bytes, Callable[[], bytes]] = {
-            b"POWR": lambda: _POWER[self._lamp.phase],
+            b"POWR": lambda: power,
             b"LAMP": lambda: b"%d %d" % (self._lamp.hours, self._lamp.burning),
             b"ERST": lambda: b"0%d%d000" % (2 * self._lamp.failed, 2 * self._lamp.too_hot),
             b"NAME": lambda: self._name,
@@ -193,11 +196,11 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
     lamp : its lamp; the optical bench reads the same one
     port : TCP port, 0 for any free one (see ``address`` once started)
     password : asked of every client, or None
-    idle_s : seconds after which an idle connection is closed (the specification says 30)
+    idle_s : seconds of its lamp's clock after which an idle connection is closed (the specification says 30)
     odd : in what it differs from the specification
     wedges_below_s : asked twice within this time while it warms or cools, it hangs: ``wedged`` is true for good
 
-    ``heard``: the commands that it read, without their CR.
+    ``heard``: the commands that it read, without their CR; ``connections``: how many it accepted.
 
     ``faults`` are its knobs, ``scenario`` a script that turns them at what it hears; ``silent`` and ``slow_s`` hold for
     the greeting too.
@@ -218,6 +221,7 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
         TcpServer.__init__(self, port)
         self._board = PjLinkBoard(lamp, name, odd)
         self.heard: list[bytes] = []
+        self.connections = 0
         self._board_lock = threading.Lock()
         self._password = password
         self._idle_s = idle_s
@@ -228,6 +232,7 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
         self._board.odd = odd
 
     def _serve(self, client: socket.socket) -> None:
+        self.connections += 1
         with client, contextlib.suppress(OSError):
             client.settimeout(_TICK_S)
             check = None if self._password is None else PasswordCheck(self._password, self._board.odd, self._random)
@@ -240,7 +245,7 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
                 if self.scenario is not None:
                     self.scenario.tick()
                     self.scenario.heard(len(line) + 1)
-                if check is not None and not check.passed:
+                if check is not None and (not check.passed or self._board.odd.digest_each):
                     reply = check.hears(line)
                     if reply:
                         self._send(client, reply)
@@ -262,8 +267,9 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
     def _lines(self, client: socket.socket) -> Iterator[bytes]:
         """Lines without their CR until the client goes, is idle too long, or sends a line that never ends."""
         buffer = bytearray()
-        heard = time.monotonic()
-        while not self._stopped.is_set() and time.monotonic() - heard < self._idle_s and len(buffer) < _LONGEST:
+        clock = self.lamp.clock
+        heard = clock()
+        while not self._stopped.is_set() and clock() - heard < self._idle_s and len(buffer) < _LONGEST:
             while (end := buffer.find(CR)) >= 0:
                 line = bytes(buffer[:end])
                 del buffer[: end + 1]
@@ -272,9 +278,9 @@ class EmulatedPjLinkProjector(EmulatedProjector, TcpServer):
                 data = client.recv(1024)
             except TimeoutError:
                 continue
-            if not data:
+            if not data or clock() - heard >= self._idle_s:
                 return
-            heard = time.monotonic()
+            heard = clock()
             buffer += data
 
     def _send(self, client: socket.socket, data: bytes) -> None:

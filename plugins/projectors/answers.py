@@ -13,9 +13,10 @@ repeated seldom.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
+from hal.deadline import Deadline
 from hal.notices import Notice
 from hal.values import LampRules, Power
 
@@ -120,6 +121,12 @@ SILENT_S: Final = 60.0
 """Time before an unanswered optional query is repeated, because each costs seconds."""
 
 
+COUNTER_S: Final = 3600.0
+"""Counters such as lamp hours are asked again after this time, and when the power state has changed."""
+UNCOUNTED_S: Final = 300.0
+"""The same for one that was not told."""
+
+
 class OptionalAnswers:
     """For one projector. ``name``: its name for the technician; ``fields``: the purpose of each query, for notes."""
 
@@ -130,6 +137,18 @@ class OptionalAnswers:
         self._unknown: set[str] = set()
         self._noted: set[str] = set()
         self._unreported: list[Notice] = []
+        self._counters: dict[str, tuple[float, Power, int | None]] = {}
+
+    def counted(
+        self, question: str, power: Power, ask: Callable[[Deadline], int | None], deadline: Deadline
+    ) -> int | None:
+        """The value of a counter: as it was last told, or asked now."""
+        now_s = deadline.time.monotonic()
+        asked_at_s, before, value = self._counters.get(question, (0.0, None, None))
+        if before is not power or now_s - asked_at_s >= (UNCOUNTED_S if value is None else COUNTER_S):
+            value = ask(deadline)
+            self._counters[question] = now_s, power, value
+        return value
 
     def may_ask(self, question: str) -> bool:
         """Whether to send an optional query now."""

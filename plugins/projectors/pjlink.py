@@ -18,15 +18,15 @@ from hal.notices import Notice
 from hal.registry import Driver, OpenContext, setting
 from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
-from plugins.projectors.pjlink_conversation import Habits, PjLinkConversation
+from plugins.projectors.pjlink_conversation import PjLinkConversation
 from plugins.projectors.profile_files import load_profile
 
 
 class PjLinkProjector:
     """A projector with PJLink. Implements ``hal.interfaces.Projector``.
 
-    Every call has its own connection: the projector closes idle ones after 30 s, and unread data of an
-    old one can never be taken for a new answer.
+    One connection is kept: the control boards of some projectors stop for good after some ten thousand of them. It is
+    closed where an answer is lost, and where the projector closes its own.
 
     Parameters
     ----------
@@ -45,15 +45,13 @@ class PjLinkProjector:
         password: str | None = None,
         transcript: Transcript | None = None,
     ) -> None:
-        self._connect = connect
+        self._talk = PjLinkConversation(connect, name, password, profile)
+        self._habits = self._talk.habits
         self._timing = profile.timing
-        self._habits = Habits(name, profile.timing)
         self._lamp = profile.lamp
         self._name = name
-        self._password = password
         self._transcript = transcript
         self._lock = threading.Lock()
-        self._closed = False
         self._inputs: tuple[str, ...] = ()
 
     def open(self, deadline: Deadline) -> None:
@@ -89,14 +87,18 @@ class PjLinkProjector:
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
         with self._turn(deadline) as talk:
             power = talk.power(deadline)
+            if power in (Power.WARMING, Power.COOLING):
+                return ProjectorStatus(power)  # one that is busy with its lamp is asked only for its power
             trouble = talk.optional("ERST", pjlink.parse_errors, deadline) or ()
-            lamps = talk.optional("LAMP", pjlink.parse_lamps, deadline) or ()
+            if power is Power.FAULT and not trouble:
+                trouble = ("projector-failed",)
             failed = any(not word.endswith("-warning") for word in trouble)
-            return ProjectorStatus(
-                Power.FAULT if failed and power is Power.OFF else power,
-                trouble,
-                max((lamp.hours for lamp in lamps), default=None),
-            )
+            hours = self._habits.counted("LAMP", power, partial(self._hours, talk), deadline)
+            return ProjectorStatus(Power.FAULT if failed and power is Power.OFF else power, trouble, hours)
+
+    def _hours(self, talk: PjLinkConversation, deadline: Deadline) -> int | None:
+        lamps = talk.optional("LAMP", pjlink.parse_lamps, deadline) or ()
+        return max((lamp.hours for lamp in lamps), default=None)
 
     def adjustments(self, *, deadline: Deadline) -> dict[str, str]:
         """As ``hal.interfaces.AdjustedProjector.adjustments``: PJLink has only the input."""
@@ -118,12 +120,18 @@ class PjLinkProjector:
 
     def switch_off(self, *, deadline: Deadline) -> None:
         with self._turn(deadline) as talk:
-            lit = (Power.ON, Power.WARMING)
-            burning = talk.power(deadline) in lit
-            if burning:
+            lit, power = (Power.ON, Power.WARMING), None
+            with contextlib.suppress(DeviceBusy):
+                power = talk.power(deadline)
+            if power in (Power.OFF, Power.COOLING) and self._habits.unavailable_since_s is None:
+                return
+            try:
                 self._command(talk, "POWR", "0", "switch off", deadline, lambda: talk.power(deadline) in lit)
-        if burning:
-            self._confirm((Power.OFF, Power.COOLING), "off", deadline)
+            except DeviceRefused:
+                if power in (Power.OFF, Power.COOLING, Power.FAULT):
+                    return  # what it does not say for certain
+                raise
+        self._confirm((Power.OFF, Power.COOLING, Power.FAULT), "off", deadline)
 
     def set_shutter(self, closed: bool, *, deadline: Deadline) -> None:
         with self._turn(deadline) as talk:
@@ -149,7 +157,7 @@ class PjLinkProjector:
         return self._habits.notices()
 
     def close(self) -> None:
-        self._closed = True
+        self._talk.close()
         if self._transcript is not None:
             self._transcript.close()
 
@@ -211,8 +219,7 @@ class PjLinkProjector:
                 return talk.power(deadline) in wanted
         except (DeviceBusy, DeviceTimeout, DeviceGone):
             # A starting projector may not answer for a while.
-            if self._closed:
-                raise
+            self._talk.check_open()
             return False
 
     def _refused(self, code: str, doing: str) -> DeviceRefused:
@@ -224,17 +231,12 @@ class PjLinkProjector:
 
     @contextlib.contextmanager
     def _turn(self, deadline: Deadline) -> Iterator[PjLinkConversation]:
-        """One caller at a time, none after ``close``; with its own connection."""
-        talk = PjLinkConversation(self._connect, self._name, self._password, self._timing, self._habits)
-        talk.check(deadline)
-        with turn(self._lock, deadline, partial(talk.check, deadline)), contextlib.closing(talk):
-            if self._closed:
-                raise DeviceGone(
-                    "projector-closed",
-                    what=f"The projector at {self._name} is no longer open.",
-                    remedy="Open the stage again.",
-                )
-            yield talk
+        """One caller at a time, none after ``close``."""
+        check = partial(self._talk.check, deadline)
+        check()
+        with turn(self._lock, deadline, check):
+            self._talk.check_open()
+            yield self._talk
 
 
 def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[str, int, str | None, ProjectorProfile]:

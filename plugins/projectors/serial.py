@@ -124,7 +124,7 @@ class SerialProjector:
     def status(self, *, deadline: Deadline) -> ProjectorStatus:
         with self._turn(deadline):
             power = self._power(deadline)
-            hours = self._hours(power, deadline)
+            hours = self._optional.counted("lamp_hours", power, partial(self._hours, power), deadline)
             unnamed = power is Power.FAULT and not self._view.trouble
             return ProjectorStatus(power, (UNNAMED_FAULT,) if unnamed else self._view.trouble, hours)
 

@@ -17,7 +17,7 @@ from controller.kiosk.interface import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.light_records import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
-from controller.kiosk.supervisors.projector_supervisor import LampBefore, Mains, ProjectorSupervisor
+from controller.kiosk.supervisors.projector_supervisor import LampBefore, Mains, Pace, ProjectorSupervisor
 from controller.kiosk.world import World
 from controller.stage.rig.ambient_light import AmbientLightLimit, LightWatch
 from controller.stage.rig.lamp_guard import LampGuard
@@ -171,8 +171,10 @@ class Devices:
         # Before its projector is reached: an opening may come first.
         failed = 0 if record is None else record.failed_in(self._world.boot())
         lamp = LampBefore(maybe_lit, failed, partial(self._ledger.forgive, table.name))
-        return ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, mains=mains, lamp=lamp,
-                                   deadline=self._world.deadline)  # fmt: skip
+        supervisor = ProjectorSupervisor(table.name, open_guard, self._tell, clock=self._world, mains=mains, lamp=lamp,
+                                         deadline=self._world.deadline)  # fmt: skip
+        supervisor.pace = Pace(table.ask_lit_s, table.ask_dark_s)
+        return supervisor
 
     def _unfed(self, projector: str) -> Notice | None:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]

@@ -28,10 +28,22 @@ LINE_WELL_S: Final = 60.0
 REOPEN_AFTER_FAULT_S: Final = 120.0
 """A projector that reported a fault is reopened after this time: many report a fault, but never its end."""
 LIGHT_MARGIN_S: Final = 30.0
+LONGEST_WARM_UP_S: Final = 900.0
+"""A projector that says itself that it warms up has so long: switched off in its warm-up, a lamp suffers."""
 _LOOKS: Final = {
     Power.ON: Condition.LIT, Power.WARMING: Condition.LIGHTING, Power.COOLING: Condition.COOLING,
     Power.OFF: Condition.DARK,
 }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Seconds between two questions to a projector that is lit, or dark, as wanted. While a change is expected, every
+    step asks: the control boards of some hang when they are asked often for long.
+    """
+
+    lit_s: float = 15.0
+    dark_s: float = 18.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +110,11 @@ class ProjectorSupervisor:
         self._answers_since_s: float | None = None
         self._burning = False
         self._faulty_since_s: float | None = None
+        self.pace = Pace()
+        self._answered_at_s = float("-inf")
+        """When it last answered; long ago if it is to be asked at once."""
+        self._phase: tuple[Power, float] | None = None
+        """What it says it does, warming or cooling, and since when; infinitely late once that was told as too long."""
 
     @property
     def view(self) -> ProjectorView:
@@ -128,15 +145,18 @@ class ProjectorSupervisor:
             self._keep_forgiven(MOST_STRIKES - 1)
         if wanted and not self._want_lit:
             self._faulty_since_s, self._unanswered = float("-inf"), False
+        if wanted is not self._want_lit:
+            self._answered_at_s = float("-inf")
         self._want_lit = wanted
 
     def forgive(self) -> None:
         """After the technician's repair: allow all attempts again, the first at once."""
         self._failed_strikes, self._faulty_since_s, self._unanswered = 0, float("-inf"), False
+        self._answered_at_s = float("-inf")
         self._keep_forgiven(0)
 
     def step(self) -> None:
-        """Read the status once, and act on it. Blocks for a few answers at most; device errors are not raised."""
+        """Read the status if it is time to, and act on it. It blocks for a few answers; raises no device errors."""
         self._stepping = True
         try:
             self._step()
@@ -146,7 +166,7 @@ class ProjectorSupervisor:
     def _step(self) -> None:
         if self._mains.asleep():
             self._silent_since_s = None
-            self._reopen_at_s = 0.0
+            self._reopen_at_s, self._answered_at_s = 0.0, float("-inf")
             self._show(ProjectorView(self.name, Condition.DARK, Power.OFF, looked=True, hours=self._view.hours,
                                      strikes=self._view.strikes, counter_hours=self._view.counter_hours))  # fmt: skip
             return
@@ -154,6 +174,11 @@ class ProjectorSupervisor:
             guard = self._opened()
             if guard is None:
                 return
+            if self._clock.now_s() - self._answered_at_s < self._pause_s(guard):
+                self._show(replace(self._view, stable_left_s=guard.stable_left_s()))
+                return
+            # Before the question: what is wanted may change while it is answered.
+            self._answered_at_s = self._clock.now_s()
             status = guard.status(deadline=self._deadline(ANSWER_S))
             for notice in guard.notices():
                 self._tell(Notice(notice.code, notice.text, "", Level.WARNING))
@@ -161,6 +186,7 @@ class ProjectorSupervisor:
             self._silent(error)
             return
         self._silent_since_s = None
+        self._watch_phase(guard, status.power)
         if self._answers_since_s is None:
             self._answers_since_s = self._clock.now_s()
         # Read late: opening the line takes seconds, and the lamp may not be wanted any more.
@@ -177,6 +203,41 @@ class ProjectorSupervisor:
             self._see(self._view.condition, status, Notice.of(error, level=Level.ERROR))
         self._keep_failed(guard)
 
+    def _pause_s(self, guard: LampGuard) -> float:
+        """Seconds from the last answer to the next question; 0 while a change is expected."""
+        wanted, view = self._want_lit, self._view
+        if self._silent_since_s is not None or view.condition in (Condition.LIGHTING, Condition.COOLING):
+            return 0.0
+        if view.condition is Condition.LIT and wanted is not False:
+            return self.pace.lit_s
+        if view.condition is Condition.DARK and not wanted:
+            return self.pace.dark_s
+        # A fault, or a lamp that is given up. One that may burn is switched off until it does not.
+        full = view.problem is not None and view.problem.code == DISK_FULL
+        broken = view.condition is Condition.BROKEN and not full
+        return self.pace.lit_s if broken and (wanted or not guard.may_be_lit) else 0.0
+
+    def _watch_phase(self, guard: LampGuard, power: Power) -> None:
+        """Tell once if the projector says for longer than its profile that it warms up or cools."""
+        now_s = self._clock.now_s()
+        if power not in (Power.WARMING, Power.COOLING):
+            self._phase = None
+        elif self._phase is None or self._phase[0] is not power:
+            self._phase = power, now_s
+        else:
+            cools = power is Power.COOLING
+            rules = guard.capabilities.lamp_rules
+            limit_s = 2 * rules.cool_down_s + LIGHT_MARGIN_S if cools else self._light_limit_s(guard)
+            if now_s - self._phase[1] > limit_s:
+                self._phase = power, float("inf")
+                does = "cooled" if cools else "warmed up"
+                self._tell(Notice(
+                    f"lamp-{'cools' if cools else 'warms'}-long",
+                    f"Projector {self.name} has {does} for {limit_s:.0f} s, longer than its profile expects.",
+                    "Wait for it. If it always takes so long, give the time under [safety] in stage.toml.",
+                    Level.WARNING,
+                ))  # fmt: skip
+
     def _keep_failed(self, guard: LampGuard) -> None:
         guard.keep_failed(self._failed_strikes + (self._struck_at_s is not None))
 
@@ -192,6 +253,7 @@ class ProjectorSupervisor:
         if self._guard is None:
             if self._clock.now_s() < self._reopen_at_s:
                 return None
+            self._answered_at_s = float("-inf")
             self._guard = self._open_guard(self._deadline(ANSWER_S))
             if self._closed:
                 # Closed while it was being opened: release the line, because the next service needs it.
@@ -279,7 +341,7 @@ class ProjectorSupervisor:
         if self._struck_at_s is None or not self._warms:
             # A command may arrive late, and a lamp is not switched off in the middle of its warm-up.
             self._struck_at_s, self._warms = self._clock.now_s(), True
-        if self._clock.now_s() - self._struck_at_s > self._light_limit_s(guard):
+        if self._clock.now_s() - self._struck_at_s > max(LONGEST_WARM_UP_S, self._light_limit_s(guard)):
             self._strike_failed()
             guard.switch_off(deadline=self._deadline(guard.switch_s))
         self._see(Condition.LIGHTING, status, self._awaited)

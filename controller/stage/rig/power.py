@@ -131,7 +131,10 @@ def power_down(
 
 
 def _check(guard: LampGuard, deadline: Deadline) -> None:
-    status = guard.status(deadline=deadline.within(guard.answer_s))
+    try:
+        status = guard.status(deadline=deadline.within(guard.answer_s))
+    except DeviceBusy:
+        return  # it is there
     if status.power is Power.FAULT or fatal_faults(status):
         raise faulty(guard.name, status, then=START_AGAIN)
 
@@ -142,8 +145,9 @@ def _strike(guard: LampGuard, deadline: Deadline, advance: Advance, clock: Clock
     while True:
         try:
             return guard.switch_on(deadline=deadline.within(guard.switch_s))
-        except DeviceRefused as error:
-            if error.code not in ("lamp-resting", "lamp-cooling"):
+        except (DeviceRefused, DeviceBusy) as error:
+            # One that is busy does not report its power state for a while.
+            if error.code not in ("lamp-resting", "lamp-cooling", "projector-busy"):
                 raise
             deadline.check(error.code, what=error.what, remedy=error.remedy)
             _rest(guard, guard.rest_left_s(), deadline, advance, clock)

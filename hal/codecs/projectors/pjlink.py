@@ -156,10 +156,10 @@ def accepted(text: str) -> None:
 
 
 def parse_power(text: str) -> Power:
-    """POWR: 0 standby, 1 on, 2 cooling, 3 warm-up (4.2)."""
-    if text not in _POWERS:
+    """POWR: 0 standby, 1 on, 2 cooling, 3 warm-up (4.2); some projectors have more states, which are UNKNOWN."""
+    if not re.fullmatch("[0-9]", text, re.ASCII):
         raise _broken(text.encode(), "a power state")
-    return _POWERS[text]
+    return _POWERS.get(text, Power.UNKNOWN)
 
 
 def parse_errors(text: str) -> tuple[str, ...]:

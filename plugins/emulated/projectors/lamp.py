@@ -54,7 +54,7 @@ class EmulatedLamp:
         self, timing: LampTiming, *, hours: float = 1200.0, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._timing = timing
-        self._clock = clock
+        self.clock = self._clock = clock
         self._lock = threading.RLock()
         self._lit_since: float | None = None
         self._off_since: float | None = None

@@ -132,7 +132,7 @@ def test_a_silent_lamp_question_never_costs_the_power_state(open_pjlink: Any, le
     ("answer", "error"),
     [
         (b"", ProtocolError),
-        (b"4", ProtocolError),
+        (b"44", ProtocolError),
         (b"1 1", ProtocolError),
         (b"on", ProtocolError),
         (None, DeviceTimeout),

@@ -16,7 +16,7 @@ from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors import projector_supervisor
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
-from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES
+from controller.kiosk.supervisors.projector_supervisor import MOST_STRIKES, Pace
 from controller.kiosk.world import World
 from controller.stage.rig.lamp_ledger import LampFile, LampRecord
 from controller.stage.sessions.check import check_stage
@@ -58,6 +58,7 @@ def test_work_whose_projector_is_lost_meanwhile_says_which_and_not_that_somebody
         raise closed()
     with pytest.raises(DeviceGone) as caught, devices.lent():  # noqa: PT012 - the supervisor works meanwhile
         monkeypatch.setattr(QuickLamp, "status", silent)
+        devices.projectors[0].pace = Pace(0.0, 0.0)
         devices.projectors[0].step()
         assert not models.lamps["A"].open
         raise closed()

@@ -112,7 +112,7 @@ def test_values() -> None:
 @pytest.mark.parametrize(
     ("parse", "text"),
     [
-        (pjlink.parse_power, "4"),
+        (pjlink.parse_power, "44"),
         (pjlink.parse_power, "\u0661"),
         (pjlink.parse_errors, "00000"),
         (pjlink.parse_errors, "000003"),
