@@ -13,8 +13,8 @@ from controller.kiosk.supervisors.projector_supervisor import ProjectorSuperviso
 from controller.stage.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
 from hal.links import TcpLink
+from lab.emulated.pjlink import EmulatedPjLinkProjector, PjLinkOddities
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.pjlink import EmulatedPjLinkProjector, PjLinkOddities
 from plugins.projectors.pjlink import PjLinkProjector
 from plugins.projectors.profile_files import load_profile
 from tests.controller.stage.rig.lamp_model import Shelf, World
