@@ -124,7 +124,7 @@ SILENT_S: Final = 60.0
 COUNTER_S: Final = 3600.0
 """Counters such as lamp hours are asked again after this time, and when the power state has changed."""
 UNCOUNTED_S: Final = 300.0
-"""The same for one that was not told."""
+"""The same for one without an answer."""
 
 
 class OptionalAnswers:
@@ -142,7 +142,7 @@ class OptionalAnswers:
     def counted(
         self, question: str, power: Power, ask: Callable[[Deadline], int | None], deadline: Deadline
     ) -> int | None:
-        """The value of a counter: as it was last told, or asked now."""
+        """The value of a counter: as it was last answered, or asked now."""
         now_s = deadline.time.monotonic()
         asked_at_s, before, value = self._counters.get(question, (0.0, None, None))
         if before is not power or now_s - asked_at_s >= (UNCOUNTED_S if value is None else COUNTER_S):

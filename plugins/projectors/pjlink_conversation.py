@@ -53,7 +53,7 @@ class Habits(OptionalAnswers):
         self._switched_on_at_s = -1e9
 
     def switched(self, on: bool) -> None:
-        """It was told to switch on or off, by the last message."""
+        """The last message was to switch it on or off."""
         self._switched_on_at_s = self._asked_at_s if on else -1e9
 
     def power_unavailable(self, deadline: Deadline) -> Power | None:
