@@ -114,7 +114,7 @@ class ProjectorSupervisor:
         self._answered_at_s = float("-inf")
         """When it last answered; long ago if it is to be asked at once."""
         self._phase: tuple[Power, float] | None = None
-        """What it says it does, warming or cooling, and since when; infinitely late once it was reported as too long."""
+        """What it says it does, warming or cooling, and since when; infinitely late once that was reported."""
 
     @property
     def view(self) -> ProjectorView:
