@@ -1,1 +1,1 @@
-"""Emulated devices and light that only engineers need: a USB bus, PJLink projectors, light by Mitsuba."""
+"""Emulated devices and light that only engineers need: projectors, cameras, a USB bus, light by Mitsuba."""

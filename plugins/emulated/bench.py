@@ -29,12 +29,14 @@ from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.faults import ScenarioPlayer, read_scenario
 from plugins.emulated.core.shot import Expose
 from plugins.emulated.core.truth import (
+    DEFAULT_BOARD,
     FOLDER,
     USB_FILE,
     BenchTruth,
     CameraTruth,
     LampTruth,
     ObjectTruth,
+    ProjectorTruth,
     read_truth,
     write_truth,
 )
@@ -50,10 +52,10 @@ from plugins.emulated.optics.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.projectors.boards import DEFAULT_BOARD, board_named, projector_on_its_wire, quick_profile
 from plugins.emulated.projectors.dousers import dmx_nodes
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.projector import BoardProjector
+from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.tape import serve_tape
 
 if TYPE_CHECKING:
@@ -214,11 +216,15 @@ def _start(
     if script is None and truth.scenario:
         script = stage / truth.scenario
     scenario = read_scenario(script) if script is not None else None
+    lamps = [EmulatedLamp(_timing(projector.lamp)) for projector in truth.projectors]
+    boot_s = {name: one.boot_s for one in truth.mains for name in one.feeds}
+    wires = {
+        projector.name: _on_its_wire(stage, projector, lamp, boot_s.get(projector.name, 0.0))
+        for projector, lamp in zip(truth.projectors, lamps, strict=True)
+    }
     for family in {projector.board for projector in truth.projectors}:
-        board_named(family)
         with _explained(stage):
             _write_fast_profile(stage, family)
-    lamps = [EmulatedLamp(_timing(projector.lamp)) for projector in truth.projectors]
 
     def progress(share: float) -> None:
         if stopped.is_set():
@@ -229,15 +235,11 @@ def _start(
         world = stack.enter_context(World(stage, truth, lamps, progress=progress))
     world.warm()
     _follow_bumps(world, out)
-    boot_s = {name: one.boot_s for one in truth.mains for name in one.feeds}
-    wires: dict[str, BoardProjector] = {}
-    for projector, lamp in zip(truth.projectors, lamps, strict=True):
-        wire = projector_on_its_wire(stage, projector, lamp, boot_s.get(projector.name, 0.0))
-        wires[projector.name] = wire
+    for name, wire in wires.items():
         if scenario is not None:
-            wire.scenario = ScenarioPlayer(scenario, device=projector.name, faults=wire.faults, lamp=lamp, plug=wire)
+            wire.scenario = ScenarioPlayer(scenario, device=name, faults=wire.faults, lamp=wire.lamp, plug=wire)
         stack.enter_context(wire)
-        out.served(projector.name, "projector", wire.address)
+        out.served(name, "projector", wire.address)
     covered = {one.name: lamp for one, lamp in zip(truth.projectors, lamps, strict=True)}
     for node in dmx_nodes(truth.dousers, covered, out.douser):
         out.served("douser", "dmx", stack.enter_context(node).address)
@@ -277,6 +279,14 @@ def _usb_devices(stage: Path, truth: BenchTruth) -> UsbDevices | None:
         stage, truth
     )
     return devices
+
+
+def _on_its_wire(stage: Path, truth: ProjectorTruth, lamp: EmulatedLamp, boot_s: float) -> Any:
+    """The projector, not started yet; those of other makers, and on a LAN port, are of an extension."""
+    if truth.board == DEFAULT_BOARD and not truth.tcp_port:
+        return EmulatedSerialProjector(stage / truth.port, lamp, boot_s=boot_s)
+    wired = extension("boards", asked_by=f"The board {truth.board} on its wire, as bench.toml has it,")
+    return wired(stage, truth, lamp, boot_s)
 
 
 def _timing(lamp: LampTruth) -> LampTiming:

@@ -25,10 +25,10 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.boards import BOARDS, baud_of
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.core.faults import ScenarioPlayer, parse_scenario
-from plugins.emulated.projectors.boards import BOARDS, baud_of, quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector

@@ -14,14 +14,13 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated import bench
-from plugins.emulated.projectors import boards
+from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 
 PROJECTORS: dict[str, EmulatedSerialProjector] = {}
-CAMERAS: list[EmulatedPtpCamera] = []
+CAMERAS: list[PtpIpCamera] = []
 
 
 class KnownProjector(EmulatedSerialProjector):
@@ -30,7 +29,7 @@ class KnownProjector(EmulatedSerialProjector):
         PROJECTORS[port.name.removeprefix("tty-")] = self
 
 
-class KnownCamera(EmulatedPtpCamera):
+class KnownCamera(PtpIpCamera):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         CAMERAS.append(self)
@@ -60,7 +59,6 @@ def listen() -> None:
 
 
 if __name__ == "__main__":
-    vars(bench).update(EmulatedPtpCamera=KnownCamera)
-    vars(boards).update(EmulatedSerialProjector=KnownProjector)
+    vars(bench).update(PtpIpCamera=KnownCamera, EmulatedSerialProjector=KnownProjector)
     threading.Thread(target=listen, daemon=True).start()
     sys.exit(bench.EmulatedBench().serve(Path(sys.argv[1]), json_lines=True))

@@ -14,10 +14,10 @@ import pytest
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.values import Power
-from lab.emulated.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.projectors.boards import BOARDS, login_of, quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
-from plugins.emulated.projectors.network import GATES, EmulatedNetworkProjector
+from lab.emulated.projectors.boards import BOARDS, login_of
+from lab.emulated.projectors.network import GATES, EmulatedNetworkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.network.driver import open_network_projector
 from plugins.projectors.pjlink import PjLinkProjector, open_pjlink_projector
@@ -120,7 +120,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         name = kwargs.pop("name", "left")
         board = kwargs.pop("board", None) or BOARDS.get(profile)
         if board is None:
-            raise LookupError(f"no emulated board for {profile}: add it to plugins/emulated/projectors/boards.py")
+            raise LookupError(f"no emulated board for {profile}: add it to lab/emulated/projectors/boards.py")
         (tmp_path / f"{name}.toml").write_text(edit(quick_profile(timing, base=profile)))
         table_read = load_profile(f"{name}.toml", tmp_path).serial
         assert table_read is not None

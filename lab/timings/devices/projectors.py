@@ -12,7 +12,7 @@ from hal.codecs.projectors.serial_protocol import query_bytes
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from lab.timings import Row, Timing, at_most, timed
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector

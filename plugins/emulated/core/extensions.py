@@ -1,7 +1,8 @@
 """Parts of the bench that other distributions bring, by the entry-point group ``velatura.bench``.
 
-``usb``: what ``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``); ``mitsuba``: an engine of indirect light
-(``plugins.emulated.optics.indirect.transfers.LightTransfer``). Both are in velatura-lab.
+``boards``: makes a projector with another control board than the usual one, or on a LAN port; ``usb``: what
+``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``); ``mitsuba``: an engine of indirect light
+(``plugins.emulated.optics.indirect.transfers.LightTransfer``). All are in velatura-lab.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ GROUP: Final = "velatura.bench"
 
 
 def extension(name: str, *, asked_by: str) -> Any:
-    """The class of this name. ``asked_by``: what in a stage needs it. Raises DeviceError ``bench-part-missing``."""
+    """What this entry point names; ``asked_by``: what in a stage needs it. Raises DeviceError("bench-part-missing")."""
     for entry in entry_points(group=GROUP, name=name):
         return entry.load()
     raise DeviceError(

@@ -63,6 +63,7 @@ Three: TypeAlias = tuple[float, float, float]
 Matrix: TypeAlias = tuple[Three, Three, Three]
 FILE_NAME: Final = "bench.toml"
 FOLDER: Final = "bench"
+DEFAULT_BOARD: Final = "optoma-later"
 USB_FILE: Final = f"{FOLDER}/usb.toml"
 ENGINES: Final = ("direct", "radiosity", "mitsuba")
 """Of light between surfaces."""
@@ -235,8 +236,9 @@ class Panels:
 class ProjectorTruth:
     """A projector; ``port`` and ``profile`` are relative to the stage folder.
 
-    ``board``: the family whose control board it has (``projectors.boards.BOARDS``); ``tcp_port``: it is reached by
-    its own LAN port on this computer, with the login of its family and ``password``, and not by a serial line
+    ``board``: the family whose control board it has; ``tcp_port``: it is reached by its own LAN port on this computer,
+    with the login of its family and ``password``, and not by a serial line. Boards other than the default, and LAN
+    ports, are in velatura-lab.
     """
 
     name: str
@@ -250,7 +252,7 @@ class ProjectorTruth:
     lamp: LampTruth
     panels: Panels = Panels()
     dithering: Dithering = STEADY
-    board: str = "optoma-later"
+    board: str = DEFAULT_BOARD
     tcp_port: Annotated[int, Between(0, 65_535)] = 0
     password: str = ""
 

@@ -1,1 +1,1 @@
-"""Emulated projectors with lamps, fans and faults. Entry: `boards`, `serial`, `network`, `lamp`."""
+"""Emulated projectors with lamps, fans and faults. Entry: `serial`, `board`, `lamp`."""

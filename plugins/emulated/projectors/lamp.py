@@ -1,4 +1,4 @@
-"""The lamp of an emulated projector: strike, warm-up, light, cooling, hours, and how it fails.
+"""The lamp of an emulated projector: strike, warm-up, light, cooling, hours, how it fails, and a profile of its times.
 
 The optical bench asks ``light_level``; the wire emulators strike and extinguish. Times are of the emulated lamp, not of
 any driver's opinion of it.
@@ -8,11 +8,16 @@ from __future__ import annotations
 
 import enum
 import math
+import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import resources
 from typing import Final
+
+from hal.errors import PluginError
+from plugins.emulated.core.truth import DEFAULT_BOARD
 
 FIRST_LIGHT: Final = 0.3
 """Share of full light right after the strike: an arc lamp starts dim and brightens while it warms."""
@@ -175,3 +180,39 @@ class EmulatedLamp:
         with self._lock:
             self._lit_since = self._clock() - self._timing.warm_up_s
             self._off_since = None
+
+
+_TIMING_S = {
+    # An emulated projector answers at once, but the machine that it is emulated on may be loaded.
+    "answer_s": 2.0,
+    "late_s": 3.0,
+    "command_s": 3.0,
+    "confirm_s": 15.0,
+    "interval_s": 0.005,
+    "boot_interval_s": 0.05,
+}
+
+
+def quick_profile(lamp: LampTiming, *, base: str = DEFAULT_BOARD, stable_s: float | None = None) -> str:
+    """The TOML text of the shipped profile ``base`` with the times of an emulated lamp.
+
+    ``stable_s`` is the time from strike to photometric stability (default: the warm-up time). Raises
+    PluginError("profile-unchanged") if the shipped file lacks a key that must be shortened.
+    """
+    text = (resources.files("firmware_configs") / "projectors" / f"{base}.toml").read_text(encoding="utf-8")
+    times = {
+        **_TIMING_S,
+        "warm_up_s": lamp.warm_up_s,
+        "stable_s": max(lamp.warm_up_s, stable_s or 0.0),
+        "cool_down_s": lamp.cool_down_s,
+        "minimum_off_s": lamp.cool_down_s,
+    }
+    for key, seconds in times.items():
+        text, count = re.subn(rf"(?m)^{key}\s*=\s*[0-9.]+.*$", f"{key} = {float(seconds)!r}", text)
+        if count != 1:
+            raise PluginError(
+                "profile-unchanged",
+                what=f"The shipped profile {base} does not set {key} once.",
+                remedy="Reinstall velatura; the profile was changed.",
+            )
+    return f"# Written for an emulated stage: {base} with short times.\n{text}"

@@ -15,8 +15,7 @@ from typing import Final
 
 from hal.errors import DeviceError
 from hal.serial_link import PtyLink
-from plugins.emulated.projectors.board import Board
-from plugins.emulated.projectors.boards_text import OptomaBoard
+from plugins.emulated.projectors.board import Board, OptomaBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.projector import BoardProjector
 

@@ -16,7 +16,7 @@ from hal.deadline import in_seconds
 from hal.registry import OpenContext
 from hal.tape import read_tape
 from hal.values import Power
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.bench import DRIVER as BENCH
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.pjlink import open_pjlink_projector

@@ -10,7 +10,7 @@ from aiopjlink import Lamp as PjLamp
 from aiopjlink import PJLinkERR3, PJLinkPassword
 
 from hal.errors import DeviceError
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.aiopjlink_client import talk
 

@@ -11,7 +11,7 @@ from pypjlink import MUTE_VIDEO
 from pypjlink import Projector as PyPjLink
 from pypjlink.projector import ProjectorError
 
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 
 

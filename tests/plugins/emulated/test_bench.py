@@ -25,12 +25,20 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.registry import OpenContext
 from hal.values import Power
+from lab.emulated.projectors.boards import BOARDS, login_of, projector_on_its_wire
 from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.core.shot import ShotSettings
-from plugins.emulated.core.truth import BenchTruth, DouserTruth, MainsTruth, ProjectorTruth, read_truth, write_truth
+from plugins.emulated.core.truth import (
+    DEFAULT_BOARD,
+    BenchTruth,
+    DouserTruth,
+    MainsTruth,
+    ProjectorTruth,
+    read_truth,
+    write_truth,
+)
 from plugins.emulated.optics.layout import Stands
 from plugins.emulated.optics.world import World
-from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, login_of, projector_on_its_wire
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.network.driver import open_network_projector
 from plugins.projectors.serial import SerialProjector, open_serial_projector

@@ -9,7 +9,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.finding import Found, Known, SearchScope
-from lab.emulated.pjlink import EmulatedPjLinkProjector
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.finding import network
 

@@ -15,7 +15,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.finding import Found, Known, SearchScope
-from plugins.emulated.projectors.boards import BOARDS, baud_of
+from lab.emulated.projectors.boards import BOARDS, baud_of
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.finding import serial_ports

@@ -18,8 +18,7 @@ from hal.registry import OpenContext
 from lab.emulated.usb.mains import Mains
 from lab.emulated.usb.process import UsbBusProcess
 from plugins.emulated.core.truth import MainsTruth
-from plugins.emulated.projectors.boards import quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.hid.relay import RelayBoard
 from plugins.projectors.serial import open_serial_projector

@@ -9,8 +9,8 @@ import pytest
 
 from hal.conformance import ProjectorConformance
 from hal.interfaces import Projector
-from plugins.emulated.projectors.boards import BOARDS, baud_of, login_of
-from plugins.emulated.projectors.boards_text import OptomaBoard, OptomaQuirks
+from lab.emulated.projectors.boards import BOARDS, baud_of, login_of
+from plugins.emulated.projectors.board import OptomaBoard, OptomaQuirks
 
 
 class TestSerialProjector(ProjectorConformance):

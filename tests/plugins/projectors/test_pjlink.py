@@ -13,8 +13,7 @@ from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.projectors.pjlink import open_pjlink_projector
 from tests.plugins.conftest import hasty
 

@@ -19,8 +19,7 @@ from hal.errors import DeviceError
 from hal.interfaces import Projector
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import quick_profile
-from plugins.emulated.projectors.lamp import LampTiming
+from plugins.emulated.projectors.lamp import LampTiming, quick_profile
 from plugins.finding.network import PjLinkListener
 from plugins.projectors.pjlink import open_pjlink_projector
 from tests.plugins.projectors.pjlink_advance import NOTICE, pjlink_advance_python

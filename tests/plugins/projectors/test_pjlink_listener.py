@@ -14,7 +14,7 @@ from hal.codecs.projectors.pjlink import InputChanged, LinkUp, PowerChanged, Tro
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceTimeout
 from hal.values import Power
-from lab.emulated.pjlink import EmulatedPjLinkUdp, PjLinkOddities
+from lab.emulated.projectors.pjlink import EmulatedPjLinkUdp, PjLinkOddities
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.finding.network import FoundProjector, PjLinkListener
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hal.deadline import in_seconds
 from hal.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
-from lab.emulated.pjlink import EmulatedPjLinkProjector, PjLinkOddities
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector, PjLinkOddities
 from tests.plugins.conftest import hasty
 from tests.waiting import wait_for
 

@@ -27,9 +27,8 @@ from hal.registry import OpenContext
 from hal.serial_link import SerialLink
 from hal.transcript import ReplayLink, parse_transcript
 from hal.values import Power
-from plugins.emulated.projectors.boards import quick_profile
-from plugins.emulated.projectors.boards_text import OptomaBoard, OptomaQuirks
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.board import OptomaBoard, OptomaQuirks
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 from plugins.projectors.serial import SerialProjector, open_serial_projector
 from tests.plugins.conftest import hasty, wait_for_power

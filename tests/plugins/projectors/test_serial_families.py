@@ -13,9 +13,9 @@ import pytest
 from hal.deadline import in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power
-from plugins.emulated.projectors.boards import baud_of
-from plugins.emulated.projectors.boards_binary import NecBoard
-from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
+from lab.emulated.projectors.boards import baud_of
+from lab.emulated.projectors.boards_binary import NecBoard
+from lab.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import shipped_profiles
 from tests.plugins.conftest import each, hasty, wait_for_power

@@ -13,8 +13,8 @@ import pytest
 from hal.deadline import in_seconds
 from hal.errors import DeviceRefused, DeviceTimeout, ProtocolError
 from hal.values import Power, ProjectorStatus
-from plugins.emulated.projectors.boards import BOARDS
-from plugins.emulated.projectors.boards_text import SanyoBoard
+from lab.emulated.projectors.boards import BOARDS
+from lab.emulated.projectors.boards_text import SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from tests.plugins.conftest import each
 from tests.plugins.projectors.odd_board import OddBoard

@@ -25,10 +25,10 @@ from hal.deadline import Deadline, in_seconds
 from hal.registry import OpenContext
 from hal.values import DeviceIdentity, Power
 from lab.emulated.cameras.camera import EmulatedPtpCamera
-from lab.emulated.pjlink import PjLinkOddities
+from lab.emulated.projectors.boards import BOARDS
+from lab.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard
+from lab.emulated.projectors.pjlink import PjLinkOddities
 from plugins.emulated.cameras.body import CameraNames
-from plugins.emulated.projectors.boards import BOARDS
-from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.ptp.camera import open_camera
 from tests.controller.kiosk.install.test_outputs import LEFT, OFF, RIGHT

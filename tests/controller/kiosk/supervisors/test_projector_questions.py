@@ -13,7 +13,7 @@ from controller.kiosk.supervisors.projector_supervisor import ProjectorSuperviso
 from controller.stage.rig.lamp_guard import LampGuard
 from hal.deadline import Deadline
 from hal.links import TcpLink
-from lab.emulated.pjlink import EmulatedPjLinkProjector, PjLinkOddities
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector, PjLinkOddities
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.pjlink import PjLinkProjector
 from plugins.projectors.profile_files import load_profile

@@ -22,8 +22,7 @@ from hal.errors import DeviceBusy
 from hal.finding import Finder, Found, SearchScope, load_finders
 from hal.registry import BrokenPlugin, Driver, Drivers, load_drivers
 from plugins.dousers.sacn_douser import DRIVER
-from plugins.emulated.projectors.boards import quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from tests.controller.stage.rig.lamp_model import World
 from tests.controller.stage.rig.rig_model import ModelCamera, ModelDisplay

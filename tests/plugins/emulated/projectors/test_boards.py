@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from plugins.emulated.projectors.boards_binary import Ep910Board, NecBoard
-from plugins.emulated.projectors.boards_marked import ChristieBoard, PanasonicBoard
-from plugins.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
+from lab.emulated.projectors.boards_binary import Ep910Board, NecBoard
+from lab.emulated.projectors.boards_marked import ChristieBoard, PanasonicBoard
+from lab.emulated.projectors.boards_text import BenqBoard, BenqQuirks, EpsonBoard, EpsonQuirks, SanyoBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.plugins.emulated.conftest import Clock
 

@@ -17,10 +17,10 @@ from jvc_projector_remote.jvcprojector import JVCHandshakeError
 from jvcprojector import JvcProjector, JvcProjectorAuthError
 from jvcprojector.command import Input, LightPower, LightTime, Power  # type: ignore[attr-defined]
 
-from plugins.emulated.projectors.boards import BOARDS, login_of
-from plugins.emulated.projectors.boards_marked import ChristieBoard
+from lab.emulated.projectors.boards import BOARDS, login_of
+from lab.emulated.projectors.boards_marked import ChristieBoard
+from lab.emulated.projectors.network import GATES, EmulatedNetworkProjector, JvcHashedGate
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.projectors.network import GATES, EmulatedNetworkProjector, JvcHashedGate
 from tests.waiting import wait_for
 
 TIMING = LampTiming(warm_up_s=0.3, cool_down_s=0.5)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from plugins.emulated.projectors.boards_text import OptomaBoard, OptomaQuirks
+from plugins.emulated.projectors.board import OptomaBoard, OptomaQuirks
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 

@@ -11,8 +11,8 @@ from benqprojector.benqprojector import BenQProjectorSerial
 from epson_projector import Projector as EpsonProjector
 from epson_projector.const import SERIAL
 
+from lab.emulated.projectors.boards_text import BenqBoard, EpsonBoard
 from plugins.emulated.projectors.board import Board
-from plugins.emulated.projectors.boards_text import BenqBoard, EpsonBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 

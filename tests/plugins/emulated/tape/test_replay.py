@@ -19,9 +19,10 @@ from hal.registry import OpenContext
 from hal.tape import Tape, read_tape
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
-from lab.emulated.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.projectors.boards import BOARDS, DEFAULT_BOARD, baud_of, quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from lab.emulated.projectors.boards import BOARDS, baud_of
+from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from plugins.emulated.core.truth import DEFAULT_BOARD
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.emulated.tape import serve_tape
 from plugins.gphoto2.camera import open_camera as open_gphoto2

@@ -19,8 +19,8 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS, baud_of, quick_profile
-from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
+from lab.emulated.projectors.boards import BOARDS, baud_of
+from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.network.device_server import parse_url
 from plugins.projectors.serial import DRIVER, SerialProjector, open_serial_projector

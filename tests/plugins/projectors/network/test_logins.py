@@ -16,16 +16,10 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import OpenContext
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS, login_of
-from plugins.emulated.projectors.boards_marked import PanasonicDzBoard
+from lab.emulated.projectors.boards import BOARDS, login_of
+from lab.emulated.projectors.boards_marked import PanasonicDzBoard
+from lab.emulated.projectors.network import GATES, EmulatedNetworkProjector, JvcGate, JvcHashedGate, NtControlSha256Gate
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
-from plugins.emulated.projectors.network import (
-    GATES,
-    EmulatedNetworkProjector,
-    JvcGate,
-    JvcHashedGate,
-    NtControlSha256Gate,
-)
 from plugins.projectors.network.driver import DRIVER, magic_packet, open_network_projector
 from tests.plugins.conftest import each, hasty
 from tests.plugins.projectors.switching import strikes_once_when_its_second_answer_is_lost

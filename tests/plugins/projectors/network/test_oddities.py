@@ -12,8 +12,8 @@ import pytest
 from hal.deadline import in_seconds
 from hal.errors import DeviceRefused, ProtocolError
 from hal.values import Power
-from plugins.emulated.projectors.boards import BOARDS
-from plugins.emulated.projectors.boards_marked import BarcoPulseBoard
+from lab.emulated.projectors.boards import BOARDS
+from lab.emulated.projectors.boards_marked import BarcoPulseBoard
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from tests.plugins.projectors.odd_board import OddBoard
 from tests.plugins.projectors.switching import SOON, status, switches_without_hours

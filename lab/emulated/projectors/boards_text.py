@@ -1,6 +1,6 @@
-"""Control boards of protocols by lines of text: Acer, BenQ, Digital Projection, Epson, Optoma, Sanyo, Sony.
+"""Control boards of protocols by lines of text: Acer, BenQ, Digital Projection, Epson, Sanyo, Sony.
 
-See ``board``. Sources, beside docs/reference/projectors.md: "RS232 Protocol Function List" (Optoma), the RS232 tables
+See ``board``. Sources, beside docs/reference/projectors.md: the RS232 tables
 of Acer's manuals, "Basic Serial Command Functional Specifications" of PLC-XM100 (Sanyo), Digital Projection's protocol
 guide 115-482H as others read it, the manuals of E-Vision Laser 5000 and 6500, and Sony's manuals as programs of users
 quote them.
@@ -249,96 +249,6 @@ class EpsonBoard(LineBoard):
             return b"05"
         codes = {LampPhase.STANDBY: b"00", LampPhase.LIT: b"01", LampPhase.WARMING: b"02", LampPhase.COOLING: b"03"}
         return codes[self._lamp.phase]
-
-
-@dataclass(frozen=True, slots=True)
-class OptomaQuirks:
-    """By model: ``ok`` is how it spells OK; ``p_first``: it acknowledges a question before it answers."""
-
-    ok: bytes = b"OK"
-    p_first: bool = False
-    model_code: int = 2
-
-
-class OptomaBoard(LineBoard):
-    """A later model: ``~XXnnn p``, two digits of the projector's ``number``, the command, a space, the parameter."""
-
-    start = b"~"
-    _INFO: Final = {LampPhase.STANDBY: 0, LampPhase.WARMING: 1, LampPhase.COOLING: 2}
-    _LAMP_FAIL, _OVER_TEMPERATURE = 4, 7
-
-    def __init__(self, lamp: EmulatedLamp, *, number: int = 1, quirks: OptomaQuirks | None = None) -> None:
-        super().__init__(lamp)
-        self._number = number
-        self._quirks = quirks or OptomaQuirks()
-        self._reported_phase = lamp.phase
-        self._reported_trouble: set[int] = set()
-
-    def notices(self) -> list[bytes]:
-        """INFO lines due since the last call: changes of the lamp's phase, and trouble."""
-        due = []
-        phase = self._lamp.phase
-        if phase is not self._reported_phase:
-            self._reported_phase = phase
-            if phase in self._INFO:
-                due.append(self._INFO[phase])
-        trouble = {self._OVER_TEMPERATURE} if self._lamp.too_hot else set()
-        if self._lamp.failed and (self._lamp.strikes or self._reported_trouble):
-            trouble.add(self._LAMP_FAIL)
-        due += sorted(trouble - self._reported_trouble)
-        self._reported_trouble = trouble
-        return [b"INFO%d\r" % code for code in due]
-
-    def _answers(self, command: bytes, busy: bool) -> list[bytes]:
-        if len(command) < 6 or command[:1] != b"~" or not command[1:3].isdigit():
-            return [b"F\r"] if command else []
-        if int(command[1:3]) not in (0, self._number):
-            return []  # another projector on the same cable is meant
-        code, space, parameter = command[3:].partition(b" ")
-        if not code.isdigit() or not space or busy:
-            return [b"F\r"]
-        return [self._act(int(code), parameter)]
-
-    def _act(self, command: int, parameter: bytes) -> bytes:
-        if command == 0:
-            return self._switch(parameter)
-        if command == 2:
-            return self._mute(parameter)
-        status = self._read(command) if parameter == b"1" else None
-        if status is None:
-            return b"F\r"
-        return (b"P\r" if self._quirks.p_first else b"") + self._quirks.ok + status + b"\r"
-
-    def _switch(self, parameter: bytes) -> bytes:
-        if parameter == b"1":
-            return b"P\r" if self._strike() else b"F\r"
-        if parameter in (b"0", b"2"):
-            self._lamp.extinguish()
-            return b"P\r"
-        return b"F\r"
-
-    def _strike(self) -> bool:
-        struck = self._lamp.strike()
-        if struck and self._lamp.failed:
-            self._reported_trouble.discard(self._LAMP_FAIL)  # every strike of a dead lamp is reported again
-        return struck
-
-    def _mute(self, parameter: bytes) -> bytes:
-        if parameter not in (b"0", b"1", b"2") or not self._lamp.burning:
-            return b"F\r"
-        self._lamp.shutter_closed = parameter == b"1"
-        return b"P\r"
-
-    def _read(self, command: int) -> bytes | None:
-        burning = self._lamp.burning
-        states = {
-            108: b"%04d" % self._lamp.hours,
-            121: b"7" if burning else b"0",
-            122: b"C07",
-            124: b"1" if burning else b"0",
-            151: b"%d" % self._quirks.model_code,
-        }
-        return states.get(command)
 
 
 class SanyoBoard(LineBoard):

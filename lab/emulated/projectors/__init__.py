@@ -1,0 +1,1 @@
+"""Emulated projectors of many makers, on serial lines, LAN ports and PJLink. Entry: `boards`, `pjlink`."""
