@@ -18,6 +18,7 @@ import numpy as np
 from controller.bundle.signing import generate_key
 from controller.config import write_stage
 from controller.core.arrays import FloatImage
+from controller.core.colour import linear_to_srgb
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import sha256_of, sync_folder, write_atomically
 from controller.optics.solve.appearance import exposed_for_one, traditional_compensation
@@ -25,7 +26,6 @@ from controller.optics.solve.bounded.engine import Engine
 from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.reach.feasibility import target_radiance
 from controller.optics.solve.targets.files import shipped_photograph
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage, Mask
+from controller.core.colour import linear_to_srgb
 from controller.kiosk.preview.scenes import SHIPPED
 from controller.optics.solve.targets.files import read_picture
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from controller.api.arrays import as_images
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.colour import Unsuitable
 from controller.core.errors import UsageError, WorkError
 from controller.optics.capture import brackets, linear_files, raw
 from controller.optics.capture.brackets import MergedBracket
@@ -64,7 +65,7 @@ def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Develop
     if suffix in (*linear_files.SUFFIXES, ".png"):
         try:
             image, saturated = linear_files.read_linear(path, bits=(8, 16))
-        except linear_files.Unreadable as error:
+        except Unsuitable as error:
             raise _unreadable(path, error) from error
         image[saturated] = np.nan
         return Developed(image, saturated, None, None, None)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from controller.api.arrays import as_image
 from controller.bundle.describe import png
 from controller.core.arrays import save_arrays
+from controller.core.colour import linear_to_srgb
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import grid_mesh, write_glb, write_ply
@@ -20,7 +21,6 @@ from controller.optics.capture.linear_files import exr_bytes
 from controller.optics.capture.raw import SRGB_TO_XYZ
 from controller.optics.solve.result import metrics
 from controller.optics.solve.result.metrics import Comparison
-from controller.optics.solve.targets.values import linear_to_srgb
 
 if TYPE_CHECKING:
     from controller.core.arrays import ByteImage, Float64

@@ -24,10 +24,10 @@ EXTRAS: Final = {
 """Purpose of each extra of pyproject.toml that people install."""
 _MODULES: Final = {
     "": "cramjam nacl numpy pyglet xxhash zstandard",
-    "controller": "OpenEXR PIL StreamDeck cv2 cycler hid jinja2 llvmlite lz4 matplotlib numba pydantic pydantic_core"
-    " rawpy rich scipy serial tomlkit trimesh typer usb",
+    "controller": "OpenEXR PIL StreamDeck cv2 cycler hid imagecodecs jinja2 llvmlite lz4 matplotlib numba"
+    " pydantic pydantic_core rawpy rich scipy serial tifffile tomlkit trimesh typer usb",
     "panel": "aiomqtt anyio argon2 multipart prometheus_client python_multipart starlette uvicorn",
-    "bench": "embreex tifffile",
+    "bench": "embreex",
     "gphoto2": "gphoto2",
     "mains": "pymodbus pysnmp",
     "building": "pythonosc sacn",

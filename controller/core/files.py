@@ -11,14 +11,13 @@ from hal.runtime.files import (
     UnfitFile,
     check_pixels,
     read_bytes,
-    read_picture_bytes,
     read_text,
     require_regular,
 )
 
 __all__ = [
     "LARGEST_MESH", "LARGEST_TEXT", "MOST_PIXELS", "UnfitFile", "check_pixels", "file_error", "read_bytes",
-    "read_picture_bytes", "read_text", "require_regular",
+    "read_text", "require_regular",
 ]  # fmt: skip
 
 _REFUSED = {

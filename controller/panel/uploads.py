@@ -14,6 +14,7 @@ from pathlib import Path
 
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
+from controller.core.text import printable
 from controller.kiosk.operations.fields import TARGET_KEY
 from controller.kiosk.store import targets
 from controller.kiosk.values import Fit
@@ -21,6 +22,8 @@ from controller.panel import decoder
 
 WHOLE, OUTLINE = ".whole", ".json"
 """Beside a target: what was uploaded, and the regions of it that are used."""
+
+LONGEST_REASON = 300
 
 Fitted = Callable[[Path, Fit], bytes]
 """Fits a PNG file to the camera's view."""
@@ -37,7 +40,7 @@ class UploadLimits:
 
 
 def decode_picture(file: Path, limits: UploadLimits, least_px: tuple[int, int] | None = None) -> bytes:
-    """The picture in ``file``, encoded again as PNG (RGB, 8 bit, no metadata); ``least_px``: see ``decoder.decode``.
+    """The picture in ``file``, encoded again as PNG (sRGB, no metadata); ``least_px``: see ``decoder.decode``.
 
     Raises UsageError("picture-refused") unless it is a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
     UsageError("picture-too-large") for one with too many pixels.
@@ -52,7 +55,7 @@ def decode_picture(file: Path, limits: UploadLimits, least_px: tuple[int, int] |
                 stdin=data,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                env={},
+                env={"OPENBLAS_NUM_THREADS": "1"},
                 cwd="/",
                 timeout=limits.seconds + 5,
                 check=False,
@@ -66,14 +69,15 @@ def decode_picture(file: Path, limits: UploadLimits, least_px: tuple[int, int] |
             remedy="Scale it down. The resolution of the camera is enough.",
         )
     if done.returncode != 0 or not done.stdout.startswith(b"\x89PNG"):
-        raise _refused()
+        told = done.stdout[:LONGEST_REASON] if done.returncode == decoder.NOT_A_PICTURE else b""
+        raise _refused(printable(told.decode("utf-8", "replace")))
     return done.stdout
 
 
-def _refused() -> UsageError:
+def _refused(reason: str = "") -> UsageError:
     return UsageError(
         "picture-refused",
-        what="The file could not be read as a picture.",
+        what=f"The file could not be read as a picture{f': {reason}' if reason else ''}.",
         remedy="Save it as PNG or JPEG, and upload it again.",
     )
 

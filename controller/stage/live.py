@@ -20,14 +20,14 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage
+from controller.core.colour import Unsuitable, linear_to_srgb
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
-from controller.core.files import UnfitFile, check_pixels, read_picture_bytes
-from controller.optics.solve.targets.colour import Unsuitable, embedded_profile
-from controller.optics.solve.targets.files import check_picture, read_picture
-from controller.optics.solve.targets.values import linear_to_srgb
+from controller.core.files import UnfitFile, check_pixels
+from controller.core.pictures import read_picture_file
+from controller.optics.solve.targets import files
 
-PICTURES: Final = (".png", ".jpg", ".jpeg", ".exr")
+PICTURES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr")
 SETTLED_S: Final = 0.2
 """A picture that can't be read and is older than this is damaged, not still being written."""
 
@@ -205,32 +205,16 @@ def unreadable(path: Path, why: str) -> UsageError:
     )
 
 
-def _has_own_colours(path: Path, data: bytes) -> bool:
-    """Whether the picture says what its colours mean, so that they are not simply sRGB."""
-    try:
-        return embedded_profile(data) is not None
-    except Unsuitable as error:
-        raise unreadable(path, str(error)) from error
-
-
 def _as_srgb(path: Path) -> ByteImage:
+    """(rows, columns, 3) uint8, black where the picture is transparent. Raises UsageError, FileNotFoundError."""
+    path.stat()
     if path.suffix.lower() != ".exr":
         try:
-            data = read_picture_bytes(path)
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise unreadable(path, str(error.strerror)) from error
-        except cv2.error:
-            image = None
-        if image is None or not (b"IEND" in data[-4096:] or b"\xff\xd9" in data[-4096:]):
-            read_picture(path)  # tells what is wrong with it
-            raise unreadable(path, "one of its pictures could not be decoded")
-        if not _has_own_colours(path, data):
-            return np.ascontiguousarray(image[..., ::-1])
-    light = read_picture(path)[..., :3]
-    check_picture(path, light, (light.shape[1], light.shape[0]))
+            return read_picture_file(path).bytes_shown()
+        except Unsuitable as error:
+            raise files.unreadable(path, error) from error
+    light = files.read_picture(path)[..., :3]
+    files.check_picture(path, light, (light.shape[1], light.shape[0]))
     return np.round(linear_to_srgb(light) * np.float32(255)).astype(np.uint8)
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import stat
-import struct
 from pathlib import Path
 from typing import Final
 
@@ -25,9 +23,6 @@ _KINDS: Final = (
     (stat.S_ISSOCK, "it is a socket, not a file"), (stat.S_ISCHR, "it is a device, not a file"),
     (stat.S_ISBLK, "it is a disk, not a file"),
 )  # fmt: skip
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
-_NO_SIZE: Final = {0xC4, 0xC8, 0xCC}
-"""JPEG markers among C0 to CF that start no frame."""
 
 
 class UnfitFile(OSError):
@@ -59,65 +54,11 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
     return read_bytes(path, largest).decode("utf-8-sig")
 
 
-def read_picture_bytes(path: Path, most_pixels: int = MOST_PIXELS) -> bytes:
-    """The bytes of a picture file that may be decoded; raises as ``read_bytes``, and for too many pixels."""
-    data = read_bytes(path)
-    check_pixels(path, picture_size(data), most_pixels)
-    return data
-
-
 def check_pixels(path: Path, size: tuple[int, int] | None, most_pixels: int = MOST_PIXELS) -> None:
     """Raises ``UnfitFile`` for a picture whose size (width, height) has more pixels; None: the size is unknown."""
     if size is not None and size[0] * size[1] > most_pixels:
         limit = f"more than {most_pixels / 1e6:.0f} million pixels"
         raise UnfitFile(path, f"it is {size[0]} x {size[1]} pixels large, {limit}")
-
-
-def picture_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) from the header of a PNG, JPEG, TIFF, BMP or NetPBM picture, or None for other files."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
-    if data.startswith(b"\xff\xd8"):
-        return _jpeg_size(data)
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff_size(data)
-    if data.startswith(b"BM") and len(data) >= 26:
-        width, height = struct.unpack("<ii", data[18:26])
-        return abs(width), abs(height)
-    netpbm = re.match(rb"P[1-6]\s+(?:#[^\n]*\n\s*)*(\d{1,12})\s+(\d{1,12})", data[:4096])
-    return (int(netpbm[1]), int(netpbm[2])) if netpbm else None
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 <= len(data):
-        if data[at] != 0xFF:
-            return None
-        marker = data[at + 1]
-        if marker == 0xFF:  # a fill byte
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in _NO_SIZE:
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
-
-
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Of the first picture in the file; its width and length are tags 256 and 257, of 2 or 4 bytes."""
-    order = "<" if data[:2] == b"II" else ">"
-    try:
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, at)
-        found = {}
-        for entry in range(at + 2, at + 2 + 12 * count, 12):
-            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-            if tag in (256, 257):
-                (found[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, entry + 8)
-    except struct.error:
-        return None
-    return (found[256], found[257]) if len(found) == 2 else None
 
 
 def _check_name(path: Path) -> None:

@@ -18,6 +18,7 @@ from playwright.sync_api import expect
 
 from controller.config.models import SolveTable
 from controller.core.arrays import load_arrays
+from controller.core.colour import srgb_to_linear
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.interface import Job
@@ -27,7 +28,6 @@ from controller.kiosk.values import Computed
 from controller.optics.solve.request import solve_appearance
 from controller.optics.solve.result.metrics import by_pixels, visible_object
 from controller.optics.solve.targets.files import load_target
-from controller.optics.solve.targets.values import srgb_to_linear
 from controller.panel.uploads import Targets, UploadLimits
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry

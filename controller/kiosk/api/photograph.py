@@ -61,6 +61,7 @@ def _decoded(file: Path) -> Any:
     import cv2
     import rawpy
 
+    from controller.core.colour import Unsuitable
     from controller.optics.capture import linear_files
 
     try:
@@ -79,5 +80,5 @@ def _decoded(file: Path) -> Any:
             except rawpy.LibRawError:
                 pass
             return raw.postprocess(half_size=True)[..., ::-1]
-    except (OSError, ValueError, rawpy.LibRawError, linear_files.Unreadable, cv2.error):
+    except (OSError, ValueError, rawpy.LibRawError, Unsuitable, cv2.error):
         return None

@@ -44,29 +44,47 @@ def fitted(picture: bytes, size_px: tuple[int, int], how: Literal["fit", "fill",
     middle of the view. Uncovered parts are transparent: they stay dark. "stretch" covers the view with all of it.
     Raises UsageError("target-unreadable").
     """
-    import cv2
-
-    from controller.optics.solve.targets.colour import Unsuitable, embedded_profile, with_profile
-
-    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED) if picture else None
-    if decoded is None:
-        raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
-    height, width = decoded.shape[:2]
+    whole = _decoded(picture)
+    height, width = whole.shape[:2]
     if (width, height) == size_px:
         return picture
     across, down = size_px[0] / width, size_px[1] / height
     scale = 1.0 if how == "crop" else min(across, down) if how == "fit" else max(across, down)
     if scale != 1.0 or how == "stretch":
         wanted = size_px if how == "stretch" else (max(1, round(width * scale)), max(1, round(height * scale)))
-        decoded = cv2.resize(decoded, wanted, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+        whole = _resized(whole, wanted, smaller=scale < 1)
+    return _png(_in_the_middle(whole, size_px))
+
+
+def _decoded(picture: bytes) -> npt.NDArray[Any]:
+    """(rows, columns, 4) sRGB with alpha, uint8 or uint16. Raises UsageError("target-unreadable")."""
+    from controller.core.colour import Unsuitable
+    from controller.core.pictures import decode
+
     try:
-        profile = embedded_profile(picture)
-    except Unsuitable as error:
+        return decode(picture).with_alpha()
+    except (Unsuitable, OSError) as error:
         raise UsageError(
             "target-unreadable", what=f"The target can't be used: {error}.", remedy="Save it as PNG."
         ) from error
-    png = cv2.imencode(".png", _in_the_middle(_with_alpha(decoded), size_px))[1].tobytes()
-    return png if profile is None else with_profile(png, profile)
+
+
+def _resized(picture: npt.NDArray[Any], size_px: tuple[int, int], *, smaller: bool) -> npt.NDArray[Any]:
+    """A transparent pixel's colour has no weight: it must not show at the edges."""
+    import cv2
+
+    full = np.iinfo(picture.dtype).max
+    colour, alpha = picture[..., :3].astype(np.float32), picture[..., 3:].astype(np.float32) / full
+    weighted = np.concatenate([colour * alpha, full * alpha], axis=2)
+    made = cv2.resize(weighted, size_px, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+    plain = made[..., :3] * (full / np.maximum(made[..., 3:], full / 1000))
+    return np.asarray(np.rint(np.clip(np.dstack([plain, made[..., 3]]), 0, full)), picture.dtype)
+
+
+def _png(picture: npt.NDArray[Any]) -> bytes:
+    import imagecodecs
+
+    return bytes(imagecodecs.png_encode(np.ascontiguousarray(picture), level=1))
 
 
 def regions_of(text: str) -> tuple[Region, ...]:
@@ -103,25 +121,14 @@ def restricted(picture: bytes, regions: Sequence[Region]) -> bytes:
 
     if not regions:
         return picture
-    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED)
-    if decoded is None:
-        raise UsageError("target-unreadable", what="The target can't be read as a picture.", remedy="Save it as PNG.")
-    whole = _with_alpha(decoded)
+    whole = _decoded(picture)
     rows, columns = whole.shape[:2]
     inside = np.zeros((rows, columns), np.uint8)
     for region in regions:
         # Each on its own, because together their overlaps would count as outside.
         cv2.fillPoly(inside, [np.rint(np.array(region) * (columns - 1, rows - 1)).astype(np.int32)], 255)
     whole[..., 3] = np.minimum(whole[..., 3], inside.astype(whole.dtype) * (np.iinfo(whole.dtype).max // 255))
-    return cv2.imencode(".png", whole, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-
-
-def _with_alpha(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    import cv2
-
-    if picture.ndim == 3 and picture.shape[2] == 4:
-        return picture
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGRA if picture.ndim == 2 else cv2.COLOR_BGR2BGRA))
+    return _png(whole)
 
 
 def _in_the_middle(picture: npt.NDArray[Any], size_px: tuple[int, int]) -> npt.NDArray[Any]:
@@ -140,12 +147,10 @@ def wrapped(run: Path, names: tuple[str, ...], picture: Path) -> bytes:
 
     Raises UsageError("target-unreadable") and what reading a calibration raises.
     """
-    import cv2
-
-    from controller.optics.solve.targets.values import linear_to_srgb
+    from controller.core.colour import linear_to_srgb
     from controller.stage.artefacts.calibrated import Calibrated
     from controller.stage.steps.appearance.requests import make_target
 
     made = make_target("photograph", picture, {}, Calibrated(run, names))
     seen = np.rint(255 * np.dstack([linear_to_srgb(made.image), made.mask])).astype(np.uint8)
-    return cv2.imencode(".png", cv2.cvtColor(seen, cv2.COLOR_RGBA2BGRA))[1].tobytes()
+    return _png(seen)

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.colour import Unsuitable
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import check_pixels, require_regular
+from controller.core.pictures import HEIC, is_heic, read_picture_file
 from controller.optics.capture import linear_files
 from controller.optics.capture.demosaic import SensorLevels, demosaic, fill_bad
 from controller.optics.capture.profile import CameraProfile
@@ -124,7 +125,7 @@ def read_samples(path: Path) -> tuple[FloatImage, Mask]:
 def _read_linear(path: Path) -> tuple[FloatImage, Mask]:
     try:
         return linear_files.read_linear(path)
-    except linear_files.Unreadable as error:
+    except Unsuitable as error:
         raise _unreadable(path, error) from error
 
 
@@ -156,8 +157,12 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
     return RawMosaic(mosaic, SensorLevels(colours, black, white, clip), camera_to_xyz)
 
 
-def _unreadable(path: Path, reason: object) -> WorkError:
+def _unreadable(path: Path, reason: Exception) -> WorkError:
     words = reason.strerror if isinstance(reason, OSError) and reason.strerror else reason
+    if reason.args and isinstance(reason.args[0], bytes):  # LibRaw's
+        words = reason.args[0].decode("ascii", "replace")
+        with path.open("rb") as file:
+            words = HEIC if is_heic(file.read(12)) else words
     return WorkError(
         "photograph-unreadable",
         what=f"The photograph {path.name} can't be read ({words}).",
@@ -179,7 +184,7 @@ def _sites(raw: Any) -> npt.NDArray[np.int64]:
 def _colour_of_sites(raw: Any, sites: npt.NDArray[np.int64], path: Path) -> npt.NDArray[np.int64]:
     """(2, 2) of 0 red, 1 green, 2 blue at the visible area's first rows and columns."""
     letters = raw.color_desc.decode("ascii")
-    regular = sites.shape == (4, 4) and np.array_equal(sites[:2, :2], sites[2:, 2:])
+    regular = sites.shape == (4, 4) and np.array_equal(sites[:2, :2], sites[2:, 2:]) and sites.max() < len(letters)
     names = "".join(sorted(letters[index] for index in sites[:2, :2].ravel())) if regular else ""
     if names != "BGGR":
         raise UsageError(
@@ -231,13 +236,10 @@ def develop(
 def read_jpeg_values(path: Path) -> npt.NDArray[np.uint8]:
     """(rows, columns, 3) uint8 RGB of a JPEG as it lies on the sensor, without light. Raises WorkError as above."""
     try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
+        values = read_picture_file(path, upright=False).values
+    except Unsuitable as error:
         raise _unreadable(path, error) from error
-    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-    if decoded is None:
-        raise _unreadable(path, "the JPEG file is not complete")
-    return np.asarray(decoded, np.uint8)
+    return np.ascontiguousarray(np.broadcast_to(values, (*values.shape[:2], 3)), np.uint8)
 
 
 def _read_jpeg(path: Path, response: Float64) -> Photograph:

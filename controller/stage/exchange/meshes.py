@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from controller.core.colour import srgb_to_linear
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import View, scene_script, write_glb, write_ply
 from controller.optics.calibrate.values import Pinhole
-from controller.optics.solve.targets.values import srgb_to_linear
 from controller.stage.exchange.content import Content
 
 MESH, SCRIPT = "object.glb", "scene.py"

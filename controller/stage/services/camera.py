@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage
+from controller.core.colour import Unsuitable
 from controller.core.errors import CalibrationError, UsageError, WorkError
-from controller.core.files import read_picture_bytes
+from controller.core.pictures import read_picture_file
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics, write_intrinsics
 from controller.optics.calibrate.geometry.lenses import (
@@ -73,29 +74,18 @@ def read_grey(path: Path) -> ByteImage:
     """A photograph with display gamma, (rows, columns) uint8. Raises WorkError("photograph-unreadable")."""
     if path.suffix.lower() in PICTURES:
         try:
-            data = np.frombuffer(read_picture_bytes(path), np.uint8)
-        except OSError as error:
-            raise _unreadable(path, error.strerror) from error
-        # the sensor's orientation, not EXIF's: the stage's pictures are not rotated either
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            grey = cv2.imdecode(data, flags) if data.size else None
-        except cv2.error:
-            grey = None
-        if grey is None:
-            raise _unreadable(path, "it could not be decoded")
-        return np.asarray(grey, dtype=np.uint8)
+            # as it lies on the sensor: the stage's pictures are not rotated either
+            shown = read_picture_file(path, upright=False).bytes_shown()
+        except Unsuitable as error:
+            raise WorkError(
+                "photograph-unreadable",
+                what=f"The photograph {path} can't be read: {error}.",
+                remedy="Give unedited JPEG, PNG, TIFF or RAW files from the camera.",
+            ) from error
+        return np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), np.uint8)
     light = read_photograph(path).image.mean(axis=2)
     bright = max(float(np.quantile(light, 0.98)), 1e-6)
     return np.asarray(np.clip(255.0 * np.sqrt(np.clip(light / bright, 0, 1)), 0, 255), dtype=np.uint8)
-
-
-def _unreadable(path: Path, why: str | None) -> WorkError:
-    return WorkError(
-        "photograph-unreadable",
-        what=f"The photograph {path} can't be read: {why}.",
-        remedy="Give unedited JPEG, PNG, TIFF or RAW files from the camera.",
-    )
 
 
 def _kept(found: CameraIntrinsics, out: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.colour import linear_to_srgb
 from controller.optics.solve.result.metrics import (
     TITLES,
     PixelSet,
@@ -19,7 +20,6 @@ from controller.optics.solve.result.metrics import (
     sharpness_around,
     structural_similarity,
 )
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import image_planes, plane_frames
 from controller.stage.report.pictures import Crop, crop_around

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from controller.bundle.live_maps import LiveMaps, compensate
 from controller.core.arrays import ByteImage, FloatImage
+from controller.core.colour import linear_to_srgb
 from controller.optics.calibrate.values import Calibration, Radiometry
 from controller.optics.solve.appearance import StageLight, base_image, scale_frames, solve_base
 from controller.optics.solve.bounded.equations import SolveSettings
@@ -27,7 +28,6 @@ from controller.optics.solve.scaling.dither import to_device, to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import reduced, reduction, scaling_maps
 from controller.optics.solve.targets.files import shipped_photograph
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.optics.transport import LightTransport, build_transport
 from controller.play.control.launch import PlayerSettings, start_player
 from controller.play.frames import FrameFile, FrameSet, OutputSize

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import trimesh
 
 from controller.core.arrays import Float64
-from controller.optics.solve.targets.values import linear_to_srgb
+from controller.core.colour import linear_to_srgb
 from plugins.emulated.optics.shapes import BUST_AXIS_X, VASE_AXIS_X, bust, paint_bust, paint_vase, vase
 
 Part = tuple[Float64, Float64, Float64]

@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from controller.panel import decoder
+from controller.core.colour import Unsuitable
+from controller.core.files import UnfitFile
 from controller.panel.decoder import decode
 
 RAMP = np.linspace(0, 65535, 256).astype(np.uint16)[None].repeat(8, axis=0)
@@ -50,14 +51,14 @@ def test_big_endian_sixteen_bits_too() -> None:
 
 def test_a_picture_that_says_nowhere_what_is_white_is_refused() -> None:
     for picture in (Image.fromarray((RAMP / 65535).astype(np.float32)), Image.fromarray(RAMP.astype(np.int32))):
-        with pytest.raises(ValueError, match=r"^[IF]$"):
+        with pytest.raises(Unsuitable, match="numbers"):
             decode(saved(picture, "TIFF"), 10_000)
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "LA", "CMYK", "YCbCr"])
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "LA", "YCbCr"])
 def test_every_mode_becomes_rgb_of_the_same_colours(mode: str) -> None:
     grey = Image.fromarray(EIGHT).point(lambda value: 255 * (value > 127))
-    data = saved(grey.convert("RGB").convert(mode), "TIFF" if mode in ("CMYK", "YCbCr") else "PNG")
+    data = saved(grey.convert("RGB").convert(mode), "TIFF" if mode == "YCbCr" else "PNG")
     assert np.abs(pixels(data).astype(int) - np.asarray(grey)[..., None]).max() <= 2
 
 
@@ -71,9 +72,8 @@ def test_it_is_turned_as_the_camera_was_held() -> None:
 
 def test_too_many_pixels_are_told_before_they_are_decoded() -> None:
     assert decode(saved(Image.new("RGB", (100, 100)), "PNG"), 10_000)
-    with pytest.raises(SystemExit) as caught:
+    with pytest.raises(UnfitFile):
         decode(saved(Image.new("RGB", (101, 100)), "PNG"), 10_000)
-    assert caught.value.code == decoder.TOO_MANY_PIXELS
 
 
 @pytest.mark.parametrize(("size", "least", "expected"), [
@@ -90,7 +90,7 @@ def test_a_large_picture_is_made_smaller_and_still_covers_what_is_asked(
     held = Image.Exif()
     if turned:
         # What is to be seen upright lies on its side in the file.
-        held[decoder.ORIENTATION] = 6
+        held[0x0112] = 6
         whole = whole.transpose(Image.Transpose.ROTATE_90)
     with Image.open(io.BytesIO(decode(saved(whole, kind, exif=held), 10_000_000, least))) as found:
         assert found.width >= min(least[0], size[0])

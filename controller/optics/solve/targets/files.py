@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
+from controller.core.colour import SPACES, ColourSpace, Primaries, Unsuitable, mixed
 from controller.core.errors import UsageError
-from controller.core.files import read_picture_bytes
-from controller.optics.capture.linear_files import Unreadable, exr_chromaticities, read_exr
-from controller.optics.solve.targets.colour import (
-    SPACES,
-    ColourSpace,
-    Primaries,
-    Profile,
-    Unsuitable,
-    decoded,
-    embedded_profile,
-    read_profile,
-)
+from controller.core.pictures import KINDS, read_picture_file
+from controller.optics.capture.linear_files import exr_chromaticities, read_exr
 from controller.optics.solve.targets.values import Target
 
 PHOTOGRAPHS: Final = {"astronaut": Path(__file__).with_name("astronaut.png")}
 """The astronaut Eileen Collins, photographed by NASA: in the public domain (https://flic.kr/p/r9qvLn). sRGB."""
-_ALLOWED = "EXR, PNG or JPEG"
 
 
 def load_target(path: Path, size: tuple[int, int], colour: ColourSpace | None = None) -> Target:
@@ -46,8 +34,7 @@ def load_target(path: Path, size: tuple[int, int], colour: ColourSpace | None = 
     height, width = picture.shape[:2]
     check_picture(path, picture, size)
     mask = picture[..., 3] > 0.5 if picture.shape[2] == 4 else np.ones((height, width), dtype=np.bool_)
-    image = np.where(mask[..., None], np.maximum(picture[..., :3], 0), 0).astype(np.float32)
-    return Target(image, mask)
+    return Target(np.maximum(picture[..., :3], 0), mask)
 
 
 def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> None:
@@ -69,77 +56,50 @@ def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> Non
 
 
 def read_picture(path: Path, colour: ColourSpace | None = None) -> FloatImage:
-    """(rows, columns, 3 or 4) float32 linear sRGB light of an EXR, PNG (8 or 16 bit) or JPEG.
+    """(rows, columns, 3 or 4) float32 linear sRGB light of an EXR, PNG, JPEG, TIFF or WebP, upright.
 
-    ``colour``: the file's colour space; None: what the file says (an ICC profile, chromaticities of an EXR), else sRGB.
-    An EXR is linear light.
+    ``colour``: the file's colour space; None: what the file says (an ICC profile, chromaticities, ...), else sRGB.
+    An EXR is linear light. The fourth channel, where there is transparency, is 1 or 0; at 0 the light is 0.
 
     Raises UsageError("target-unreadable").
     """
     try:
-        return _read_encoded(path, colour) if path.suffix.lower() != ".exr" else _read_light(path, colour)
-    except (Unreadable, Unsuitable) as error:
-        raise _unreadable(path, str(error)) from error
+        light, mask = _read_exr(path, colour) if path.suffix.lower() == ".exr" else _read_encoded(path, colour)
+    except Unsuitable as error:
+        raise unreadable(path, error) from error
+    return light if mask is None else np.dstack([np.where(mask[..., None], light, 0), mask]).astype(np.float32)
 
 
-def _read_light(path: Path, colour: ColourSpace | None) -> FloatImage:
+def unreadable(path: Path, why: Unsuitable) -> UsageError:
+    """The error of a picture that can't be a target."""
+    return UsageError(
+        "target-unreadable",
+        what=f"{path.name} can't be used as a target: {why}.",
+        remedy=f"Give an EXR, {KINDS} picture as seen from the camera.",
+    )
+
+
+def _read_exr(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, Mask | None]:
     picture = read_exr(path)
+    light, mask = picture[..., :3], None
+    if picture.shape[2] == 4:
+        alpha = picture[..., 3:]
+        mask = np.asarray(alpha[..., 0] > 0.5)
+        light = np.asarray(light / np.clip(alpha, 0.5, 1), np.float32)  # EXR's alpha is premultiplied
     said = exr_chromaticities(path) if colour is None else None
-    if said is not None:
-        red, green, blue, white = ((said[n], said[n + 1]) for n in (0, 2, 4, 6))
-        space = Primaries(red, green, blue, white)
-    else:
-        space = SPACES[colour or "srgb"]
-    try:
-        return _with_alpha(decoded(picture[..., :3], space), picture[..., 3:])
-    except (np.linalg.LinAlgError, ZeroDivisionError) as error:
-        raise Unsuitable("its chromaticities are no colours") from error
+    if said is None:
+        return mixed(light, SPACES[colour or "srgb"]), mask
+    red, green, blue, white = ((said[n], said[n + 1]) for n in (0, 2, 4, 6))
+    return mixed(light, Primaries(red, green, blue, white)), mask
+
+
+def _read_encoded(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, Mask | None]:
+    if colour is not None and SPACES[colour].curve == "none":
+        raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
+    picture = read_picture_file(path)
+    return picture.linear(SPACES[colour] if colour else None), picture.mask()
 
 
 def shipped_photograph(name: Literal["astronaut"] = "astronaut") -> FloatImage:
     """(512, 512, 3) float32 linear light in [0, 1] of the photograph that comes with Velatura."""
     return read_picture(PHOTOGRAPHS[name], "srgb")
-
-
-def _read_encoded(path: Path, colour: ColourSpace | None) -> FloatImage:
-    """(rows, columns, 3 or 4) float32, linear, from PNG or JPEG."""
-    if colour is not None and SPACES[colour].curve == "none":
-        raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
-    try:
-        data = read_picture_bytes(path)
-    except OSError as error:
-        raise _unreadable(path, f"it can't be read: {error.strerror}") from error
-    jpeg = data.startswith(b"\xff\xd8\xff")
-    if not jpeg and not data.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise _unreadable(path, f"it is not an {_ALLOWED} file")
-    # decoders fill missing parts with grey and only print a warning
-    if (jpeg and b"\xff\xd9" not in data[-4096:]) or (not jpeg and b"IEND" not in data[-4096:]):
-        raise _unreadable(path, "its end is missing")
-    embedded = embedded_profile(data)
-    source = SPACES[colour] if colour else read_profile(embedded) if embedded else SPACES["srgb"]
-    try:
-        picture: npt.NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise _unreadable(path, "it could not be decoded") from error
-    if picture is None:
-        raise _unreadable(path, "it could not be decoded")
-    if picture.ndim == 2:
-        return _linear(np.repeat(picture[..., None], 3, axis=2), source)
-    alpha = picture[..., 3:].astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
-    return _with_alpha(_linear(picture[..., 2::-1], source), alpha)
-
-
-def _linear(values: npt.NDArray[Any], source: Primaries | Profile) -> FloatImage:
-    return source.decoded(values) if isinstance(source, Profile) else decoded(values, source)
-
-
-def _with_alpha(light: FloatImage, alpha: FloatImage) -> FloatImage:
-    return np.concatenate([light, alpha], axis=2) if alpha.shape[2] else light
-
-
-def _unreadable(path: Path, why: str) -> UsageError:
-    return UsageError(
-        "target-unreadable",
-        what=f"{path.name} can't be used as a target: {why}.",
-        remedy=f"Give an {_ALLOWED} picture as seen from the camera.",
-    )

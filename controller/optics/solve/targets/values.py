@@ -1,13 +1,11 @@
-"""A target picture, its parts on objects that stand apart, and the sRGB curve of picture files (IEC 61966-2-1)."""
+"""A target picture, and its parts on objects that stand apart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask
 from controller.core.blur import masked_blur
@@ -26,27 +24,6 @@ class Target:
     image: FloatImage
     mask: Mask
     softened: str = ""
-
-
-def srgb_to_linear(values: npt.NDArray[Any]) -> FloatImage:
-    """Linear light of sRGB values: floats in [0, 1], or integers over their type's whole range."""
-    encoded = _as_unit(values)
-    low = encoded / np.float32(12.92)
-    high = ((np.maximum(encoded, 0) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.where(encoded <= 0.04045, low, high).astype(np.float32)
-
-
-def linear_to_srgb(light: FloatImage) -> FloatImage:
-    """sRGB values in [0, 1] of linear light, clipped to [0, 1]."""
-    clipped = np.clip(light, 0, 1).astype(np.float32)
-    high = np.float32(1.055) * clipped ** np.float32(1 / 2.4) - np.float32(0.055)
-    return np.where(clipped <= 0.0031308, np.float32(12.92) * clipped, high).astype(np.float32)
-
-
-def _as_unit(values: npt.NDArray[Any]) -> FloatImage:
-    if np.issubdtype(values.dtype, np.integer):
-        return values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
-    return values.astype(np.float32)
 
 
 CAMERA_FILTER_PX = 0.7

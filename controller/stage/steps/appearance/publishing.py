@@ -23,9 +23,9 @@ from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.config import load_stage
 from controller.config.loader import FILE
 from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.colour import linear_to_srgb
 from controller.core.errors import BundleError
 from controller.core.storage import sha256_of
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId

@@ -17,9 +17,9 @@ from controller.config import Stage
 from controller.config.models import AppearanceTable
 from controller.config.table import allowed, checked_arguments
 from controller.core.arrays import FloatImage
+from controller.core.colour import ColourSpace
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
-from controller.optics.solve.targets.colour import ColourSpace
 from controller.optics.solve.targets.files import check_picture, load_target, read_picture
 from controller.optics.solve.targets.patterns import (
     CheckerboardLook,

@@ -15,7 +15,7 @@ from PIL import Image, ImageCms
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.targets import fitted, regions_of, restricted
-from controller.optics.solve.targets.colour import with_profile
+from tests.controller.optics.solve.targets import icc_files
 
 VIEW = (60, 40)
 
@@ -82,13 +82,28 @@ def test_what_is_no_picture_is_refused(data: bytes) -> None:
     assert caught.value.code == "target-unreadable"
 
 
-def test_a_picture_of_another_size_keeps_its_colour_profile() -> None:
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    changed = fitted(with_profile(png_of(120, 40), profile), VIEW)
-    with Image.open(io.BytesIO(changed)) as opened:
-        opened.verify()
-        assert opened.info["icc_profile"] == profile
-        assert opened.size == VIEW
+def test_a_picture_of_another_size_is_converted_by_its_colour_profile() -> None:
+    profile = icc_files.icc_profile(icc_files.ADOBE_D50, icc_files.ADOBE_CURVE)
+    picture = Image.new("RGB", (120, 40), (180, 90, 60))
+    file = io.BytesIO()
+    picture.save(file, "PNG", icc_profile=profile)
+    theirs = ImageCms.profileToProfile(
+        picture, ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB"),
+        ImageCms.Intent.RELATIVE_COLORIMETRIC,
+    )  # fmt: skip
+    assert theirs is not None
+    found = seen(fitted(file.getvalue(), VIEW))[20, 30, 2::-1] / 257
+    assert np.abs(found - np.asarray(theirs)[0, 0]).max() < 1
+
+
+def test_hidden_colours_do_not_show_at_the_edges_of_a_picture_that_is_made_smaller() -> None:
+    picture = np.zeros((400, 600, 4), np.uint8)
+    picture[..., 1] = 255  # green, hidden
+    picture[85:315, 123:477] = (0, 0, 200, 255)
+    found = seen(fitted(cv2.imencode(".png", picture)[1].tobytes(), VIEW))
+    shown = found[..., 3] > 0
+    assert found[shown][:, 1].max() <= 2
+    assert found[shown & (found[..., 3] > 20)][:, 2].min() >= 198
 
 
 def test_a_picture_that_moves_is_refused() -> None:

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from pxr import Gf, Usd, UsdGeom, UsdValidation
 
-from controller.optics.solve.targets.values import linear_to_srgb
+from controller.core.colour import linear_to_srgb
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.formats import FORMATS, format_of
 from tests.controller.stage.exchange.conftest import NAMES, NOISE_PX, opencv_px

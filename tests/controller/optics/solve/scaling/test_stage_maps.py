@@ -10,6 +10,7 @@ import pytest
 
 from controller.bundle.live_maps import LiveMaps, compensate, compensate_light, light_table
 from controller.core.arrays import ByteImage, FloatImage
+from controller.core.colour import linear_to_srgb
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import Base, BaseKind, StageLight, base_image, scale_frames, solve_base
@@ -17,7 +18,6 @@ from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.scaling.dither import to_light
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.optics.solve.scaling.stage_maps import NARROWED, footprints, reduced, reduction, scaling_maps
-from controller.optics.solve.targets.values import linear_to_srgb
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from lab.timings.tools.synthetic import synthetic_calibration, synthetic_target

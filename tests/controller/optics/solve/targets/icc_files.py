@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 
 import numpy as np
 
@@ -45,3 +46,14 @@ def icc_profile(columns: tuple[tuple[float, ...], ...], curve: bytes, *, kind: b
     head = struct.pack(">I4sI4s4s4s", size, b"test", 0x04300000, b"mntr", kind, b"XYZ ")
     head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + b"\0" * 28 + struct.pack(">3i", 63190, 65536, 54061)
     return head.ljust(128, b"\0") + table + body
+
+
+def with_chunk(png: bytes, kind: bytes, body: bytes) -> bytes:
+    """A PNG with one more chunk after its header."""
+    chunk = struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    return png[:33] + chunk + png[33:]
+
+
+def with_profile(png: bytes, profile: bytes) -> bytes:
+    """A PNG with an ICC profile, in any depth."""
+    return with_chunk(png, b"iCCP", b"profile\0\0" + zlib.compress(profile))

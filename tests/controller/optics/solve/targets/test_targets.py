@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from controller.core.arrays import FloatImage, Mask
+from controller.core.colour import linear_to_srgb, srgb_to_linear
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.files import load_target, shipped_photograph
 from controller.optics.solve.targets.patterns import CheckerboardLook, PatternLook, checkerboard, replace_pattern
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
-from controller.optics.solve.targets.values import Target, in_box, linear_to_srgb, srgb_to_linear, through_camera
+from controller.optics.solve.targets.values import Target, in_box, through_camera
 from controller.optics.solve.targets.wrap import PrintLook, object_space, wrap_photograph
 
 ROWS, COLUMNS, FOCAL = 160, 240, 400.0
