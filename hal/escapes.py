@@ -1,4 +1,4 @@
-r"""Bytes as printable ASCII, for transcripts and messages: without loss, and safe for a terminal.
+r"""Bytes as printable ASCII, for tapes and messages: without loss, and safe for a terminal.
 
 Bytes 0x20 to 0x7e stand for themselves except the backslash; ``\r``, ``\n``, ``\t`` and ``\\`` are as in C; every other
 byte is ``\xNN``.
@@ -27,9 +27,9 @@ def unescaped(text: str) -> bytes:
     data = text.encode("ascii", "backslashreplace")
     if not text.isascii() or b"\\" in _ESCAPE.sub(b"", data):
         raise ProtocolError(
-            "transcript-wrong",
-            what=f"The bytes {text[:80]!r} of the transcript are not escaped correctly.",
-            remedy="Record it again. Its format is described in hal/transcript.py.",
+            "tape-wrong",
+            what=f"The bytes {text[:80]!r} of the tape are not escaped correctly.",
+            remedy="Record it again. Its format is described in docs/reference/tape-format.md.",
         )
     return _ESCAPE.sub(lambda m: bytes.fromhex(m[1].decode()) if m[1] else _LONG[m[2]], data)
 

@@ -1,8 +1,7 @@
 """Byte links: how bytes reach a device and come back, always with a deadline; over TCP the lookup of the host's name
 is part of it.
 
-Links and protocol codecs are independent. ``hal.serial_link`` has the link over a serial port, ``hal.transcript``
-the one that replays a recording.
+Links and protocol codecs are independent. ``hal.serial_link`` has the link over a serial port.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, Final, Protocol
 
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
-from hal.transcript import Transcript
+from hal.tape import Transcript
 
 _Places = list[tuple[Any, ...]]
 _turn = threading.Lock()

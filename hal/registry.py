@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
@@ -14,8 +13,7 @@ from hal.deadline import Deadline
 from hal.driver_calls import Caller, closed_quietly, mismatch
 from hal.errors import PluginError
 from hal.escapes import toml_value
-from hal.tape import Tape
-from hal.transcript import Transcript
+from hal.tape import Tape, Transcript
 
 GROUP = "velatura.devices"
 BENCH = "-bench"
@@ -33,29 +31,23 @@ _KIND_WORDS: Final[Mapping[type, str]] = {
 class OpenContext:
     """The stage's folders for a driver: relative paths in settings start at the stage's folder.
 
-    ``transcripts``: folder for byte transcripts, or None to keep none. ``runtime``: short private folder for sockets.
-    ``tape``: records the traffic of all devices, instead of transcripts. ``checked``: whether calls of drivers are
-    checked, on threads of their own (``hal.driver_calls``).
+    ``runtime``: short private folder for sockets. ``tape``: records the traffic of all devices. ``checked``: whether
+    calls of drivers are checked, on threads of their own (``hal.driver_calls``).
     """
 
     stage: Path
-    transcripts: Path | None = None
     runtime: Path | None = None
     tape: Tape | None = None
     checked: bool = True
 
-    def transcript(self, kind: str, address: str, *, keep: int = 10_000, secret: str = "") -> Transcript | None:
+    def transcript(self, kind: str, address: str, *, secret: str = "") -> Transcript | None:
         """Where a driver records its bytes; None to record none.
 
         ``kind``: "serial", "tcp", "pjlink", "ptp" or "hid"; ``secret``: a password, which is not recorded.
         """
-        if self.tape is not None:
-            return self.tape.track(kind, address, secrets=(secret.encode(),) if secret else ())
-        if self.transcripts is None:
+        if self.tape is None:
             return None
-        self.transcripts.mkdir(parents=True, exist_ok=True)
-        name = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{kind}-{address}")
-        return Transcript(self.transcripts / f"{name}.txt", keep=keep)
+        return self.tape.track(kind, address, secrets=(secret.encode(),) if secret else ())
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ import serial
 from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceRefused
 from hal.links import BufferedLink, port_taken
-from hal.transcript import Transcript
+from hal.tape import Transcript
 
 TERMINALS: Final = "/dev/pts/"
 

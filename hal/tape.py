@@ -12,13 +12,31 @@ import threading
 import time
 import zlib
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 from typing import Final, TextIO
 
 from hal.errors import ProtocolError
 from hal.escapes import escaped, unescaped
 from hal.runtime.files import require_regular
-from hal.transcript import Direction, Entry, Transcript
+
+
+class Direction(Enum):
+    """The direction of an entry: to the device, from it, or a remark."""
+
+    SENT = ">"
+    RECEIVED = "<"
+    REMARK = "|"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A piece of a track; ``at_s`` in seconds since the tape began. How bytes are grouped has no meaning."""
+
+    at_s: float
+    way: Direction
+    data: bytes
+
 
 HEADER: Final = "velatura tape 1"
 MOST_BYTES: Final = 1 << 30
@@ -45,7 +63,7 @@ class Tape:
         self._file: TextIO | None = path.open("w", encoding="ascii", buffering=1)
         self._write(HEADER)
 
-    def track(self, kind: str, address: str, *, secrets: tuple[bytes, ...] = ()) -> TapeTrack:
+    def track(self, kind: str, address: str, *, secrets: tuple[bytes, ...] = ()) -> Transcript:
         """A new track: ``kind`` is a word for how its bytes are to be understood, ``address`` the device's.
 
         Each of ``secrets`` is written as asterisks.
@@ -54,7 +72,7 @@ class Tape:
             self._tracks += 1
             number = self._tracks
         self._line("+", number, f"{kind} {escaped(address.encode())}")
-        return TapeTrack(self, number, kind, secrets)
+        return Transcript(self, number, kind, secrets)
 
     def close(self) -> None:
         with self._lock:
@@ -84,17 +102,23 @@ class Tape:
                 self._file = None
 
 
-class TapeTrack(Transcript):
-    """A transcript that is a track of a tape; it keeps nothing in memory. ``close`` leaves the tape open."""
-
-    whole = True
+class Transcript:
+    """Records what is said with one device, as a track of a tape."""
 
     def __init__(self, tape: Tape, number: int, kind: str, secrets: tuple[bytes, ...]) -> None:
-        super().__init__(keep=1)
         self._tape = tape
         self._number = number
         self._kind = kind
         self._secrets = tuple(secret for secret in secrets if secret)
+
+    def sent(self, data: bytes) -> None:
+        self._add(Direction.SENT, data)
+
+    def received(self, data: bytes) -> None:
+        self._add(Direction.RECEIVED, data)
+
+    def remark(self, text: str) -> None:
+        self._add(Direction.REMARK, text.encode("ascii", "backslashreplace"))
 
     def _add(self, way: Direction, data: bytes) -> None:
         self._tape.add(self._number, way, self._without_secrets(data))

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Final, Generic, TypeVar
 
 from hal.serial_link import PtyLink
-from hal.tape import Track
-from hal.transcript import Direction, Entry
+from hal.tape import Direction, Entry, Track
 from plugins.emulated.cameras.body import CameraNames, EmulatedBody
 from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome

@@ -16,7 +16,6 @@ from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, Plu
 from hal.links import ByteLink, TcpLink, host_and_port
 from hal.notices import Notice
 from hal.registry import Driver, OpenContext, setting
-from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 from plugins.projectors.pjlink_conversation import PjLinkConversation
 from plugins.projectors.profile_files import load_profile
@@ -43,14 +42,12 @@ class PjLinkProjector:
         *,
         name: str,
         password: str | None = None,
-        transcript: Transcript | None = None,
     ) -> None:
         self._talk = PjLinkConversation(connect, name, password, profile)
         self._habits = self._talk.habits
         self._timing = profile.timing
         self._lamp = profile.lamp
         self._name = name
-        self._transcript = transcript
         self._lock = threading.Lock()
         self._inputs: tuple[str, ...] = ()
 
@@ -158,8 +155,6 @@ class PjLinkProjector:
 
     def close(self) -> None:
         self._talk.close()
-        if self._transcript is not None:
-            self._transcript.close()
 
     def _command(
         self, talk: PjLinkConversation, name: str, parameter: str, doing: str, deadline: Deadline,
@@ -266,7 +261,6 @@ def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, dea
         profile,
         name=str(settings["address"]),
         password=password,
-        transcript=transcript,
     )
     projector.open(deadline)
     return projector

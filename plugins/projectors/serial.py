@@ -20,7 +20,6 @@ from hal.links import ByteLink
 from hal.notices import Notice
 from hal.registry import Driver, OpenContext
 from hal.serial_link import SerialLink
-from hal.transcript import Transcript
 from hal.values import DeviceIdentity, Power, ProjectorCapabilities, ProjectorStatus
 from plugins.projectors.answers import OptionalAnswers, PowerView
 from plugins.projectors.network.device_server import open_url
@@ -52,7 +51,6 @@ class SerialProjector:
         *,
         name: str,
         address: str | None = None,
-        transcript: Transcript | None = None,
         check: str = SERIAL_CHECK,
     ) -> None:
         table = serial_table(profile)
@@ -61,7 +59,6 @@ class SerialProjector:
         self._table = table
         self._view = PowerView(profile.lamp, reported_powers(table))
         self._lock = threading.Lock()
-        self._transcript = transcript
         self._open_link = open_link
         self._opened_at_s = time.monotonic()
         self._answered = False
@@ -187,8 +184,6 @@ class SerialProjector:
 
     def close(self) -> None:
         self._talk.close()
-        if self._transcript is not None:
-            self._transcript.close()
 
     def _power(self, deadline: Deadline) -> Power:
         if "power" not in self._table.queries:
@@ -322,7 +317,6 @@ def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, dea
         profile,
         name=str(settings["port"]),
         address=address,
-        transcript=transcript,
     )
     projector.open(deadline)
     return projector

@@ -15,7 +15,7 @@ from hal.deadline import Deadline
 from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.registry import Driver, OpenContext
-from hal.transcript import Transcript
+from hal.tape import Transcript
 from plugins.ptp.body import PictureStorage
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, PtpLink, Reply, Sink
@@ -90,7 +90,7 @@ LONGEST_PICTURE_S: Final = 600.0
 def _settings(settings: Mapping[str, Any]) -> tuple[str, PictureStorage, Timing]:
     """Address, where pictures are stored, and time limits. Raises PluginError."""
     address = str(settings["address"])
-    _way(address, None)
+    _way(address)
     to_card = _choice(settings, "target", "computer", "card") == "card"
     storage = PictureStorage(to_card, _flag(settings, "keep_on_card"), _flag(settings, "raw_and_jpeg"))
     return address, storage, _timing(settings)
@@ -102,11 +102,11 @@ def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
 
 
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
-    """Open the camera of a ``[camera]`` table; transcripts go to ``context.transcripts``."""
+    """Open the camera of a ``[camera]`` table."""
     address, storage, timing = _settings(settings)  # a wrong address leaves no file
-    transcript = context.transcript(TRACK, _named(address), keep=1000)
-    connect = _way(address, None if context.tape is not None else transcript)
-    if context.tape is not None and transcript is not None:
+    transcript = context.transcript(TRACK, _named(address))
+    connect = _way(address)
+    if transcript is not None:
         connect = _recorded(connect, transcript)
     return PtpCamera(
         connect,
@@ -118,15 +118,15 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
     )
 
 
-def _way(address: str, transcript: Transcript | None) -> Connect:
+def _way(address: str) -> Connect:
     """What opens a link to ``address``. Raises PluginError."""
     if address.startswith("usb:"):
         # Imported here, because a stage with its camera on the network needs no libusb.
         from plugins.ptp.usb.bus import UsbAddress, UsbFinder
 
-        return UsbFinder(UsbAddress.parse(address), transcript=transcript).connect
+        return UsbFinder(UsbAddress.parse(address)).connect
     place = PtpIpAddress.parse(address)
-    return lambda until: PtpIpLink.connect(place, transcript=transcript, deadline=until)
+    return lambda until: PtpIpLink.connect(place, deadline=until)
 
 
 def _recorded(connect: Connect, track: Transcript) -> Connect:

@@ -21,7 +21,6 @@ from hal.codecs.ptp.values import broken
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, PluginError
 from hal.links import connected
-from hal.transcript import Transcript
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost, camera_off
 
 DEFAULT_PORT: Final = 15740
@@ -138,7 +137,6 @@ def readable(wires: Iterable[Wire | None], seconds: float) -> bool:
 
 _BLOCK: Final = 1 << 20
 _MOST_EVENTS: Final = 10_000
-_LONGEST_NOTE: Final = 4096
 _MOST_READS: Final = 16
 _EVENTS_S: Final = 5.0
 
@@ -146,9 +144,8 @@ _EVENTS_S: Final = 5.0
 class PtpIpLink:
     """An open PTP/IP connection; see ``PtpLink``. Made by ``connect``."""
 
-    def __init__(self, command: Wire, transcript: Transcript | None) -> None:
+    def __init__(self, command: Wire) -> None:
         self._command = command
-        self._transcript = transcript
         self._events: Wire | None = None
         self._event_bytes = bytearray()
         self._queue: deque[LinkEvent] = deque(maxlen=_MOST_EVENTS)
@@ -158,13 +155,13 @@ class PtpIpLink:
         self._ready_for_events = False
 
     @classmethod
-    def connect(cls, address: PtpIpAddress, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
-        """Open both connections and introduce this computer; ``transcript`` records all but picture data.
+    def connect(cls, address: PtpIpAddress, *, deadline: Deadline) -> Self:
+        """Open both connections and introduce this computer.
 
         Raises DeviceGone("camera-off") without an answer, DeviceBusy if another computer uses the camera,
         DeviceRefused where the camera does not know this one, DeviceTimeout.
         """
-        link = cls(Wire.connect(address.host, address.command_port, deadline=deadline), transcript)
+        link = cls(Wire.connect(address.host, address.command_port, deadline=deadline))
         try:
             link._introduce(address, deadline)
         except BaseException:
@@ -196,7 +193,7 @@ class PtpIpLink:
             if data is not None:
                 packets += ptp_ip.pack(ptp_ip.StartData(number, len(data)))
                 packets += ptp_ip.pack(ptp_ip.EndData(number, data))
-            self._send(self._command, packets, deadline)
+            self._command.send(packets, deadline)
             return self._answer(number, sink, most, deadline)
         except BaseException:
             # The rest of the answer may still come; it must not be taken for the next one.
@@ -227,12 +224,12 @@ class PtpIpLink:
         name = socket.gethostname()
         # A computer always sends the same name, so that a camera asks for pairing only once.
         guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"velatura.{name}").bytes
-        self._send(self._command, ptp_ip.pack(ptp_ip.InitCommandRequest(guid, f"Velatura {name}"[:39])), deadline)
+        self._command.send(ptp_ip.pack(ptp_ip.InitCommandRequest(guid, f"Velatura {name}"[:39])), deadline)
         accepted = self._packet(self._command, deadline)
         if not isinstance(accepted, ptp_ip.InitCommandAck):
             raise _unwelcome(accepted)
         self._events = _event_wire(address, accepted.name, deadline)
-        self._send(self._events, ptp_ip.pack(ptp_ip.InitEventRequest(accepted.connection)), deadline)
+        self._events.send(ptp_ip.pack(ptp_ip.InitEventRequest(accepted.connection)), deadline)
         ready = self._packet(self._events, deadline)
         if not isinstance(ready, ptp_ip.InitEventAck):
             raise _unwelcome(ready)
@@ -277,8 +274,6 @@ class PtpIpLink:
             raise broken(f"the answer to request {transaction} while request {number} was asked")
 
     def _stream(self, count: int, take: Sink, deadline: Deadline) -> None:
-        if self._transcript is not None:
-            self._transcript.remark(f"{count} bytes of data")
         view = memoryview(self._block)
         while count:
             piece = view[: min(count, _BLOCK)]
@@ -293,7 +288,7 @@ class PtpIpLink:
             case ptp_ip.Event(code, _, parameters):
                 self._queue.append(LinkEvent(code, parameters))
             case ptp_ip.Ping():
-                self._send(wire, ptp_ip.pack(ptp_ip.Pong()), deadline)
+                wire.send(ptp_ip.pack(ptp_ip.Pong()), deadline)
             case ptp_ip.Pong():
                 pass
             case ptp_ip.Cancel():
@@ -324,7 +319,6 @@ class PtpIpLink:
                 raise broken("picture data on the event connection")
             if len(pending) < end:
                 return
-            self._note(pending[:end])
             packet = ptp_ip.parse(kind, bytes(pending[ptp_ip.HEADER.size : end]))
             del pending[:end]
             self._aside(packet, events, deadline)
@@ -338,7 +332,6 @@ class PtpIpLink:
     def _exactly(self, wire: Wire, count: int, deadline: Deadline) -> bytearray:
         data = bytearray(count)
         wire.fill(memoryview(data), deadline, self._wait)
-        self._note(data)
         return data
 
     def _wait(self, deadline: Deadline) -> None:
@@ -346,15 +339,6 @@ class PtpIpLink:
         still_time(deadline)
         if readable([self._command, self._events], min(SLICE_S, deadline.left_s())) and self._ready_for_events:
             self._pump()
-
-    def _send(self, wire: Wire, data: bytes, deadline: Deadline) -> None:
-        if self._transcript is not None:
-            self._transcript.sent(data[:_LONGEST_NOTE])
-        wire.send(data, deadline)
-
-    def _note(self, data: bytes | bytearray) -> None:
-        if self._transcript is not None:
-            self._transcript.received(bytes(data[:_LONGEST_NOTE]))
 
 
 def _event_wire(address: PtpIpAddress, name: str, deadline: Deadline) -> Wire:

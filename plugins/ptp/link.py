@@ -11,7 +11,7 @@ from hal.codecs.ptp.values import Answer
 from hal.deadline import Deadline
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused
 from hal.notices import Notice
-from hal.transcript import Transcript
+from hal.tape import Transcript
 
 Sink = Callable[[memoryview], object]
 """Receives the bytes of a data phase in pieces; the memory is reused after it returns."""

@@ -19,7 +19,7 @@ from hal.codecs.ptp.values import Answer, Operation, Vendor
 from hal.deadline import Deadline, in_seconds, turn
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.notices import Notice
-from hal.transcript import Transcript
+from hal.tape import Transcript
 from hal.values import CameraCapabilities, CameraStatus, CapturedFile, DeviceIdentity, ExposureSettings
 from plugins.camera_files import PendingFile, commit_all, kind_of
 from plugins.ptp.body import Body, Channel, PictureStorage
@@ -77,7 +77,7 @@ class PtpCamera:
     ----------
     serial : the camera must have this serial number; "" uses the first that answers and keeps to it
     storage : where the camera stores pictures, and which
-    transcript : closed with the camera; the opener of a link records its bytes
+    transcript : for remarks; the opener of a link records its bytes
     """
 
     def __init__(
@@ -91,7 +91,6 @@ class PtpCamera:
         deadline: Deadline,
     ) -> None:
         self._connect = connect
-        self._transcript = transcript
         self._serial = serial
         self._storage = storage or PictureStorage()
         self._timing = timing or Timing()
@@ -178,8 +177,6 @@ class PtpCamera:
                     body.leave(deadline=deadline)
                     channel.once(Operation.CLOSE_SESSION, deadline=deadline)
             channel.link.close()
-        if self._transcript is not None:
-            self._transcript.close()
 
     def _capture(self, shot: Shot, destination: Path, deadline: Deadline) -> list[CapturedFile]:
         self._check_time_for(shot, deadline)

@@ -14,7 +14,7 @@ import typer
 from controller.__main__ import application
 
 ROOT = Path(__file__).parents[2]
-FORMATS = r"transcript 1|tape 1|bundle signature 1"
+FORMATS = r"tape 1|bundle signature 1"
 """First words of file formats; no command is meant."""
 NAMED = re.compile(rf"(?<![\w./-])(?:\.venv/bin/)?velatura (?!{FORMATS})([a-z][a-z-]*)((?: [\w./=-]+)*)")
 

@@ -17,28 +17,29 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import TcpLink, host_and_port
 from hal.serial_link import SerialLink
-from hal.transcript import Direction, Transcript
+from hal.tape import Direction, Tape, read_tape
 
 
 class Peer:
     """The other end of a TCP link."""
 
-    def __init__(self) -> None:
+    def __init__(self, tape: Path) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.transcript = Transcript()
+        self.tape = Tape(tape)
         port = self.listener.getsockname()[1]
-        self.link = TcpLink("127.0.0.1", port, deadline=in_seconds(20), transcript=self.transcript)
+        self.link = TcpLink("127.0.0.1", port, deadline=in_seconds(20), transcript=self.tape.track("tcp", "peer"))
         self.socket, _ = self.listener.accept()
 
     def close(self) -> None:
         self.link.close()
         self.socket.close()
         self.listener.close()
+        self.tape.close()
 
 
 @pytest.fixture
-def peer() -> Iterator[Peer]:
-    made = Peer()
+def peer(tmp_path: Path) -> Iterator[Peer]:
+    made = Peer(tmp_path / "peer.tape")
     yield made
     made.close()
 
@@ -146,12 +147,13 @@ def test_a_peer_that_reads_nothing_stops_a_long_write_at_the_deadline(peer: Peer
         peer.link.write(b"x" * 30_000_000, deadline=in_seconds(0.3))
 
 
-def test_every_byte_stands_in_the_transcript(peer: Peer) -> None:
+def test_every_byte_stands_on_the_tape(peer: Peer) -> None:
     peer.link.write(b"question\r", deadline=in_seconds(20))
     peer.socket.sendall(b"answer\r")
     peer.link.read_until(b"\r", limit=10, deadline=in_seconds(20))
-    sent = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Direction.SENT)
-    received = b"".join(entry.data for entry in peer.transcript.entries if entry.way is Direction.RECEIVED)
+    (track,) = read_tape(peer.tape.path)
+    sent = b"".join(entry.data for entry in track.entries if entry.way is Direction.SENT)
+    received = b"".join(entry.data for entry in track.entries if entry.way is Direction.RECEIVED)
     assert (sent, received) == (b"question\r", b"answer\r")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
+from hal.tape import Entry, Tape, read_tape
 from hal.values import Power
 from lab.emulated.projectors.boards import BOARDS, login_of
 from lab.emulated.projectors.network import GATES, EmulatedNetworkProjector
@@ -55,8 +57,9 @@ class SerialPair:
     emulator: EmulatedSerialProjector
     stage: Path
 
-    def transcript(self) -> str:
-        return next((self.stage / "transcripts").glob("*.txt")).read_text()
+    def said(self) -> list[Entry]:
+        """All that driver and projector have said to each other."""
+        return [entry for path in self.stage.glob("*.tape") for track in read_tape(path) for entry in track.entries]
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,18 @@ OpenPjLink = Callable[..., PjLinkPair]
 
 
 @pytest.fixture
-def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
+def taped(tmp_path: Path) -> Iterator[Callable[[str], OpenContext]]:
+    """Makes contexts in which drivers are recorded, each on a tape of this name."""
+    with contextlib.ExitStack() as tapes:
+
+        def context(name: str) -> OpenContext:
+            return OpenContext(tmp_path, tape=tapes.enter_context(contextlib.closing(Tape(tmp_path / f"{name}.tape"))))
+
+        yield context
+
+
+@pytest.fixture
+def open_serial(tmp_path: Path, taped: Callable[[str], OpenContext]) -> Iterator[OpenSerial]:
     """Start an emulated projector on a pty and open its driver; keyword arguments go to the emulator.
 
     ``profile`` is a shipped one, ``edit`` changes its text, ``timing`` is its lamp's; ``board`` makes another board
@@ -129,7 +143,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
         )
         emulator.start()
         table = {"profile": f"{name}.toml", "port": f"run/tty-{name}", **(settings or {})}
-        context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
+        context = taped(f"{name}-{len(opened)}")
         pair = SerialPair(open_serial_projector(table, context, in_seconds(20)), emulator, tmp_path)
         opened.append(pair)
         return pair
@@ -141,7 +155,7 @@ def open_serial(tmp_path: Path) -> Iterator[OpenSerial]:
 
 
 @pytest.fixture
-def open_network(tmp_path: Path) -> Iterator[OpenNetwork]:
+def open_network(tmp_path: Path, taped: Callable[[str], OpenContext]) -> Iterator[OpenNetwork]:
     """Start an emulated projector on its own LAN port and open its driver; other keyword arguments go to the emulator.
 
     ``profile``, ``edit``, ``timing``, ``board`` and ``name`` as in ``open_serial``; ``gate``: another login than the
@@ -161,7 +175,7 @@ def open_network(tmp_path: Path) -> Iterator[OpenNetwork]:
         emulator = EmulatedNetworkProjector(lamp, board, gate=gate, **kwargs)
         emulator.start()
         table = {"profile": f"{name}.toml", "address": emulator.address, **(settings or {})}
-        context = OpenContext(tmp_path, transcripts=tmp_path / "transcripts")
+        context = taped(f"{name}-{len(opened)}")
         try:
             driver = open_network_projector(table, context, in_seconds(20))
         except BaseException:

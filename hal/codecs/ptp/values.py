@@ -126,7 +126,7 @@ def broken(what: str) -> ProtocolError:
     return ProtocolError(
         "camera-protocol",
         what=f"The camera sent {what}.",
-        remedy="Switch the camera off and on. If it happens again, report it with the transcript.",
+        remedy="Switch the camera off and on. If it happens again, report it with a tape (`velatura record`).",
     )
 
 

@@ -18,7 +18,7 @@ from serial import rfc2217
 from hal.deadline import SLICE_S, Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError
 from hal.links import BufferedLink, ByteLink, TcpLink
-from hal.transcript import Transcript
+from hal.tape import Transcript
 
 SCHEMES: Final = ("socket", "rfc2217")
 _LOST: Final = (OSError, ValueError, TypeError, AttributeError)

@@ -30,7 +30,7 @@ from hal.deadline import Deadline
 from hal.errors import DeviceError, DeviceGone, DeviceTimeout, PluginError, ProtocolError
 from hal.links import ByteLink, TcpLink, host_and_port
 from hal.registry import Driver, OpenContext, setting
-from hal.transcript import Transcript
+from hal.tape import Transcript
 from plugins.projectors.profile_files import load_profile, serial_table
 from plugins.projectors.serial import SerialProjector
 
@@ -336,9 +336,7 @@ def open_network_projector(settings: Mapping[str, Any], context: OpenContext, de
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     parsed = read_settings(settings, context)
     transcript = context.transcript("tcp", f"{parsed.host}-{parsed.port}", secret=parsed.account.password or "")
-    projector = SerialProjector(
-        _Line(parsed, transcript).open, parsed.profile, name=parsed.account.name, transcript=transcript, check=CHECK
-    )
+    projector = SerialProjector(_Line(parsed, transcript).open, parsed.profile, name=parsed.account.name, check=CHECK)
     try:
         projector.open(deadline)
     except DeviceError:

@@ -13,7 +13,6 @@ import usb.util
 from hal.codecs.ptp.values import printable
 from hal.deadline import Deadline
 from hal.errors import DeviceGone, DeviceRefused, PluginError
-from hal.transcript import Transcript
 from plugins.ptp.ip import still_time
 from plugins.ptp.link import camera_off
 from plugins.ptp.usb.link import PtpUsbLink
@@ -84,9 +83,8 @@ def usb_cameras() -> list[UsbCamera]:
 class UsbFinder:
     """Opens the camera of an address, and the same camera again after it was plugged in elsewhere."""
 
-    def __init__(self, address: UsbAddress, *, transcript: Transcript | None = None) -> None:
+    def __init__(self, address: UsbAddress) -> None:
         self._address = address
-        self._transcript = transcript
         self._known = address.serial
 
     def connect(self, deadline: Deadline) -> PtpUsbLink:
@@ -94,7 +92,7 @@ class UsbFinder:
         still_time(deadline)
         camera = self._choose(usb_cameras())
         pipes = PyusbPipes.open(camera.device)
-        link = PtpUsbLink.over(pipes, transcript=self._transcript, deadline=deadline)
+        link = PtpUsbLink.over(pipes, deadline=deadline)
         self._known = camera.serial
         return link
 

@@ -19,7 +19,6 @@ from hal.codecs.ptp.usb import HEADER, ClassRequest
 from hal.codecs.ptp.values import Answer, broken
 from hal.deadline import Deadline
 from hal.errors import DeviceError, ProtocolError
-from hal.transcript import Transcript
 from plugins.ptp.ip import still_time
 from plugins.ptp.link import MOST_IN_MEMORY, LinkEvent, Reply, Sink, camera_lost
 from plugins.ptp.usb.pipes import InterruptReader, Pipes, PipeStalled
@@ -28,7 +27,6 @@ Result = TypeVar("Result")
 
 _SLICE_S: Final = 0.1
 _BLOCK: Final = 1 << 20
-_LONGEST_NOTE: Final = 4096
 _REQUEST_S: Final = 0.3
 _RESET_S: Final = 2.0
 _EMPTY_S: Final = 0.01
@@ -40,9 +38,8 @@ _MOST_ODD: Final = 16
 class PtpUsbLink:
     """An open camera on USB; see ``PtpLink``. ``pipes`` belong to it and are closed with it."""
 
-    def __init__(self, pipes: Pipes, *, transcript: Transcript | None = None) -> None:
+    def __init__(self, pipes: Pipes) -> None:
         self._pipes = pipes
-        self._transcript = transcript
         self._transaction = -1
         self._first = array("B", bytes(pipes.packet))
         self._block = array("B", bytes(_BLOCK // pipes.packet * pipes.packet))
@@ -53,9 +50,9 @@ class PtpUsbLink:
         self._interrupts = InterruptReader(pipes)
 
     @classmethod
-    def over(cls, pipes: Pipes, *, transcript: Transcript | None = None, deadline: Deadline) -> Self:
+    def over(cls, pipes: Pipes, *, deadline: Deadline) -> Self:
         """Start on ``pipes``: end unfinished transactions of another program. Closes the pipes if that fails."""
-        link = cls(pipes, transcript=transcript)
+        link = cls(pipes)
         try:
             link._tidy_up(deadline)
         except BaseException:
@@ -156,8 +153,6 @@ class PtpUsbLink:
             return None
 
     def _send(self, data: bytes, deadline: Deadline) -> None:
-        if self._transcript is not None:
-            self._transcript.sent(data[:_LONGEST_NOTE])
         whole = len(data) % self._pipes.packet == 0
         while data:
             still_time(deadline)
@@ -175,8 +170,6 @@ class PtpUsbLink:
         try:
             return work()
         except PipeStalled:
-            if self._transcript is not None:
-                self._transcript.remark("stalled; the halt is cleared and the transfer repeated")
             self._pipes.clear_halts()
             return work()
 
@@ -219,7 +212,6 @@ class PtpUsbLink:
                 if empty > _MOST_ODD:
                     raise broken("nothing but empty packets")
             start += self._first[:count].tobytes()
-        self._note(start)
         return start
 
     def _stream(self, length: int, start: memoryview, take: Sink, most: int, deadline: Deadline) -> None:
@@ -249,8 +241,6 @@ class PtpUsbLink:
                 more = late or count == len(buffer)
             elif received < length and not late and (count % packet or not count):
                 raise broken(f"{received} bytes of data where {length} were announced")
-        if self._transcript is not None:
-            self._transcript.remark(f"{received} bytes of data")
 
     def _buffer(self, wanted: int) -> array[int]:
         """Room for ``wanted`` bytes, and for no packet more: what follows them is another container."""
@@ -270,10 +260,6 @@ class PtpUsbLink:
             late = time.monotonic() - began >= wait_s
             if count or not late:
                 return count, late
-
-    def _note(self, data: bytes) -> None:
-        if self._transcript is not None:
-            self._transcript.received(data[:_LONGEST_NOTE])
 
 
 def _nowhere(piece: memoryview) -> None:

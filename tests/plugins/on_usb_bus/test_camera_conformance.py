@@ -25,7 +25,7 @@ class EveryFlavour(CameraConformance):
     @pytest.fixture
     def camera(self, bus: UsbBusProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PtpCamera]:
         bus.add("camera", "camera", flavour=self.flavour, size=50_000, time_scale=0.01)
-        context = OpenContext(tmp_path_factory.mktemp("stage"), transcripts=tmp_path_factory.mktemp("transcripts"))
+        context = OpenContext(tmp_path_factory.mktemp("stage"))
         camera = open_camera({"address": "usb:"}, context, in_seconds(20))
         yield camera
         camera.close()

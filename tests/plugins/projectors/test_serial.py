@@ -25,7 +25,6 @@ from hal.errors import (
 )
 from hal.registry import OpenContext
 from hal.serial_link import SerialLink
-from hal.transcript import ReplayLink, parse_transcript
 from hal.values import Power
 from plugins.emulated.projectors.board import OptomaBoard, OptomaQuirks
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
@@ -121,7 +120,7 @@ def test_a_lost_reply_to_on_strikes_the_lamp_once_and_is_confirmed_by_the_power_
     pair.emulator.faults.loses_this_one = lose_the_second
     pair.driver.switch_on(deadline=in_seconds(SOON))
     assert pair.emulator.lamp.strikes == 1
-    assert len(re.findall(r"> ~0000 1\\r", pair.transcript())) == 1
+    assert sum(entry.data == b"~0000 1\r" for entry in pair.said()) == 1
     assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.WARMING, Power.ON)
 
 
@@ -173,12 +172,8 @@ def test_a_starting_projector_is_not_asked_more_often_than_its_profile_allows(op
     pair = open_serial(timing=LampTiming(1.5, 0.4))
     pair.driver.switch_on(deadline=in_seconds(SOON))
     wait_for_power(pair.driver, Power.ON)
-    sent = [
-        entry.at_s
-        for entry in parse_transcript(pair.transcript())
-        if entry.way.value == ">" and entry.data.startswith(b"~")
-    ]
-    strike = next(entry.at_s for entry in parse_transcript(pair.transcript()) if entry.data == b"~0000 1\r")
+    sent = [entry.at_s for entry in pair.said() if entry.way.value == ">" and entry.data.startswith(b"~")]
+    strike = next(entry.at_s for entry in pair.said() if entry.data == b"~0000 1\r")
     booting = [at for at in sent if strike <= at < strike + 1.4]
     gaps = [later - earlier for earlier, later in itertools.pairwise(booting)]
     assert gaps
@@ -237,18 +232,6 @@ def test_another_projectors_number_gets_no_answer(open_serial: Any) -> None:
     pair = open_serial(board=partial(OptomaBoard, number=3), settings={"address": "04"}, edit=hasty)
     with pytest.raises(DeviceTimeout):
         pair.driver.status(deadline=in_seconds(SOON))
-
-
-def test_a_recorded_conversation_replays_without_a_projector(open_serial: Any, tmp_path: Path) -> None:
-    pair = open_serial()
-    told = pair.driver.identity(deadline=in_seconds(SOON))
-    status = pair.driver.status(deadline=in_seconds(SOON))
-    link = ReplayLink(parse_transcript(pair.transcript()))
-    profile = load_profile("left.toml", tmp_path)
-    replayed = SerialProjector(lambda deadline: link, profile, name="a recording")
-    assert replayed.identity(deadline=in_seconds(SOON)) == told
-    assert replayed.status(deadline=in_seconds(SOON)) == status
-    assert link.finished
 
 
 def test_a_projector_that_is_closed_while_its_port_is_opened_again_lets_go_of_the_port(tmp_path: Path) -> None:

@@ -8,19 +8,21 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hal.codecs.ptp.eos import exposure_of
 from hal.codecs.ptp.values import Operation
-from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout
 from hal.interfaces import LiveViewCamera, WatchedCamera
 from hal.values import ExposureSettings
 from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.body import CameraFaults
 from plugins.emulated.cameras.wire import GENERAL_ERROR
-from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire
+from plugins.ptp.ip import PtpIpAddress, PtpIpLink
+from plugins.ptp.link import Reply
 from plugins.ptp.shot import Timing
 from plugins.ptp.still import PtpCamera
 from tests.plugins.ptp.ptp_rig import FLAVOURS, HASTY, PATIENT, SHORT, Rig, Studio, connect, running, when
@@ -81,10 +83,14 @@ def test_a_stop_before_the_body_has_answered_that_its_shutter_is_open_closes_it(
     class Stopped(PtpIpLink):
         """Is cancelled when the request has gone, and nothing has come."""
 
-        def _send(self, wire: Wire, data: bytes, deadline: Deadline) -> None:
-            super()._send(wire, data, deadline)
-            if int(Operation.EOS_BULB_START).to_bytes(2, "little") in data[12:14]:
+        def transact(self, operation: int, *parameters: int, **options: Any) -> Reply:
+            self.asked = operation
+            return super().transact(operation, *parameters, **options)
+
+        def _answer(self, *arguments: Any) -> Reply:
+            if self.asked == Operation.EOS_BULB_START:
                 stop.set()
+            return super()._answer(*arguments)
 
     with EmulatedPtpCamera(Studio().expose, flavour="eos-new", time_scale=1.0) as emulator:
         address = PtpIpAddress.parse(emulator.address)

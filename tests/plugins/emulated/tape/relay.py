@@ -18,8 +18,7 @@ from hal.codecs.ptp import usb as ptp_usb
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
 from hal.links import connected
-from hal.tape import Tape
-from hal.transcript import Transcript
+from hal.tape import Tape, Transcript
 
 _BLOCK: Final = 1 << 16
 _CONNECT_S: Final = 5.0

@@ -67,11 +67,11 @@ def test_every_variant_of_a_login_is_passed(open_network: Any, profile: str, gat
     assert power(pair) is Power.OFF
 
 
-def test_no_transcript_holds_the_password(open_network: Any) -> None:
+def test_no_tape_holds_the_password(open_network: Any) -> None:
     for profile in LOCKED:
         pair = open_network(profile=profile, name=profile, password="secret123", settings={"password": "secret123"})
         pair.driver.status(deadline=in_seconds(SOON))
-        told = [file.read_text() for file in (pair.stage / "transcripts").glob("tcp-*.txt")]
+        told = [file.read_text() for file in pair.stage.glob("*.tape")]
         assert told
         assert any("<" in text for text in told)
         assert not any("secret123" in text for text in told)

@@ -9,14 +9,12 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
-from hal.transcript import Direction, Transcript, parse_transcript
 from lab.emulated.cameras.camera import EmulatedPtpCamera
 from plugins.emulated.cameras.body import CameraFaults
 from plugins.ptp.ip import PtpIpAddress, PtpIpLink, Wire, readable
@@ -264,21 +262,6 @@ def test_a_camera_that_hangs_up_is_gone(camera: Scripted, link: PtpIpLink) -> No
     with pytest.raises(DeviceGone) as caught:
         link.transact(0x1001, deadline=in_seconds(20))
     assert caught.value.code == "camera-disconnected"
-
-
-def test_a_transcript_holds_everything_but_the_pictures(camera: Scripted, tmp_path: Path) -> None:
-    record = Transcript(tmp_path / "camera.txt")
-    link = PtpIpLink.connect(camera.address, transcript=record, deadline=in_seconds(20))
-    camera.answers.append(data_phase(b"PICTURE" * 100) + response())
-    link.transact(0x1009, 3, deadline=in_seconds(20))
-    link.close()
-    record.close()
-    entries = parse_transcript((tmp_path / "camera.txt").read_text())
-    sent = b"".join(entry.data for entry in entries if entry.way is Direction.SENT)
-    assert packet(6, struct.pack("<IHII", 1, 0x1009, 0, 3)) in sent
-    assert b"".join(entry.data for entry in entries if entry.way is Direction.RECEIVED).endswith(response())
-    assert not any(b"PICTURE" in entry.data for entry in entries)
-    assert any(entry.data == b"700 bytes of data" for entry in entries)
 
 
 def _send(wire: Wire) -> None:
