@@ -64,7 +64,8 @@ class Job:
     ``number`` grows with every job; ``left_s`` None until it is known; ``run`` the run's folder name if the job
     makes one; ``outcome`` a sentence when it ended, with ``failed`` if it failed; ``count`` the number of steps it will
     have, 0 until that is known; ``waits`` a sentence on what a job waits for that did not start yet;
-    ``why``: why ``left_s`` rose; ``steps`` those up to the current one; ``appearance``: the one that it makes, or empty
+    ``why``: why ``left_s`` rose; ``steps`` those up to the current one; ``appearance``: the one that it makes, or
+    empty; ``background``: it makes way for what people ask
     """
 
     number: int
@@ -80,6 +81,7 @@ class Job:
     waits: str = ""
     why: str = ""
     appearance: str = ""
+    background: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +177,8 @@ class KioskState:
     ``places`` of the projectors, empty until they are calibrated. ``drifts``: the drift checks, newest first.
     ``revision`` grows with every change, also over restarts of the service. ``needs_setup`` is True while the stage
     has no valid stage.toml. ``black``, ``paused``, ``brightness`` (percent): what people changed of the picture until
-    the stage closes. ``dose_klx_h``: light on the object since its light sensor was first used, None without one.
+    the stage closes. ``made``: a computed appearance that was not shown yet, or empty. ``dose_klx_h``: light
+    on the object since its light sensor was first used, None without one.
     """
 
     revision: int
@@ -199,6 +202,7 @@ class KioskState:
     places: tuple[Place, ...] = ()
     black: bool = False
     paused: bool = False
+    made: str = ""
     brightness: float = 100.0
     drifts: tuple[DriftCheck, ...] = ()
     dose_klx_h: float | None = None

@@ -17,7 +17,7 @@ from controller.kiosk.api.control import plain
 from controller.kiosk.api.folder import appearances_of, projector_picture
 from controller.kiosk.api.photograph import newest_photograph
 from controller.kiosk.changes.watch import since_good
-from controller.kiosk.decide.interfaces import Request
+from controller.kiosk.decide.interfaces import Request, title_of
 from controller.kiosk.decide.operator_overrides import effect
 from controller.kiosk.interface import (
     Aiming,
@@ -35,7 +35,6 @@ from controller.kiosk.interface import (
     Schedule,
     TriedDevice,
 )
-from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.schedule import check
 from controller.kiosk.service import Service
 from controller.kiosk.store import archive, runs, settings, targets
@@ -132,9 +131,9 @@ class StageKiosk(AttachedKiosk):
 
     def computed(self, target: Path) -> Computed:
         service = self.service
-        if service.jobs.running is not None:
+        if (running := service.jobs.running) is not None:
             # Both would need the memory of a whole solve.
-            raise WorkError("preview-ended", what="A job of the kiosk runs, which may need all of the memory.",
+            raise WorkError("preview-ended", what=f"{title_of(running)} runs, which may need all of the memory.",
                             remedy="Look at the picture again when the job has ended.")  # fmt: skip
         return self._previews.of(service.checked, target)
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from controller.core.arrays import Float64
 from controller.core.errors import VelaturaError
+from controller.kiosk.decide.interfaces import title_of
 from controller.kiosk.interface import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, Place
-from controller.kiosk.jobs.job_runner import title_of
 from controller.kiosk.service import Service
 from controller.kiosk.store import runs
 from controller.kiosk.world import World
@@ -114,6 +114,8 @@ class Snapshots:
         if index is not None and bundle is not None:
             identity = BundleIdentity(index.revision, bundle.stem, float(index.created_unix_s))
         live = service.reconciler.live
+        if shown is not None and shown.appearance == service.jobs.made:
+            service.jobs.seen()
         return KioskState(
             revision=revision,
             stage=service.tables.stage.name,
@@ -136,6 +138,7 @@ class Snapshots:
             drifts=self._drifts,
             black=live.black,
             paused=bool(live.held),
+            made=service.jobs.made if service.jobs.made in service.bundles.names() else "",
             brightness=round(100 * live.brightness, 1),
             dose_klx_h=service.devices.dose_klx_h,
         )

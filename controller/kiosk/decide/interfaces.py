@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
@@ -152,6 +152,28 @@ class Finished:
     outcome: Notice
     failed: bool = False
     then: tuple[Request, ...] = ()
+
+
+TITLES: Final[Mapping[str, str]] = {
+    "aim": "Test shots",
+    "drift": "Drift check",
+    "quick": "Quick recalibration",
+    "projector": "Recalibration of projector",
+    "full": "Full recalibration",
+    "compare": "Photographing",
+    "publish": "Publishing appearances",
+    "compute": "New appearance",
+    "report": "Report of",
+    "takeover": "Frames without projector",
+    "variants": "Frames for the loss of a projector",
+}
+BACKGROUND: Final = ("takeover", "variants", "report")
+"""Kinds that nobody waits for: they make way for what people ask, and are done afterwards."""
+
+
+def title_of(request: Request) -> str:
+    """The job's name in the panel and the log."""
+    return " ".join((TITLES.get(request.kind, request.kind), *request.arguments))
 
 
 class Jobs(Protocol):

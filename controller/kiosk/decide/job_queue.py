@@ -11,13 +11,22 @@ from dataclasses import replace
 from typing import Final
 
 from controller.core.errors import WorkError
-from controller.kiosk.decide.interfaces import NOT_YET, Condition, Finished, Jobs, ProjectorView, Request
+from controller.kiosk.decide.interfaces import (
+    BACKGROUND,
+    NOT_YET,
+    Condition,
+    Finished,
+    Jobs,
+    ProjectorView,
+    Request,
+    title_of,
+)
 from controller.kiosk.decide.planner import Plan, Task
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
 
 _NAME: Final = "work"
-_BACKGROUND: Final = "takeover"
+_AGAIN: Final = "takeover"
 """It is asked for again as long as it is needed."""
 
 
@@ -45,7 +54,7 @@ def unfinished_work(log: EventLog) -> list[tuple[Request, bool]]:
 
 
 def _is_kept(request: Request) -> bool:
-    return request.kind != _BACKGROUND
+    return request.kind != _AGAIN
 
 
 class JobQueue:
@@ -56,7 +65,7 @@ class JobQueue:
         self._monotonic, self._patience_s = monotonic, patience_s
         self._waiting: tuple[Request | None, float] = (None, 0.0)
         self._queue: deque[Request] = deque()
-        self._cancelled = False
+        self._cancelled = self._makes_way = False
         self._holder: int | None = None
         self._again: frozenset[Request] = frozenset()
 
@@ -91,24 +100,41 @@ class JobQueue:
         return any(request.number == number for request in self._queue)
 
     def submit(self, *requests: Request) -> None:
-        """Queue jobs. Raises WorkError("busy") while another job runs or waits, or with the reason of a refusal."""
-        self.check_idle()
+        """Queue jobs; background jobs make way. Raises WorkError("busy") while another job runs or waits, or with the
+        reason of a refusal.
+        """
+        self._check_idle()
         if (why := self._jobs.refusal(requests[0])) is not None:
             self._log.add(why)
             raise WorkError(why.code, what=why.what, remedy=why.remedy)
-        self._queue.extend(requests)
+        self._make_way()
+        self._queue.extendleft(reversed(requests))
         self._keep()
 
-    def check_idle(self) -> None:
-        """Raises WorkError("busy")."""
-        if self.head is not None or self._holder not in (None, threading.get_ident()):
-            raise WorkError(
-                "busy", what="Another job is running or waiting.", remedy="Wait until it ends, or cancel it."
-            )
+    def _check_idle(self) -> None:
+        """Raises WorkError("busy") naming the job of people that runs or waits."""
+        running = self._jobs.running
+        head = next((one for one in (running, *self._queue) if one is not None and one.kind not in BACKGROUND), None)
+        if head is not None:
+            what = f"{title_of(head)} {'is running' if head is running else 'waits for its start'}."
+            raise WorkError("busy", what=what, remedy="Wait until it ends, or cancel it.")
+        if self._holder not in (None, threading.get_ident()):
+            raise WorkError("busy", what="Somebody else is changing this stage.", remedy="Try again in a moment.")
+
+    def _make_way(self) -> None:
+        """End the background job that runs, and do it again after what people ask."""
+        if (running := self._jobs.running) is not None and not self._makes_way:
+            self._makes_way = True
+            self._jobs.cancel()
+            self._queue.append(running)
+            self._log.add(Notice("work-waits", f"{title_of(running)} waits, and is done later."))
 
     def hold(self) -> None:
-        """Start no job, and accept jobs only from the caller's thread, until ``release``. Raises as above."""
-        self.check_idle()
+        """Start no job, and accept jobs only from the caller's thread, until ``release``; a background job that runs
+        makes way. Raises as above.
+        """
+        self._check_idle()
+        self._make_way()
         self._holder = threading.get_ident()
 
     def release(self) -> None:
@@ -136,11 +162,14 @@ class JobQueue:
         finished = self._jobs.finished()
         if finished is None:
             return None
-        self._tell(finished.outcome)
+        if not (self._makes_way and finished.failed):
+            self._tell(finished.outcome)
+        self._makes_way = False
         if self._cancelled and finished.then:
             finished = replace(finished, then=())
             self._log.add(_CANCELLED)
         self._cancelled = False
+        self._queue = deque(one for one in self._queue if one not in finished.then)
         self._queue.extendleft(reversed(finished.then))
         self._keep()
         return finished

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -118,6 +119,8 @@ _EMPTY: Final = Notice(
 )  # fmt: skip
 
 
+WAY_S: Final = 30.0
+"""Until a background job has made way for a change of files that it reads."""
 BRIGHTNESS_FADE_S: Final = 0.25
 """As long as the player's supervisor waits between two looks, so that a slow change has no steps to see."""
 _SHOWING: Final = (State.POWERING, State.WARMING, State.READY, State.PLAYING, State.DEGRADED, State.FAULT)
@@ -277,10 +280,23 @@ class Reconciler:
         with self._lock:
             self._queue.hold()
         try:
+            self._await_way()
             yield
         finally:
             with self._lock:
                 self._queue.release()
+
+    def _await_way(self) -> None:
+        """Until a background job has ended that makes way. Raises WorkError("busy") if it does not end soon."""
+        until_s = time.monotonic() + WAY_S
+        while True:
+            with self._lock:
+                self._take_finished()
+                if not self._queue.running:
+                    return
+            if time.monotonic() > until_s:
+                raise WorkError("busy", what="A job in the background does not end.", remedy="Try again in a minute.")
+            time.sleep(0.05)
 
     def cancel(self) -> None:
         """Raises WorkError("nothing-to-cancel")."""

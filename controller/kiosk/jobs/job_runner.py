@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.errors import SEND_DIAGNOSTICS
-from controller.kiosk.decide.interfaces import Finished, Request
+from controller.kiosk.decide.interfaces import BACKGROUND, Finished, Request, title_of
 from controller.kiosk.interface import Job, JobStep
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.world import Thread, World
@@ -20,28 +20,8 @@ from hal.deadline import Cancelled
 from hal.errors import CodedError
 from hal.notices import Level, Notice
 
-TITLES: Final[Mapping[str, str]] = {
-    "aim": "Test shots",
-    "drift": "Drift check",
-    "quick": "Quick recalibration",
-    "projector": "Recalibration of projector",
-    "full": "Full recalibration",
-    "compare": "Photographing",
-    "publish": "Publishing appearances",
-    "compute": "New appearance",
-    "report": "Report of",
-    "takeover": "Frames without projector",
-    "variants": "Frames for the loss of a projector",
-}
-
-
 REMEMBERED: Final = 16
 """Ended jobs, for a client that polls only now and then."""
-
-
-def title_of(request: Request) -> str:
-    """The job's name in the panel and the log."""
-    return " ".join((TITLES.get(request.kind, request.kind), *request.arguments))
 
 
 class JobReporter:
@@ -100,6 +80,16 @@ class JobRunner:
         self._cancel = self._world.event()
         self._finished: Finished | None = None
         self._thread: Thread | None = None
+        self._made = ""
+
+    @property
+    def made(self) -> str:
+        """The appearance that was computed last, until other work of people begins or it is ``seen``; else empty."""
+        return self._made
+
+    def seen(self) -> None:
+        """The new appearance was shown."""
+        self._made = ""
 
     @property
     def job(self) -> Job | None:
@@ -132,9 +122,11 @@ class JobRunner:
     def begin(self, request: Request) -> None:
         self._request, self._cancel = request, self._world.event()
         title = title_of(request)
+        if request.kind not in BACKGROUND:
+            self._made = ""
         # Only a job that is named after an appearance makes one.
         made = request.arguments[0] if request.kind == "compute" and request.arguments else ""
-        job = Job(request.number or self.reserve(), title, appearance=made)
+        job = Job(request.number or self.reserve(), title, appearance=made, background=request.kind in BACKGROUND)
         self._reporter = JobReporter(job, self._log, self._changed)
         self._log.add(Notice("work-begins", f"Started: {title}."))
         run = partial(self._run, request, self._reporter, self._cancel)
@@ -178,6 +170,8 @@ class JobRunner:
             reporter.job, ended=True, failed=finished.failed, outcome=finished.outcome.text, left_s=None
         )
         self._ended[reporter.job.number] = reporter.job
+        if reporter.job.appearance and not finished.failed:
+            self._made = reporter.job.appearance
         while len(self._ended) > REMEMBERED:
             self._ended.popitem(last=False)
         with self._lock:

@@ -44,16 +44,16 @@ CLOSED: Final = ("off", "cooling", "fault", "solving", "publishing")
 
 def flags(state: KioskState) -> frozenset[str]:
     """What is true now; ``data-if`` of a control names those that it needs, with "!" those that it must not have."""
-    busy = state.job is not None and not state.job.ended
-    stops = busy and state.job is not None and state.job.cancellable
-    made = state.job is not None and state.job.ended and not state.job.failed and bool(state.job.appearance)
+    runs = state.job is not None and not state.job.ended
+    busy = runs and state.job is not None and not state.job.background
+    stops = runs and state.job is not None and state.job.cancellable
     found = {
         "open": state.state in OPEN, "closed": state.state in CLOSED, "busy": busy, "stops": stops,
         "set-up": not state.needs_setup, "calibrated": any(grade.kept for grade in state.grades),
         "playable": state.bundle is not None, "identifying": state.identifying, "in-turn": state.in_turn,
         "failed": bool(state.failures), "plays": state.state in PLAYS and (bool(state.playing) or state.black),
         "black": state.black, "paused": state.paused,
-        "made": made and state.job is not None and state.job.appearance != state.playing,
+        "made": bool(state.made) and state.made != state.playing,
     }  # fmt: skip
     return frozenset(name for name, true in found.items() if true)
 
@@ -156,6 +156,7 @@ class Drawing:
             "top": str(module.top(state)),
             "devices": str(module.devices(state)),
             "job": str(module.job(state)),
+            "made": str(module.made(state)),
             "lamps": str(module.lamps(state)),
             "next": str(module.next(state)),
             "around": str(module.around_object(state)),

@@ -29,6 +29,23 @@
     if (photograph && !running) photograph.hidden = true;
     const made = document.querySelector("#made [name=name]");
     if (made && now && now.dataset.made) made.value = now.dataset.made;
+    if (now && bundle !== undefined && bundle !== now.dataset.bundle) refresh();
+    if (now) bundle = now.dataset.bundle;
+  }
+
+  // A new bundle: its appearances and their pictures come to an open page, too.
+  let bundle;
+  async function refresh() {
+    if (!document.querySelector(".shelf")) return;
+    try {
+      const answer = await fetch(location.href, { redirect: "manual" });
+      const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+      for (const place of document.querySelectorAll(".shelf")) {
+        const now = page.getElementById(place.id);
+        if (now) place.replaceWith(now);
+      }
+      follow();
+    } catch { /* not reachable: the next change or load brings it */ }
   }
 
   function draw(parts) {

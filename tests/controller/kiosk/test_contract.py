@@ -143,6 +143,34 @@ class TestStageKiosk(Contract):
         assert told["done-by"] == f"Show this appearance now ({OTHER})."
         assert told["refused"].startswith("Show this appearance now (no such). Refused: The installed bundle")
 
+    def test_settings_wait_for_no_job_in_the_background(self, stage: Real) -> None:
+        service = stage.kiosk.service
+        with service.reconciler.idle():
+            service.submit(Request("variants"))
+        service.reconciler.step()
+        assert service.jobs.running == Request("variants")
+        stage.kiosk.save_settings(contract.TOML)
+        service.reconciler.step()
+        assert service.jobs.running == Request("variants"), "it is done afterwards"
+
+    def test_a_new_appearance_is_announced_until_it_is_shown(self, stage: Real) -> None:
+        kiosk, service = stage.kiosk, stage.kiosk.service
+        kiosk.stop()
+        vars(service.jobs)["_handlers"]["compute"] = JobHandler(
+            lambda request, *_: Finished(request, Notice("", "Done."))
+        )
+        service.submit(Request("compute", arguments=(OTHER,)))
+        service.reconciler.step()
+        wait_for(lambda: service.jobs.job is not None and service.jobs.job.ended)
+        service.reconciler.step()
+        service.submit(Request("variants"))
+        service.reconciler.step()
+        service.changed()
+        assert kiosk.snapshot().made == OTHER
+        vars(service.player)["_view"] = PlayerView(Showing(current(stage.folder / "bundles"), OTHER))
+        service.changed()
+        assert kiosk.snapshot().made == ""
+
     def test_a_closed_stage_that_computes_says_so(self, stage: Real) -> None:
         kiosk, service = stage.kiosk, stage.kiosk.service
         hour = datetime.now(UTC) + timedelta(hours=3)

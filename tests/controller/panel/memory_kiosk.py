@@ -5,6 +5,7 @@ It keeps the contract of tests/controller/kiosk/contract.py, as the real one doe
 
 from __future__ import annotations
 
+import hashlib
 import io
 import itertools
 import time
@@ -110,7 +111,8 @@ class MemoryKiosk(MemoryWork):
 
     def _show(self, name: str) -> None:
         self._appearances = {key: replace(one, playing=key == name) for key, one in self._appearances.items()}
-        self.change(playing=name, state="playing", reason="Playing as asked.", black=False)
+        made = self._state.made if self._state.made != name else ""
+        self.change(playing=name, state="playing", reason="Playing as asked.", black=False, made=made)
 
     def _require_open(self) -> None:
         if self._state.state in ("off", "cooling"):
@@ -180,6 +182,10 @@ class MemoryKiosk(MemoryWork):
 
         def finish(_: str) -> None:
             self._appearances[name] = Appearance(name, time.time(), 1.0, preview=preview, outputs=OUTPUTS)
+            bundle = self._state.bundle
+            assert bundle is not None
+            digest = hashlib.sha256(bundle.digest.encode()).hexdigest()
+            self.change(made=name, bundle=replace(bundle, version=bundle.version + 1, digest=digest))
 
         return self._begin(f"New appearance {name}", "solving", finish, appearance=name)
 

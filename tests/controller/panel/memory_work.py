@@ -56,15 +56,15 @@ class MemoryWork:
             job = Job(number, name, tuple(JobStep(title, 0.0) for title in STEPS), 60.0, run=f"run-{number}",
                       appearance=appearance)  # fmt: skip
             self._cancel.clear()
-            self.change(job=job, state=state, reason=f"{name} is running.")
+            self.change(job=job, state=state, reason=f"{name} is running.", made="")
             self._worker = threading.Thread(target=self._work, args=(job, finish), daemon=True)
             self._worker.start()
             return job
 
     def _check_idle(self) -> None:
         if self._state.job is not None and not self._state.job.ended:
-            what, remedy = "Another job is running or waiting.", "Wait until it ends, or cancel it."
-            raise WorkError("busy", what=what, remedy=remedy)
+            what = f"{self._state.job.name} is running."
+            raise WorkError("busy", what=what, remedy="Wait until it ends, or cancel it.")
 
     def job(self, number: int) -> Job | None:
         job = self._state.job

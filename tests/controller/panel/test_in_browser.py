@@ -92,6 +92,23 @@ def test_cancel_ends_the_job_and_says_so(slow: Served, browser: Browser) -> None
         expect(page.get_by_text("It was cancelled.")).to_be_visible()
 
 
+def test_a_new_appearance_comes_to_open_pages_and_is_announced_until_it_plays(fresh: Served, browser: Browser) -> None:
+    kiosk = fresh.kiosk
+    assert isinstance(kiosk, MemoryKiosk)
+    with tab(browser, fresh.address) as page, tab(browser, fresh.address) as other:
+        enter(page, "otto")
+        enter(other, "otto")
+        other.goto("/appearances")
+        kiosk.compute_scene("herbst", "gold")
+        for one in (page, other):
+            expect(one.locator("#shelf").get_by_text("herbst")).to_be_visible()
+        expect(page.get_by_text("herbst is ready.")).to_be_visible()
+        picture(page, "ready")
+        page.locator("#made").get_by_role("button", name="Play now").click()
+        expect(page.get_by_text("herbst is ready.")).to_be_hidden()
+        expect(page.get_by_role("button", name="Show herbst")).to_have_attribute("aria-pressed", "true")
+
+
 def test_a_reload_in_the_middle_of_a_job_loses_nothing(slow: Served, browser: Browser) -> None:
     with tab(browser, slow.address) as page:
         enter(page, "otto")

@@ -198,6 +198,33 @@ def test_other_work_is_refused_while_some_waits_or_runs_and_a_refusal_is_told(de
     assert desk.queue.head == PUBLISH
 
 
+VARIANTS = Request("variants")
+
+
+def test_what_nobody_waits_for_makes_way_for_people_and_is_done_afterwards(desk: Desk) -> None:
+    desk.queue.offer(VARIANTS)
+    assert desk.begin() == VARIANTS
+    desk.queue.submit(FULL)
+    assert desk.jobs.cancelled == 1
+    with pytest.raises(WorkError, match="Full recalibration waits"):
+        desk.queue.submit(QUICK)
+    desk.jobs.end(failed=True)
+    desk.queue.take_finished()
+    assert desk.begin(LIT) == FULL
+    with pytest.raises(WorkError, match="Full recalibration is running"):
+        desk.queue.submit(QUICK)
+    desk.jobs.end(PUBLISH)
+    desk.queue.take_finished()
+    assert desk.begin() == PUBLISH
+    desk.jobs.end(VARIANTS)
+    desk.queue.take_finished()
+    assert desk.begin() == VARIANTS
+    desk.jobs.end()
+    desk.queue.take_finished()
+    assert desk.queue.head is None, "once is enough"
+    assert "cancelled" not in " ".join(desk.told)
+
+
 def test_only_what_failed_stays_in_sight(desk: Desk) -> None:
     desk.queue.submit(QUICK)
     desk.begin(LIT)

@@ -231,7 +231,7 @@ def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(
 def test_recalibrates_on_request_and_plays_again(kiosk: Kiosk) -> None:
     kiosk.run_until(State.PLAYING)
     kiosk.reconciler.submit(Request("quick", light=True))
-    with pytest.raises(WorkError, match="Another job"):
+    with pytest.raises(WorkError, match="Quick recalibration"):
         kiosk.reconciler.submit(Request("quick", light=True))
     kiosk.run_until(State.CALIBRATING)
     assert kiosk.player.want is None
