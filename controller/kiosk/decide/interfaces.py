@@ -168,7 +168,7 @@ TITLES: Final[Mapping[str, str]] = {
     "variants": "Frames for the loss of a projector",
 }
 BACKGROUND: Final = ("takeover", "variants", "report")
-"""Kinds that nobody waits for: they make way for what people ask, and are done afterwards."""
+"""Kinds for which no one waits: they make way for what people ask, and are done afterwards."""
 
 
 def title_of(request: Request) -> str:

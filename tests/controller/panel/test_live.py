@@ -155,7 +155,7 @@ def test_a_storm_of_changes_is_drawn_a_few_times_only(tmp_path: Path) -> None:
                         break
         thread.join()
     assert len(messages) <= 14
-    assert set(messages[0]) == {"top", "devices", "job", "lamps", "next", "events", "around", "first"}
+    assert set(messages[0]) == {"top", "devices", "job", "lamps", "next", "events", "around", "first", "made"}
     assert all(set(message) == {"top"} for message in messages[1:])
 
 

@@ -13,8 +13,7 @@ from babel.numbers import format_decimal, format_percent
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.kiosk.decide.interfaces import Condition
-from controller.kiosk.jobs.job_runner import TITLES
+from controller.kiosk.decide.interfaces import TITLES, Condition
 from controller.kiosk.roles import Role
 from controller.kiosk.state import LiveValue
 from controller.kiosk.supervisors.devices import DARK_ENOUGH, TOO_BRIGHT
