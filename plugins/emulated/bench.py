@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from hal.deadline import Deadline
 from hal.errors import DeviceError
 from hal.registry import Driver, OpenContext
-from hal.tape import read_tape
 from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.generic import EmulatedGenericBody
@@ -56,7 +55,6 @@ from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.projector import BoardProjector
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
-from plugins.emulated.tape import serve_tape
 
 if TYPE_CHECKING:
     from plugins.emulated.optics.world import World
@@ -168,7 +166,7 @@ class EmulatedBench:
 
         def start(out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event) -> Callable[[], None]:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velatura-tape-")))
-            count = serve_tape(read_tape(tape), folder, stack, out.served)
+            count = extension("tape", asked_by="Replaying a tape")(tape, folder, stack, out.served)
             out.say({"devices": count}, f"{count} devices of the tape.")
             return lambda: None
 

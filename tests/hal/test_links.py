@@ -17,7 +17,8 @@ from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceTimeout, ProtocolError
 from hal.links import TcpLink, host_and_port
 from hal.serial_link import SerialLink
-from hal.tape import Direction, Tape, read_tape
+from hal.tape import Direction, Tape
+from lab.emulated.tape import read_tape
 
 
 class Peer:

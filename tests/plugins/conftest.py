@@ -14,11 +14,12 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from hal.tape import Entry, Tape, read_tape
+from hal.tape import Tape
 from hal.values import Power
 from lab.emulated.projectors.boards import BOARDS, login_of
 from lab.emulated.projectors.network import GATES, EmulatedNetworkProjector
 from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from lab.emulated.tape import Entry, read_tape
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.network.driver import open_network_projector

@@ -14,9 +14,9 @@ from controller.core.errors import WorkError
 from controller.stage.sessions import run as recording
 from hal.deadline import in_seconds
 from hal.registry import OpenContext
-from hal.tape import read_tape
 from hal.values import Power
 from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from lab.emulated.tape import read_tape
 from plugins.emulated.bench import DRIVER as BENCH
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.pjlink import open_pjlink_projector

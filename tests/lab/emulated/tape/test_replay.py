@@ -16,21 +16,21 @@ from pypjlink import Projector as PyPjLink
 from hal.deadline import in_seconds
 from hal.interfaces import Projector
 from hal.registry import OpenContext
-from hal.tape import Tape, read_tape
+from hal.tape import Tape
 from hal.values import DeviceIdentity, ExposureSettings, Power, ProjectorStatus
 from lab.emulated.cameras.camera import EmulatedPtpCamera, Flavour
 from lab.emulated.projectors.boards import BOARDS, baud_of
 from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
+from lab.emulated.tape import serve_tape
 from plugins.emulated.core.truth import DEFAULT_BOARD
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
-from plugins.emulated.tape import serve_tape
 from plugins.gphoto2.camera import open_camera as open_gphoto2
 from plugins.projectors.pjlink import open_pjlink_projector
 from plugins.projectors.serial import open_serial_projector
 from plugins.ptp.camera import open_camera
 from tests.campaigns.camera_peers import SIZE, network_peer
-from tests.plugins.emulated.tape.relay import ptpip_relays, stream_relay
+from tests.lab.emulated.tape.relay import ptpip_relays, stream_relay
 from tests.plugins.ptp.ptp_rig import FLAVOURS, Studio
 
 QUICK = LampTiming(0.1, 0.1)
@@ -52,7 +52,7 @@ class Served:
 def replayed(tape: Path) -> Iterator[dict[str, str]]:
     served = Served()
     with contextlib.ExitStack() as stack:
-        assert serve_tape(read_tape(tape), tape.parent / "run", stack, served.add, time_scale=0.0) == 1
+        assert serve_tape(tape, tape.parent / "run", stack, served.add, time_scale=0.0) == 1
         yield served.addresses
 
 

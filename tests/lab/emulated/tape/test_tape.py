@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hal.tape as tape_module
+import lab.emulated.tape as tape_module
 from hal.errors import ProtocolError
 from hal.registry import OpenContext
-from hal.tape import HEADER, Direction, Tape, parse_tape, read_tape
+from hal.tape import HEADER, Direction, Tape
+from lab.emulated.tape import parse_tape, read_tape
 
 PIECES = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.binary(min_size=1, max_size=600)), max_size=20)
 

@@ -8,6 +8,8 @@ same device. Start at ``serve_tape``.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import contextlib
 import os
 import re
@@ -17,19 +19,107 @@ import struct
 import threading
 import time
 import tty
+import zlib
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
+from hal.errors import ProtocolError
+from hal.escapes import unescaped
+from hal.runtime.files import require_regular
 from hal.serial_link import PtyLink
-from hal.tape import Direction, Entry, Track
+from hal.tape import HEADER, MOST_BYTES, PACKED, Direction
 from plugins.emulated.cameras.body import CameraNames, EmulatedBody
 from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome
 from plugins.emulated.core.servers import BackgroundDevice, TcpServer
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
+
+LARGEST_PIECE: Final = 256 << 20
+MOST_TRACKS: Final = 10_000
+_LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<mark>[+<>|{}]) (?P<track>\d{1,6}) (?P<text>[ -~]*)", re.ASCII)
+_WAYS: Final = {**{way.value: way for way in Direction}, **{mark: way for way, mark in PACKED.items()}}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A piece of a track; ``at_s`` in seconds since the tape began. How bytes are grouped has no meaning."""
+
+    at_s: float
+    way: Direction
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The bytes of one connection, or of one device; ``entries`` in order, their times since the tape began."""
+
+    kind: str
+    address: str
+    entries: list[Entry] = field(default_factory=list)
+
+
+def read_tape(path: Path) -> tuple[Track, ...]:
+    """The tracks of a tape. Raises ProtocolError("tape-wrong")."""
+    try:
+        require_regular(path)
+        size = path.stat().st_size
+        text = path.read_text("ascii") if size <= 2 * MOST_BYTES else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise _wrong(f"it can't be read ({getattr(error, 'strerror', None) or 'not ASCII'})") from error
+    return parse_tape(text)
+
+
+def parse_tape(text: str) -> tuple[Track, ...]:
+    """The tracks of a tape's text. Raises ProtocolError("tape-wrong") naming the line."""
+    lines = text.split("\n")
+    if lines[0] != HEADER:
+        raise _wrong(f"its first line is not {HEADER!r}")
+    tracks: list[Track] = []
+    for number, line in enumerate(lines[1:], start=2):
+        # A program that was killed may leave half a line at the end.
+        if not line or (number == len(lines) and not text.endswith("\n")):
+            continue
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise _wrong(f"line {number} is not one of a tape")
+        try:
+            _take(tracks, match["mark"], int(match["track"]), float(match["at"]), match["text"])
+        except (ProtocolError, ValueError, binascii.Error, zlib.error) as error:
+            raise _wrong(f"line {number} can't be read") from error
+    return tuple(tracks)
+
+
+def _take(tracks: list[Track], mark: str, number: int, at_s: float, text: str) -> None:
+    if mark == "+":
+        kind, _, address = text.partition(" ")
+        if number != len(tracks) + 1 or len(tracks) >= MOST_TRACKS:
+            raise ValueError(number)
+        tracks.append(Track(kind, unescaped(address).decode(errors="replace")))
+        return
+    if not 1 <= number <= len(tracks):
+        raise ValueError(number)
+    data = _unpacked(text) if mark in PACKED.values() else unescaped(text)
+    tracks[number - 1].entries.append(Entry(at_s, _WAYS[mark], data))
+
+
+def _unpacked(text: str) -> bytes:
+    unpacking = zlib.decompressobj()
+    data = unpacking.decompress(base64.b64decode(text, validate=True), LARGEST_PIECE)
+    if not unpacking.eof:
+        raise ValueError("a piece that is too long, or cut")
+    return data
+
+
+def _wrong(why: str) -> ProtocolError:
+    return ProtocolError(
+        "tape-wrong",
+        what=f"This is not a tape: {why}.",
+        remedy="Record it again with `velatura record`. Its format is described in docs/reference/tape-format.md.",
+    )
+
 
 Answer = TypeVar("Answer")
 
@@ -296,15 +386,15 @@ LINES: Final = ("serial", "tcp", "pjlink")
 
 
 def serve_tape(
-    tracks: Iterable[Track], folder: Path, stack: contextlib.ExitStack, served: Served, *, time_scale: float = 1.0
+    tape: Path, folder: Path, stack: contextlib.ExitStack, served: Served, *, time_scale: float = 1.0
 ) -> int:
     """Start the devices of a tape until ``stack`` is closed; how many. ``folder``: for links to serial ports.
 
     All tracks of one kind and address are one device: each opening of it began another track. A device of an unknown
-    kind is left out. ``time_scale``: of recorded delays.
+    kind is left out. ``time_scale``: of recorded delays. Raises as ``read_tape``.
     """
     count = 0
-    for track in merged(tracks):
+    for track in merged(read_tape(tape)):
         if track.kind == "ptp":
             camera = stack.enter_context(PtpIpCamera(TapeBody(track)))
             served(track.address, "camera", camera.address)
