@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from controller.config.defaults import SMOOTHNESS
-from controller.config.table import ConfigTable, Name, OpenConfigTable, Positive, Seconds, Size
+from controller.config.table import ConfigTable, KeyFile, Name, OpenConfigTable, Positive, Seconds, Size, StageFile
 from hal.values import LampRules
 
 _Address = Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$", max_length=254)]
@@ -40,8 +40,8 @@ class BackupTable(ConfigTable):
         description='a folder on a server that gets a backup every night by SFTP: "ssh://USER@HOST/FOLDER", or with '
         "HOST:PORT",
     )  # fmt: skip
-    ssh_key_file: str | None = Field(
-        default=None, min_length=1, pattern=r'^[^"\n]+$',
+    ssh_key_file: KeyFile | None = Field(
+        default=None, pattern=r'^[^"\n]+$',
         description="a file with the private key for that server, without a passphrase; relative to the stage's "
         "folder; needed for ssh",
     )  # fmt: skip
@@ -74,11 +74,11 @@ class AlertsTable(ConfigTable):
         default="starttls", description='"starttls", "tls" or "none"; with "none" no password is sent'
     )
     mail_user: str | None = Field(default=None, min_length=1, max_length=254, description="the name to log in with")
-    mail_password_file: str | None = Field(
-        default=None, min_length=1, description="a file that has only the password, relative to the stage's folder"
+    mail_password_file: KeyFile | None = Field(
+        default=None, description="a file that has only the password, relative to the stage's folder"
     )
-    certificates: str | None = Field(
-        default=None, min_length=1,
+    certificates: StageFile | None = Field(
+        default=None,
         description="a file with certificate authorities (PEM) for servers whose certificate is not public",
     )  # fmt: skip
     webhook: str | None = Field(
@@ -119,9 +119,8 @@ class CameraTable(OpenConfigTable):
     aperture_f: Annotated[float, Field(ge=0.5, le=128)] | None = Field(
         default=None, description="the f-number from 0.5 to 128; if omitted: the current setting of the lens"
     )
-    intrinsics: str | None = Field(
+    intrinsics: StageFile | None = Field(
         default=None,
-        min_length=1,
         description="a file that `velatura camera calibrate` wrote, relative to the stage's folder; it replaces "
         "focal_length_px",
     )
@@ -360,7 +359,7 @@ class AppearanceTable(OpenConfigTable):
         description="a name of 1 to 64 letters, digits, - and _, different for every appearance",
     )
     kind: Name = Field(description='the kind of target, e.g. "photograph"')
-    file: str | None = Field(default=None, min_length=1, description="a picture file, relative to the stage's folder")
+    file: StageFile | None = Field(default=None, description="a picture file, relative to the stage's folder")
     shown_s: float = Field(
         default=15.0, ge=0.1, le=604_800, description="seconds that the bundle's playlist shows it, 0.1 to 604800"
     )

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from enum import Enum
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, TypeAdapter, ValidationError
 
-from controller.config.problems import Place, check_keys
+from controller.config.problems import KeyPath, Place, check_keys
 
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f/\\]+$")]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
 Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[int, Field(ge=1, le=16_384)]
+
+
+class Holds(Enum):
+    """What a text of a configuration file is to a backup. A field that names a file has one of these in its type."""
+
+    FILE = "a file that the stage reads"
+    KEY_FILE = "a file with a secret, which is in no backup"
+    SETTING = "a setting of a driver or of a kind of appearance, which may name a file"
+
+
+StageFile = Annotated[str, Field(min_length=1), Holds.FILE]
+KeyFile = Annotated[str, Field(min_length=1), Holds.KEY_FILE]
 
 
 class ConfigTable(BaseModel):
@@ -48,6 +61,30 @@ class OpenConfigTable(ConfigTable):
         own = {key: field.description or "" for key, field in type(self).model_fields.items()}
         check_keys(self.place, written, {**own, **allowed}, required)
         return {key: value for key, value in written.items() if key in allowed}
+
+
+def texts(value: Any, path: KeyPath = (), holds: Holds | None = None) -> Iterator[tuple[KeyPath, str, Holds | None]]:
+    """Every text in a table or a list and in those in it, with the way to it, and what it holds if that is known."""
+    if isinstance(value, BaseModel):
+        for key, field in type(value).model_fields.items():
+            marks = (*field.metadata, *_marks(field.annotation))
+            mark = next((one for one in marks if isinstance(one, Holds)), None)
+            yield from texts(getattr(value, key), (*path, key), mark)
+        yield from texts(value.model_extra or {}, path, Holds.SETTING)
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from texts(inner, (*path, str(key)), holds)
+    elif isinstance(value, list | tuple):
+        for number, inner in enumerate(value):
+            yield from texts(inner, (*path, number), holds)
+    elif isinstance(value, str):
+        yield path, value, holds
+
+
+def _marks(kind: Any) -> Iterator[Any]:
+    yield from getattr(kind, "__metadata__", ())
+    for inner in get_args(kind):
+        yield from _marks(inner)
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ The places are a folder, a USB stick that is found by its label or UUID, and a s
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -76,10 +77,14 @@ class Server:
         part = f".{name}.part"
         with tempfile.TemporaryDirectory(prefix=".back-", dir=source.parent) as folder:
             back = Path(folder) / name
-            self._sftp(f'put "{source}" "{self._at(part)}"', f'get "{self._at(part)}" "{back}"')
+            self._sftp(
+                f'put "{source}" "{self._at(part)}"',
+                f'-chmod 600 "{self._at(part)}"',
+                f'get "{self._at(part)}" "{back}"',
+            )
             if sha256_of(back) != sha256_of(source):
                 raise WorkError("backup-differs", what=DIFFERS, remedy="Check the disk of the server.")
-            archive.check_backup(back)
+            archive.check_backup(back, source.parent)
         # What it says about the folder ends the command, so that nothing is renamed in a wrong one.
         listed = self._sftp(f'rename "{self._at(part)}" "{self._at(name)}"', f'ls -1 "{self._folder}"')
         ours = sorted({word for line in listed if OURS.fullmatch(word := line.strip().rpartition("/")[2])})
@@ -235,6 +240,9 @@ def copied(source: Path, target: Path) -> Path:
     part = target.with_name(f".{target.name}.part")
     try:
         with source.open("rb") as content, part.open("wb") as file:
+            # A disk for Windows has no modes, and refuses them.
+            with contextlib.suppress(PermissionError):
+                part.chmod(0o600)
             shutil.copyfileobj(content, file, 1 << 20)
             file.flush()
             os.fsync(file.fileno())
@@ -242,7 +250,7 @@ def copied(source: Path, target: Path) -> Path:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         if sha256_of(part) != sha256_of(source):
             raise WorkError("backup-differs", what=DIFFERS, remedy="Replace the disk for backups.")
-        archive.check_backup(part)
+        archive.check_backup(part, source.parent)
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
@@ -297,6 +305,11 @@ class NightlyBackup:
         due = {key: one for key, one in due.items() if key not in done and now_s >= self._again_at_s.get(one.name, 0.0)}
         if not due:
             return
+        lacks = archive.missing(self._stage)
+        if lacks and day not in self._failed_keys:
+            self._failed_keys.add(day)
+            self._log.add(Notice("backup-incomplete", f"The backup can't hold everything. {lacks[0]}",
+                                 "Put the file there, or correct the settings.", Level.WARNING))  # fmt: skip
         try:
             source = archive.backup(self._stage)
         except (VelaturaError, OSError) as error:

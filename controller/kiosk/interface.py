@@ -207,8 +207,11 @@ class Kiosk(Protocol):
     def test_backup(self) -> None:
         """Make a backup at every place that stage.toml names. Minutes. Raises UsageError, WorkError."""
 
-    def backup(self) -> Path:
-        """A new file with settings, calibration, appearances; without secrets. Seconds."""
+    def backup(self, *, photographs: bool = False) -> Path:
+        """A new file with settings, what they name, calibration, appearances; without keys and accounts. Seconds.
+
+        ``photographs``: also those of the calibration.
+        """
 
     def restore(self, backup: Path) -> None:
         """Replace settings, calibration and appearances. Raises UsageError for a file that is not a Velatura backup."""

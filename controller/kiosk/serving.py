@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.files import file_error
 from controller.core.kiosk_places import PLAYER_OPTIONS, PLAYER_SOCKET, RUNTIME
 from controller.kiosk.interface import EventRow
 from controller.kiosk.jobs.job_handlers import JobHandlers
@@ -25,7 +26,7 @@ from controller.play.control.launch import AttachedPlayer, PlayerSettings
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.run import stage_lock
 from hal.deadline import Stop
-from hal.notices import Notice
+from hal.notices import Level, Notice
 
 SOCKET: Final = "/run/systemd/journal/socket"
 _PRIORITIES: Final = {"info": "6", "warning": "4", "error": "3"}
@@ -87,25 +88,26 @@ def serving(
 ) -> Iterator[Service]:
     """A started service, its loop in a thread; ended, with the lamps cooled, on leaving. ``alive``: as ``Service``'s.
 
-    Raises what ``checked_settings`` raises, UsageError("already-running"), and UsageError("display-plays-no-bundles").
+    Raises what ``checked_settings`` raises, and UsageError("already-running").
     """
     world = world or World()
+    given_up: VelaturaError | None = None
     if (stage / archive.RESTORING).exists():
         with stage_lock(stage):
-            archive.finish_restore(stage)
+            try:
+                archive.finish_restore(stage)
+            except (WorkError, OSError) as error:
+                # The stage plays without what the backup has.
+                given_up = file_error(error) if isinstance(error, OSError) else error
     checked, problem = _usable(stage, world)
-    if checked.stage.tables.display.driver != "player":
-        raise UsageError(
-            "display-plays-no-bundles",
-            what="A kiosk needs the player as its display.",
-            remedy='Use the driver "player" under [display] in stage.toml.',
-        )
     with stage_lock(checked.stage.folder):
         archive.clear_cut_off(checked.stage.folder)
         file = checked.stage.folder / EventLog.FILE
         log = EventLog(file, wall=world.wall, monotonic=world.monotonic, connect=world.connect,
                        also=journal_of(checked.stage.tables.stage.name))  # fmt: skip
         with contextlib.closing(log):
+            if given_up is not None:
+                log.add(Notice(given_up.code, given_up.what, given_up.remedy, Level.ERROR))
             service = Service(checked, log, problem, world, jobs)
             service.alive = alive
             ended = world.event()

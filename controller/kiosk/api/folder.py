@@ -112,8 +112,8 @@ class FolderKiosk:
     def save_settings(self, text: str) -> None:
         settings.save(self.stage, text)
 
-    def backup(self) -> Path:
-        return archive.backup(self.stage)
+    def backup(self, *, photographs: bool = False) -> Path:
+        return archive.backup(self.stage, photographs=photographs)
 
     def restore(self, backup: Path) -> None:
         archive.restore(self.stage, backup)

@@ -39,7 +39,8 @@ def call(stage: Path, op: str, **arguments: Any) -> Any:
     """Ask the running kiosk, or do it here. Raises UsageError("not-serving") for operations that need a running one."""
     if is_running(stage):
         return call_kiosk(stage, op, timeout_s=LONG_S, **arguments)
-    folder = load_stage(stage).folder
+    # A restore repairs a stage without settings, or with damaged ones, too.
+    folder = stage.resolve() if op == "restore" else load_stage(stage).folder
     operation = offline_operation(op)
     if operation is None:
         remedy = "Start it with `velatura kiosk serve`."

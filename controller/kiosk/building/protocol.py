@@ -118,10 +118,10 @@ def read(stage: Path) -> tuple[Configured, ...]:
         tables = tomllib.loads(read_text(file))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise _wrong(f"it is not TOML: {error}") from error
-    return tuple(_configured(name, table) for name, table in tables.items())
+    return tuple(_configured(name, table, stage) for name, table in tables.items())
 
 
-def _configured(name: str, table: Any) -> Configured:
+def _configured(name: str, table: Any, stage: Path) -> Configured:
     if name not in MODULES:
         raise _wrong(f"[{name[:40]}] is not a protocol; use {', '.join(MODULES)}")
     try:
@@ -129,11 +129,13 @@ def _configured(name: str, table: Any) -> Configured:
     except ModuleNotFoundError as error:
         raise extra_missing(error.name or "") or error from error
     try:
-        return Configured(protocol, protocol.options.model_validate(table))
+        options = protocol.options.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise _wrong(f"[{name}] {key}: {first['msg']}".replace(" :", ":")) from error
+    files = {key: stage / value for key, value in options if isinstance(value, Path)}
+    return Configured(protocol, options.model_copy(update=files))
 
 
 def _wrong(detail: str) -> UsageError:

@@ -16,6 +16,7 @@ from controller.kiosk.outputs import Connected
 from hal.deadline import Deadline, in_seconds
 from hal.errors import CodedError
 from hal.interfaces import Device, WatchedCamera
+from hal.secret_words import concealed, is_secret
 from hal.values import DeviceIdentity
 
 ASK_S: Final = 6.0
@@ -96,9 +97,9 @@ def shown_facts(outputs: Sequence[Connected]) -> Iterator[Fact]:
 def settings_facts(tables: StageTables) -> Iterator[Fact]:
     """Every value of stage.toml by its key. Passwords and keys are compared, and not kept."""
     for key, value in _flat("", tables.model_dump(mode="json")):
-        secret = any(word in key.rpartition(".")[2] for word in ("password", "webhook", "user"))
         text = json.dumps(value)
-        yield Fact("settings", key, f"secret {hashlib.sha256(text.encode()).hexdigest()[:8]}" if secret else text)
+        secret = f"secret {hashlib.sha256(text.encode()).hexdigest()[:8]}"
+        yield Fact("settings", key, secret if is_secret(key.rpartition(".")[2]) or concealed(text) != text else text)
 
 
 def _flat(key: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import sys
 import tempfile
@@ -16,12 +17,14 @@ import tomlkit
 from controller.config import load_stage
 from controller.config.loader import FILE
 from controller.config.models import StageTables
+from controller.config.table import Holds
 from controller.core.errors import UsageError, WorkError
 from controller.core.kiosk_places import PLAYER_SOCKET, STAGE, STATE, USER
 from controller.kiosk.install import steps
 from controller.kiosk.install.system import System
 from controller.kiosk.outputs import Connected, placed
 from controller.kiosk.store import archive
+from controller.kiosk.store.references import references
 from hal.errors import DeviceError
 from hal.player import PlayerClient
 
@@ -29,6 +32,7 @@ MOST_QUESTIONS: Final = 3
 ANSWER_S: Final = 10.0
 _CONTROLLER: Final = "velatura-controller"
 _OWNER: Final = f"{USER}:{USER}"
+_UNPACKED: Final = "restore-"
 _NOT_MOVED: Final = ("kiosk", "keys", FILE, archive.MARK)
 
 Ask = Callable[[str], str]
@@ -54,13 +58,15 @@ def restore(
         raise UsageError("kiosk-has-stage", what="This kiosk has a stage already.",
                          remedy=f"Replace it: runuser -u {USER} -- velatura kiosk restore {STAGE} FILE")  # fmt: skip
     archive.check_backup(file)
+    for cut_off in system.at(STATE).glob(f"{_UNPACKED}*"):
+        shutil.rmtree(cut_off, ignore_errors=True)
     steps.install(system, outputs_again=True, restart=False, say=say, prefix=prefix)
     if system.dry:
         say("Then the projectors are found by their serial numbers, or asked for, and the backup is put in place.")
         return
     # It would begin with half of the stage, and show its own text.
     system.run("systemctl", "stop", _CONTROLLER)
-    with tempfile.TemporaryDirectory(prefix="restore-", dir=system.at(STATE)) as name:
+    with tempfile.TemporaryDirectory(prefix=_UNPACKED, dir=system.at(STATE)) as name:
         fresh = Path(name)
         archive.restore(fresh, file)
         tables = load_stage(fresh).tables
@@ -77,14 +83,20 @@ def restore(
         sizes = {(one.width_px, one.height_px) for one in tables.display.outputs}
         steps.write_outputs(system, placed(there, sizes.pop() if len(sizes) == 1 else None))
         system.run("chown", "--recursive", _OWNER, str(STAGE))
+        os.sync()
         # Last: with it the stage is there.
         system.write(STAGE / FILE, text, owner=_OWNER)
+    for one in references(system.at(STAGE)):
+        if one.holds is Holds.KEY_FILE and one.missing:
+            say(f"{one.missing} It holds a secret, so it is in no backup: copy it there.")
     system.run("systemctl", "start", _CONTROLLER)
 
 
 def _put(part: Path, place: Path) -> None:
     if part.is_dir():
-        shutil.copytree(part, place, symlinks=True, dirs_exist_ok=True)
+        # What is there is of a restore that was cut off.
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(part, place, symlinks=True)
     else:
         shutil.copy2(part, place)
 

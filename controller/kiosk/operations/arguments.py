@@ -67,6 +67,8 @@ UpToNumber = Annotated[int, Field(ge=0, le=MOST_NUMBER, description=(
 JobNumber = Annotated[int, Field(ge=0, le=MOST_NUMBER, description=(
     "the number that was returned when the job was requested")), INTEGER]  # fmt: skip
 StageText = Annotated[str, Field(max_length=1 << 20, description="the text of stage.toml"), TEXT]
+WithPhotographs = Annotated[bool, Field(description="true or false; default: false"), CommandLine(
+    flag=Flag("--photographs", "Also the photographs of the calibration, often gigabytes.", True, False))]  # fmt: skip
 BackupFile = Annotated[Path, Field(description="a Velatura backup"), Sent.FILE, CommandLine(metavar="FILE")]
 DeviceKey = Annotated[str, Field(max_length=256, description="the key of a found device"), TEXT]
 TimeZone = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_+/-]{1,63}$", max_length=64, description=(

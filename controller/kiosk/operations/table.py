@@ -66,6 +66,7 @@ from controller.kiosk.operations.arguments import (
     TargetKey,
     TimeZone,
     UpToNumber,
+    WithPhotographs,
 )
 from controller.kiosk.operations.operation import (
     Download,
@@ -488,9 +489,11 @@ def test_backup(kiosk: Kiosk) -> None:
 
 
 @operation("POST /backup", TECHNICIAN, LOOKS, offline=True)
-def backup(kiosk: Kiosk) -> Download:
-    """Make a backup of settings, calibration and appearances. It does not contain accounts and keys."""
-    return kiosk.backup()
+def backup(kiosk: Kiosk, photographs: WithPhotographs | None = None) -> Download:
+    """Make a backup of settings, the files they name, calibration and appearances. It does not contain accounts and
+    keys, but the passwords in stage.toml.
+    """
+    return kiosk.backup(photographs=bool(photographs))
 
 
 @operation("POST /restore", TECHNICIAN, CHANGES, done="The backup is in use.",

@@ -1,11 +1,13 @@
-"""Backup and restore of a stage as a tar file without secrets."""
+"""Backup and restore of a stage as a tar file."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import gzip
+import filecmp
 import io
+import ipaddress
+import itertools
 import json
 import os
 import platform
@@ -14,97 +16,354 @@ import sqlite3
 import tarfile
 import tempfile
 import time
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path, PurePosixPath
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from controller.config import load_stage
-from controller.config.loader import FILE, LARGEST_BYTES
-from controller.core.errors import UsageError, WorkError
-from controller.core.files import require_regular
+from controller.config.loader import FILE
+from controller.config.table import Holds, texts
+from controller.config.writer import KeyChange, edited
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.files import read_text
 from controller.core.storage import sync_folder
+from controller.core.text import printable
 from controller.kiosk.outputs import outputs_of_x
+from controller.kiosk.store.references import BUILDING, OWN, Reference, building, references
+from controller.kiosk.store.runs import began_s
+from controller.kiosk.store.settings import checked_settings
+from controller.kiosk.store.unpacking import DAMAGED, not_ours, read_first, unpack
+from controller.run.journal import Journal
 from controller.stage.artefacts.grade import FIGURES
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.names import json_path
+from controller.stage.artefacts.names import CAPTURES, json_path, write_json
 from controller.stage.artefacts.published import BUNDLE_FIGURES
 from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.check import PANELS_FILE
 from controller.stage.sessions.run import tapes
+from hal.registry import Drivers
 from hal.runtime.caches import kept
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
 RESTORING: Final = ".restoring"
-"""An unpacked and checked backup; while it exists, its parts are being moved into the stage."""
+"""A checked backup (``fresh``) whose parts are being moved into the stage, and what they replace (``old``)."""
 REPLACED: Final = "kiosk/replaced"
+OUTSIDE: Final = "backup-files"
+"""The place in a backup, and in a restored stage, of files from outside the stage."""
 KEPT: Final = 5
 CUT_OFF_S: Final = 3600.0
 """An unfinished backup without changes for this time is abandoned."""
-MOST_FILES: Final = 100_000
-ROOM_SHARE: Final = 0.9
-"""The share of the free space that an unpacked backup may fill; the event log needs some, too."""
-_DAMAGED: Final = (tarfile.TarError, zlib.error, OSError, EOFError, ValueError)
-"""What reading a file raises that is damaged or is not a backup."""
-_SECRET: Final = ("keys", "kiosk", "run")
-_BACKED_UP: Final = ("stage.toml", "schedule.toml", "profiles", "appearances", "bundles", "bundles-without")
+_FILES: Final = (FILE, PANELS_FILE, BUILDING)
+_FOLDERS: Final = ("profiles", "appearances", "bundles", "bundles-without", OUTSIDE)
+_RUNS: Final = "runs"
+_PARTS: Final = "parts.json"
+"""In ``RESTORING``: the names of all that is moved, in this order."""
+_OF_SQLITE: Final = ("-wal", "-shm")
+"""The ends of SQLite's own files; what they hold is in the copy of the database."""
+_VERSION: Final = 1
 
 
-def backup(stage: Path) -> Path:
-    """A new file with settings, the newest calibration, appearances and bundles; without keys, accounts and logs."""
-    parts = [stage / name for name in _BACKED_UP if (stage / name).exists()]
-    runs = finished_calibrations(stage)
-    parts += runs[:1]
-    path = new_file(stage, "backup", "tar.gz")
+def backup(stage: Path, *, photographs: bool = False) -> Path:
+    """A new file with the settings, every file that they name, the newest calibration, appearances and bundles.
+
+    It holds the passwords in stage.toml, but no keys, accounts and logs. ``photographs``: also those of the
+    calibration. Files from outside the stage are in ``OUTSIDE``, and the settings in the backup name them there, so
+    that a restored stage finds them on any computer. Raises UsageError("stage-not-editable"), and
+    WorkError("cannot-write").
+    """
+    runs = finished_calibrations(stage)[:1]
+    changed, named = _named(stage, references(stage))
     # On another computer the connectors have other names; the displays have not.
     displays = {one.name: one.serials for one in outputs_of_x()}
-    mark = json.dumps(
-        {"velatura": 1, "made_unix_s": time.time(), "run": runs[0].name if runs else "", "displays": displays}
-    )
+    mark = {"velatura": _VERSION, "made_unix_s": time.time(), "run": runs[0].name if runs else "", "displays": displays,
+            "missing": missing(stage)}  # fmt: skip
+    parts = [stage / name for name in (*_FILES, *_FOLDERS) if (stage / name).exists() and name not in changed]
+    files = {name: path for part in [*parts, *runs] for name, path in _below(part, str(part.relative_to(stage)))}
 
     def write(archive: tarfile.TarFile) -> None:
-        add(archive, MARK, mark.encode())
-        for part in parts:
-            archive.add(part, str(part.relative_to(stage)), filter=_harmless)
+        add(archive, MARK, json.dumps(mark).encode())
+        for name, text in changed.items():
+            add(archive, name, text)
+        for name, path in (files | named).items():
+            if photographs or not (name.startswith(f"{_RUNS}/") and name.split("/")[2:3] == [CAPTURES]):
+                _add_file(archive, name, path)
 
-    return write_tar(path, write)
+    return write_tar(new_file(stage, "backup", "tar.gz"), write)
 
 
-def restore(stage: Path, file: Path) -> None:
+def missing(stage: Path) -> list[str]:
+    """A sentence for each file that the stage reads, and that does not exist."""
+    return [one.missing for one in references(stage) if one.holds is Holds.FILE and one.missing]
+
+
+def _named(stage: Path, found: Sequence[Reference]) -> tuple[dict[str, bytes], dict[str, Path]]:
+    """The settings that had to be changed, by file, and the named files by their names in the backup."""
+    named: dict[str, Path] = {}
+    changes = defaultdict[str, list[KeyChange]](list)
+    for one in found:
+        if one.holds is not Holds.FILE or one.missing:
+            continue
+        name = _own_name(stage, one.place)
+        if name is None:
+            name = next((other for other, path in named.items() if path == one.place), None)
+            name = name or _free_name(stage, one.place, named)
+            changes[one.file].append(KeyChange(one.path[:-1], str(one.path[-1]), name))
+        named[name] = one.place
+    return {file: edited(read_text(stage / file), rows).encode() for file, rows in changes.items()}, named
+
+
+def _own_name(stage: Path, place: Path) -> str | None:
+    """The name of a file that keeps its place in the stage; None if a restore would not put it back there."""
+    stage = stage.absolute()
+    if not place.is_relative_to(stage) or not place.resolve().is_relative_to(stage.resolve()):
+        return None
+    name = place.relative_to(stage)
+    hidden = any(part.startswith(".") for part in name.parts) or name.suffix == ".key"
+    return None if hidden or (name.parts[0] in OWN and name.parts[0] not in _FOLDERS) else str(name)
+
+
+def _free_name(stage: Path, place: Path, taken: Collection[str]) -> str:
+    plain = place.name.lstrip(".").removesuffix(".key") or "file"
+    names = (f"{OUTSIDE}/{plain}" if n == 1 else f"{OUTSIDE}/{n}-{plain}" for n in itertools.count(1))
+    return next(name for name in names if name not in taken and not (stage / name).exists())
+
+
+def _below(path: Path, name: str, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, Path]]:
+    """A file, or a folder and all in it, with names for the backup; no keys, no unfinished files."""
+    if path.suffix == ".key" or path.name.startswith(".") or path.name.endswith(_OF_SQLITE):
+        return
+    if path.is_file():
+        yield name, path
+    elif path.is_dir() and (real := path.resolve()) not in around:
+        yield name, path
+        for inner in sorted(path.iterdir()):
+            yield from _below(inner, f"{name}/{inner.name}", (*around, real))
+
+
+def _add_file(archive: tarfile.TarFile, name: str, path: Path) -> None:
+    """A link to a file of its folder stays one; of any other, what it leads to: it may not be on another computer."""
+    link = str(path.readlink()) if path.is_symlink() and path.is_file() else "/"
+    if "/" not in link and not link.startswith("."):
+        archive.addfile(archive.gettarinfo(path, name))
+    elif path.is_dir():
+        info = tarfile.TarInfo(name)
+        info.type, info.mode = tarfile.DIRTYPE, 0o755
+        archive.addfile(info)
+    elif path.name == Journal.FILE and (copy := _copy_of(path)):
+        add(archive, name, copy)
+    else:
+        with path.open("rb") as content:
+            archive.addfile(archive.gettarinfo(arcname=name, fileobj=content), content)
+
+
+def restore(stage: Path, file: Path, drivers: Drivers | None = None) -> None:
     """Replace settings, calibration and appearances by those of a backup; the old ones are kept in kiosk/replaced.
 
-    The backup is unpacked and checked first. After that nothing stops the restore: after a power cut
-    ``finish_restore`` completes it. Raises UsageError("not-a-backup"), WorkError("no-space") and what
-    ``load_stage`` raises for the settings in it.
+    The backup is unpacked and checked first, also by the stage's own checks. Then its parts are moved; after a power
+    cut ``finish_restore`` completes that. The restored calibration counts, and none is lost.
+
+    Raises UsageError("not-a-backup", "backup-newer", "backup-incomplete", "backup-opens-network"),
+    WorkError("no-space", "restore-given-up"), and what ``checked_settings`` raises for the settings in it.
     """
+    stage.mkdir(parents=True, exist_ok=True)
     finish_restore(stage)
+    for cut_off in stage.glob(".restore-*"):
+        shutil.rmtree(cut_off, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=".restore-", dir=stage) as name:
-        fresh = Path(name) / "fresh"
-        fresh.mkdir()
-        _unpack(file, fresh)
-        load_stage(fresh)
-        old = stage / REPLACED
-        shutil.rmtree(old, ignore_errors=True)
-        old.mkdir(parents=True)
-        fresh.rename(stage / RESTORING)
+        fresh = Path(name).absolute() / "work" / "fresh"
+        fresh.mkdir(parents=True)
+        _unpack(file, fresh, drivers)
+        _refuse_opened(fresh, stage)
+        _name_runs(fresh / _RUNS, stage)
+        write_json(fresh.parent / _PARTS, {"parts": _parts_of(fresh)})
+        for folder, _, _ in os.walk(fresh.parent, topdown=False):
+            sync_folder(Path(folder))
+        fresh.parent.rename(stage / RESTORING)
         sync_folder(stage)
     finish_restore(stage)
 
 
-def check_backup(file: Path) -> None:
-    """Read a backup to its end, and the settings in it.
+def check_backup(file: Path, room: Path | None = None) -> None:
+    """Restore a backup into an empty folder, below ``room`` if that is given, and let the stage's own checks run there.
 
-    Raises UsageError("not-a-backup") and what ``load_stage`` raises.
+    Raises as ``restore``.
     """
+    with tempfile.TemporaryDirectory(prefix=".restore-", dir=room) as folder:
+        _unpack(file, Path(folder).absolute(), None)
+
+
+def _unpack(file: Path, fresh: Path, drivers: Drivers | None) -> None:
+    """Unpack a backup and check that it is whole, and that a stage made of it can start. Raises as ``restore``."""
+    unpack(file, fresh, first=MARK)
+    lacks = _lacks((fresh / MARK).read_bytes())
+    for name in (*_FOLDERS, *_FILES, _RUNS):
+        if os.path.lexists(fresh / name) and (name in _FILES) != (fresh / name).is_file():
+            raise not_ours(f"{name} is of the wrong kind")
+    checked_settings(fresh, drivers)
+    found = [one for one in references(fresh) if one.holds is Holds.FILE]
+    allowed = {fresh / name for name in (MARK, *_FILES)} | {one.place for one in found}
+    for top in fresh.iterdir():
+        for path in () if top.name in (*_FOLDERS, _RUNS) else (top, *top.rglob("*")):
+            if not path.is_dir() and (path not in allowed or (top.name in OWN and top.name not in _FILES)):
+                raise not_ours(f"{path.relative_to(fresh)} is no part of a stage")
+    lost = [one.missing for one in found if lacks is not None and one.missing and one.missing not in lacks]
+    if lost:
+        raise UsageError("backup-incomplete", what=f"The backup is not complete: {lost[0]}",
+                         remedy="Use another backup.")  # fmt: skip
+
+
+def _lacks(mark: bytes) -> list[str] | None:
+    """What ``missing`` said when the backup was made; None in backups of before. Raises as ``restore``."""
     try:
-        with _opened(file) as (archive, finish), tempfile.TemporaryDirectory() as folder:
-            names = [_read_through(archive, member, Path(folder)) for member in archive]
-            finish()
-            if names[:1] != [MARK]:
-                raise _not_ours()
-            load_stage(Path(folder))
-    except _DAMAGED as error:
-        raise _not_ours() from error
+        content = json.loads(mark)
+        version, lacks = int(content.get("velatura", _VERSION)), content.get("missing")
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise not_ours() from error
+    if version > _VERSION:
+        raise UsageError("backup-newer", what="This backup was made by a newer Velatura.",
+                         remedy="Update Velatura first, then restore the backup.")  # fmt: skip
+    return lacks if isinstance(lacks, list) else None
+
+
+def _refuse_opened(fresh: Path, stage: Path) -> None:
+    """Raises UsageError("backup-opens-network") where the whole world could command a stage that is there already."""
+
+    def reached(folder: Path) -> set[str]:
+        return {text for path, text, _ in texts(building(folder)) if "allow" in path}
+
+    opened = [text for text in reached(fresh) - reached(stage) if _is_wide(text)]
+    if opened and (stage / FILE).exists():
+        what = f"The backup lets {opened[0]} command the stage, by its {BUILDING}."
+        remedy = f"If that is right, write it into {BUILDING} of the stage first."
+        raise UsageError("backup-opens-network", what=what, remedy=remedy)
+
+
+def _is_wide(network: str) -> bool:
+    try:
+        return not ipaddress.ip_network(network).is_private
+    except ValueError:
+        return False
+
+
+def _name_runs(fresh: Path, stage: Path) -> None:
+    """Make a restored calibration the newest, unless it is the newest of the stage already, with the same bytes."""
+    runs = stage / _RUNS
+    for run in sorted(fresh.iterdir()) if fresh.exists() else ():
+        newest = max((other.name for other in runs.iterdir()), default="") if runs.is_dir() else ""
+        if finished_calibrations(stage)[:1] == [runs / run.name] and _has_all(runs / run.name, run):
+            shutil.rmtree(run)
+        elif newest >= run.name:
+            stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(max(time.time(), began_s(newest) + 1.0)))
+            run.rename(fresh / f"{stamp}-{run.name.partition('-')[2].partition('-')[2] or 'calibrate'}")
+
+
+def _has_all(there: Path, run: Path) -> bool:
+    """Whether the folder ``there`` has all files of ``run``, with the same content."""
+    pairs = [(there / path.relative_to(run), path) for path in run.rglob("*") if path.is_file()]
+    return all(one.is_file() and _same(one, other) for one, other in pairs)
+
+
+def _same(one: Path, other: Path) -> bool:
+    if one.name == Journal.FILE:
+        # Two copies of one database may differ in bytes.
+        return (_rows_of(one) or [str(one)]) == (_rows_of(other) or [str(other)])
+    return filecmp.cmp(one, other, shallow=False)
+
+
+def _rows_of(database: Path) -> list[str]:
+    """The statements that make such a database; [] for a damaged one."""
+    try:
+        with contextlib.closing(_read_only(database)) as source:
+            return list(source.iterdump())
+    except sqlite3.Error:
+        return []
+
+
+def _parts_of(fresh: Path) -> list[str]:
+    """What is moved as a whole: files and folders of a stage, each run, each other named file; stage.toml is last."""
+    parts = [top for top in fresh.iterdir() if top.name in _FOLDERS or (top.is_file() and top.name != MARK)]
+    parts += (fresh / _RUNS).glob("*")
+    others = (top for top in fresh.iterdir() if top.is_dir() and top.name not in (*_FOLDERS, _RUNS))
+    parts += (path for top in others for path in top.rglob("*") if path.is_file())
+    return sorted((str(part.relative_to(fresh)) for part in parts), key=lambda name: (name == FILE, name))
+
+
+def finish_restore(stage: Path) -> bool:
+    """Complete an interrupted restore, so that old and new parts are not mixed; returns whether there was one.
+
+    Raises WorkError("restore-given-up") if that can't be done; the stage is as before then, if its disk allows.
+    """
+    work = stage / RESTORING
+    if not (work / _PARTS).is_file():
+        # Nothing was moved yet, or all was.
+        _remove(work)
+        return False
+    parts: list[str] = []
+    try:
+        parts = list(json.loads(read_text(work / _PARTS))["parts"])
+        if (work / "fresh" / FILE).exists():
+            load_stage(work / "fresh")
+        for part in parts:
+            if os.path.lexists(work / "fresh" / part):
+                _exchange(stage, work / "fresh" / part, stage / part, work / "old" / part)
+        if (work / "old").exists():
+            shutil.rmtree(stage / REPLACED, ignore_errors=True)
+            _move(stage, work / "old", stage / REPLACED)
+    except (OSError, ValueError, LookupError, TypeError, VelaturaError) as error:
+        raise _given_up(stage, work, parts, error) from error
+    _remove(work)
+    return True
+
+
+def _given_up(stage: Path, work: Path, parts: Sequence[str], error: Exception) -> WorkError:
+    """Put everything back, and the error that says so."""
+    why = getattr(error, "what", "") or getattr(error, "strerror", "") or "it is damaged"
+    state = "The stage is as it was before."
+    try:
+        for part in reversed(parts):
+            if not os.path.lexists(work / "fresh" / part):
+                _exchange(stage, work / "old" / part, stage / part, work / "fresh" / part)
+            elif os.path.lexists(work / "old" / part):
+                _move(stage, work / "old" / part, stage / part)
+        _remove(work)
+    except OSError:
+        state = "It is tried again at the next start."
+    return WorkError(
+        "restore-given-up",
+        what=f"The backup could not be put in place: {printable(why).rstrip('.')}. {state}",
+        remedy="Check the permissions of the stage's folder and its disk, and restore it again.",
+    )
+
+
+def _exchange(stage: Path, new: Path, place: Path, old: Path) -> None:
+    """Move what is at ``place`` to ``old``, and ``new`` to ``place``; either may be missing."""
+    if os.path.lexists(place):
+        _move(stage, place, old)
+    if os.path.lexists(new):
+        _move(stage, new, place)
+
+
+def _move(stage: Path, source: Path, target: Path) -> None:
+    """Rename, durably before anything else happens."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(target)
+    sync_folder(source.parent)
+    for folder in target.parents:
+        sync_folder(folder)
+        if folder == stage:
+            break
+
+
+def _remove(work: Path) -> None:
+    """First the list, so that what is left after a cut is only removed."""
+    if work.is_dir() and not work.is_symlink():
+        (work / _PARTS).unlink(missing_ok=True)
+        sync_folder(work)
+        shutil.rmtree(work, ignore_errors=True)
+    else:
+        work.unlink(missing_ok=True)
 
 
 def displays_of(file: Path) -> dict[str, tuple[str, ...]]:
@@ -113,68 +372,20 @@ def displays_of(file: Path) -> dict[str, tuple[str, ...]]:
     Raises UsageError("not-a-backup").
     """
     try:
-        with tarfile.open(file, "r:gz") as archive:
-            first = archive.next()
-            content = None if first is None or first.name != MARK else archive.extractfile(first)
-            if content is None:
-                raise _not_ours()
-            table = json.loads(content.read(LARGEST_BYTES)).get("displays", {})
-            return {str(name): tuple(str(serial) for serial in serials) for name, serials in table.items()}
-    except (*_DAMAGED, AttributeError, TypeError) as error:
-        raise _not_ours() from error
-
-
-@contextlib.contextmanager
-def _opened(file: Path) -> Iterator[tuple[tarfile.TarFile, Callable[[], None]]]:
-    """A backup to read, and a function that reads what is left of it and compares its checksum.
-
-    tarfile itself stops at the first header that is not one, so that it takes a damaged header for the end.
-    """
-    require_regular(file)
-    with gzip.open(file, "rb") as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
-
-        def finish() -> None:
-            while stream.read(1 << 20):
-                pass
-
-        yield archive, finish
-
-
-def _read_through(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> str:
-    """Read one member, and put the settings into ``folder``; returns its name."""
-    if _harmless(member) is None:
-        raise _not_ours()
-    content = archive.extractfile(member) if member.isfile() else None
-    if content is not None and member.name == FILE:
-        (folder / FILE).write_bytes(content.read(LARGEST_BYTES + 1))
-    while content is not None and content.read(1 << 20):
-        pass
-    return member.name
-
-
-def finish_restore(stage: Path) -> bool:
-    """Complete an interrupted restore, so that old and new parts are not mixed; returns whether there was one."""
-    fresh, old = stage / RESTORING, stage / REPLACED
-    if not fresh.exists():
-        return False
-    for part in sorted(fresh.iterdir()):
-        if part.name in (*_SECRET, MARK):
-            continue
-        if part.name == "runs":
-            _merge_runs(part, stage / "runs")
-            continue
-        if (stage / part.name).exists():
-            (stage / part.name).rename(old / part.name)
-        part.rename(stage / part.name)
-    sync_folder(stage)
-    shutil.rmtree(fresh)
-    return True
+        name, mark = read_first(file)
+        if name != MARK:
+            raise not_ours()
+        table = json.loads(mark).get("displays", {})
+        return {str(name): tuple(str(serial) for serial in serials) for name, serials in table.items()}
+    except (*DAMAGED, AttributeError, TypeError) as error:
+        raise not_ours() from error
 
 
 def clear_cut_off(stage: Path) -> None:
     """Delete the remains of interrupted restores and backups, which may be gigabytes. Needs the stage's lock."""
-    for folder in stage.glob(".restore-*"):
-        shutil.rmtree(folder, ignore_errors=True)
+    for place, pattern in ((stage, ".restore-*"), (stage / FOLDER, ".restore-*"), (stage / FOLDER, ".back-*")):
+        for folder in place.glob(pattern):
+            shutil.rmtree(folder, ignore_errors=True)
     for part in (stage / FOLDER).glob(".*.part"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > CUT_OFF_S:
@@ -191,15 +402,20 @@ def new_file(stage: Path, what: str, suffix: str) -> Path:
 
 
 def write_tar(path: Path, write: Callable[[tarfile.TarFile], None]) -> Path:
-    """``path``, which is there only when it is whole. Raises WorkError("cannot-write")."""
+    """``path``, for its owner alone, which is there only when it is whole. Raises WorkError("cannot-write")."""
     part = path.with_name(f".{path.name}.part")
     try:
-        with tarfile.open(part, "w:gz", compresslevel=1) as archive:
-            write(archive)
-        part.chmod(0o600)
+        with part.open("wb") as file:
+            part.chmod(0o600)
+            with tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as archive:
+                write(archive)
+            file.flush()
+            os.fsync(file.fileno())
         part.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
-        raise WorkError("cannot-write", what=f"{path.name} could not be written: {error.strerror}.",
+        failed = error.filename or path.name
+        raise WorkError("cannot-write", what=f"{failed} could not be read or written: {error.strerror}.",
                         remedy="Check the free space on the disk, and try again.") from error  # fmt: skip
     finally:
         part.unlink(missing_ok=True)
@@ -211,89 +427,6 @@ def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     info = tarfile.TarInfo(name)
     info.size, info.mtime = len(data), int(time.time())
     archive.addfile(info, io.BytesIO(data))
-
-
-def _harmless(info: tarfile.TarInfo) -> tarfile.TarInfo | None:
-    """Keeps only files, folders, and links to a name in the same folder; no keys, no unfinished files."""
-    name = PurePosixPath(info.name)
-    if name.suffix == ".key" or name.name.startswith("."):
-        return None
-    if info.issym():
-        return info if "/" not in info.linkname else None
-    return info if info.isfile() or info.isdir() else None
-
-
-def _unpack(file: Path, folder: Path) -> None:
-    try:
-        with _opened(file) as (archive, finish):
-            members = []
-            for count, member in enumerate(archive):
-                if count >= MOST_FILES or _harmless(member) is None:
-                    raise _not_ours()
-                members.append(member)
-            finish()
-            if not members or members[0].name != MARK:
-                raise _not_ours()
-            _require_room(folder, sum(member.size for member in members))
-            for member in members:
-                _unpack_one(archive, member, folder)
-    except _DAMAGED as error:
-        raise _not_ours() from error
-
-
-def _unpack_one(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
-    """One file, folder or link. tarfile's own filters came with Python 3.11.4, and Debian 12 has 3.11.2.
-
-    Raises UsageError("not-a-backup") for one that would lie outside ``folder``, and ValueError and OSError.
-    """
-    place = folder / member.name
-    # Also when a link that came before it leads out.
-    if not place.parent.resolve().is_relative_to(folder.resolve()) or ".." in PurePosixPath(member.name).parts:
-        raise _not_ours()
-    place.parent.mkdir(parents=True, exist_ok=True)
-    if member.isdir():
-        place.mkdir(exist_ok=True)
-    elif member.issym():
-        if member.linkname in (".", ".."):
-            raise _not_ours()
-        place.symlink_to(member.linkname)
-    else:
-        content = archive.extractfile(member)
-        assert content is not None
-        with content, place.open("xb") as file:
-            shutil.copyfileobj(content, file)
-        os.utime(place, (member.mtime, member.mtime))
-
-
-def _require_room(folder: Path, size: int) -> None:
-    """Raises WorkError("no-space"), because a small archive may be large when unpacked."""
-    free = shutil.disk_usage(folder).free
-    if size > ROOM_SHARE * free:
-        raise WorkError(
-            "no-space",
-            what=f"The backup needs {size / 1e9:.1f} GB, but only {free / 1e9:.1f} GB are free.",
-            remedy="Free some space on the stage's disk.",
-        )
-
-
-def _not_ours() -> UsageError:
-    return UsageError(
-        "not-a-backup",
-        what="This file is not a backup of a Velatura stage, or it is damaged.",
-        remedy="Use a file that was made by `velatura kiosk backup` or the panel.",
-    )
-
-
-def _merge_runs(fresh: Path, runs: Path) -> None:
-    """Give a restored run that is older than the existing ones a new name: the newest calibration is used."""
-    runs.mkdir(exist_ok=True)
-    for run in sorted(fresh.iterdir()):
-        newest = max((other.name for other in runs.iterdir()), default="")
-        name = run.name
-        if newest > name:
-            name = f"{time.strftime('%Y%m%d-%H%M%S')}-{name.partition('-')[2].partition('-')[2] or 'calibrate'}"
-        if not (runs / name).exists():
-            run.rename(runs / name)
 
 
 LARGEST_TAPE: Final = 64 << 20
@@ -334,8 +467,12 @@ def _texts(stage: Path) -> Iterable[Path]:
 
 def _copy_of(database: Path) -> bytes:
     """A consistent copy, even while the database is written."""
-    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as source:
+    with contextlib.closing(_read_only(database)) as source:
         return source.serialize()
+
+
+def _read_only(database: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)
 
 
 def _disk(stage: Path) -> dict[str, int]:

@@ -48,9 +48,18 @@ def validate(content: str) -> None:
 
 
 def checked_settings(stage: Path, drivers: Drivers | None = None, *, instead: Path | None = None) -> Checked:
-    """As ``check_stage``, and the opening hours, without which no kiosk starts. Raises also as ``check_schedule``."""
+    """As ``check_stage``, and what else no kiosk starts without: opening hours, and a display that plays bundles.
+
+    Raises also as ``check_schedule``, and UsageError("display-plays-no-bundles").
+    """
     checked = check_stage(stage, drivers=drivers, instead=instead)
     of_table(checked.stage.tables.schedule)
+    if checked.stage.tables.display.driver != "player":
+        raise UsageError(
+            "display-plays-no-bundles",
+            what="A kiosk needs the player as its display.",
+            remedy='Use the driver "player" under [display] in stage.toml.',
+        )
     return checked
 
 

@@ -276,7 +276,7 @@ class MemoryKiosk(MemoryWork):
     def doctor(self) -> Sequence[Notice]:
         return examples.findings()
 
-    def backup(self) -> Path:
+    def backup(self, *, photographs: bool = False) -> Path:
         file = self._folder.parent / "backup.velatura"
         file.write_bytes(b"a backup\n" + self._toml.encode())
         return file

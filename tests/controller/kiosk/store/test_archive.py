@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import shutil
@@ -16,6 +17,7 @@ from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.kiosk.store import archive
 from controller.kiosk.store.archive import FOLDER, LARGEST_TAPE, diagnostics
+from controller.kiosk.store.event_log import EventLog
 from controller.stage.sessions.run import new_tape
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
@@ -41,18 +43,21 @@ def contents(file: Path) -> bytes:
         return b"".join(one.read() for one in members if one is not None)
 
 
-def tarred(path: Path, fill: Callable[[tarfile.TarFile], None], *, mark: bool = True) -> Path:
+def tarred(path: Path, fill: Callable[[tarfile.TarFile], object], mark: bytes | None = b"{}") -> Path:
     with tarfile.open(path, "w:gz") as packed:
-        if mark:
-            add(packed, archive.MARK, b"{}")
+        if mark is not None:
+            add(packed, archive.MARK, mark)
         fill(packed)
     return path
 
 
-def add(packed: tarfile.TarFile, name: str, data: bytes = b"x", kind: bytes = tarfile.REGTYPE, to: str = "") -> None:
+def add(
+    packed: tarfile.TarFile, name: str, data: bytes = b"x", kind: bytes = tarfile.REGTYPE, to: str = ""
+) -> tarfile.TarInfo:
     info = tarfile.TarInfo(name)
     info.size, info.type, info.linkname = len(data), kind, to
     packed.addfile(info, io.BytesIO(data))
+    return info
 
 
 def test_a_backup_holds_settings_pictures_and_the_newest_calibration_and_no_secret(stage: Path) -> None:
@@ -92,7 +97,27 @@ def test_a_restored_calibration_counts_though_there_is_a_newer_one(stage: Path) 
     assert "0.01" in (newest / "verification.json").read_text()
 
 
-HOSTILE: dict[str, Callable[[tarfile.TarFile], None]] = {
+def add_long_header(packed: tarfile.TarFile) -> None:
+    add(packed, "././@LongLink", bytes(2 << 20), tarfile.GNUTYPE_LONGNAME)
+    add(packed, "bundles/a")
+
+
+def add_large(packed: tarfile.TarFile) -> None:
+    """A member whose header promises more than follows."""
+    info = tarfile.TarInfo("bundles/large")
+    info.size = 1 << 20
+    packed.fileobj.write(info.tobuf())
+    packed.offset += 512
+
+
+def add_negative(packed: tarfile.TarFile) -> None:
+    info = tarfile.TarInfo("bundles/large")
+    info.size = -1024
+    packed.fileobj.write(info.tobuf(format=tarfile.GNU_FORMAT))
+    packed.offset += 512
+
+
+HOSTILE: dict[str, Callable[[tarfile.TarFile], object]] = {
     "leads out": lambda packed: add(packed, "../stage.toml"),
     "leads out deeper": lambda packed: add(packed, "bundles/../../stage.toml"),
     "link up": lambda packed: add(packed, "bundles/current", b"", tarfile.SYMTYPE, ".."),
@@ -101,13 +126,48 @@ HOSTILE: dict[str, Callable[[tarfile.TarFile], None]] = {
     "device": lambda packed: add(packed, "stage.toml", b"", tarfile.CHRTYPE),
     "a key": lambda packed: add(packed, "keys/stage.key"),
     "hidden": lambda packed: add(packed, ".bashrc"),
+    "absolute": lambda packed: add(packed, "/tmp/velatura-hostile"),
+    "absolute below a part": lambda packed: add(packed, "bundles//tmp/velatura-hostile"),
+    "a file that is runs": lambda packed: add(packed, "runs"),
+    "a file that is a folder": lambda packed: add(packed, "appearances"),
+    "a folder that is settings": lambda packed: add(packed, "building.toml", b"", tarfile.DIRTYPE),
+    "a link that is a folder": lambda packed: add(packed, "bundles", b"", tarfile.SYMTYPE, "keys"),
+    "through a link": lambda packed: [
+        add(packed, "bundles/a", b"", tarfile.SYMTYPE, "b"),
+        add(packed, "bundles/a/c"),
+    ],
+    "through a file": lambda packed: [add(packed, "bundles/a"), add(packed, "bundles/a/c")],
+    "twice": lambda packed: [add(packed, "bundles/a"), add(packed, "bundles/a")],
+    "twice, a folder, too": lambda packed: [
+        add(packed, "bundles/a/c"),
+        add(packed, "bundles/a", b"", tarfile.DIRTYPE),
+        add(packed, "bundles/a"),
+    ],
+    "twice but for case": lambda packed: add(packed, "Stage.toml"),
+    "a pipe": lambda packed: add(packed, "bundles/a", b"", tarfile.FIFOTYPE),
+    "lamp hours": lambda packed: add(packed, "lamps.json", b"{}"),
+    "lamp hours as a picture": lambda packed: add(packed, "lamps.json", b"{}"),
+    "accounts": lambda packed: add(packed, "kiosk/panel/accounts.json"),
+    "a part that nothing names": lambda packed: add(packed, "other/file"),
+    "a long header": add_long_header,
+    "more than it has": add_large,
+    "a size below zero": add_negative,
+    "a mark that is none": lambda packed: None,
 }
 
 
 @pytest.mark.parametrize("how", HOSTILE)
 def test_a_hostile_archive_is_refused_and_nothing_is_touched(stage: Path, tmp_path: Path, how: str) -> None:
     before = sorted(tmp_path.rglob("*"))
-    file = tarred(tmp_path / "hostile.tar.gz", HOSTILE[how])
+    text = TEXT.replace("appearances/glass.png", "lamps.json") if "as a picture" in how else TEXT
+    mark = b"[]" if how == "a mark that is none" else b"{}"
+
+    def fill(packed: tarfile.TarFile) -> None:
+        if how not in ("hard link", "device"):
+            add(packed, "stage.toml", text.encode())
+        HOSTILE[how](packed)
+
+    file = tarred(tmp_path / "hostile.tar.gz", fill, mark)
     with pytest.raises(UsageError, match="not a backup"):
         archive.restore(stage, file)
     file.unlink()
@@ -130,7 +190,7 @@ def test_a_cut_backup_is_refused(stage: Path, tmp_path: Path) -> None:
 
 
 def test_an_archive_of_something_else_is_refused(stage: Path, tmp_path: Path) -> None:
-    file = tarred(tmp_path / "other.tar.gz", lambda packed: add(packed, "stage.toml"), mark=False)
+    file = tarred(tmp_path / "other.tar.gz", lambda packed: add(packed, "stage.toml"), None)
     with pytest.raises(UsageError, match="not a backup"):
         archive.restore(stage, file)
 
@@ -141,6 +201,71 @@ def test_a_backup_with_wrong_settings_replaces_nothing(stage: Path, tmp_path: Pa
         archive.restore(stage, file)
     assert (stage / "stage.toml").read_text() == TEXT
     assert not (stage / "kiosk/replaced").exists()
+
+
+def test_a_backup_of_a_newer_velatura_says_so(stage: Path, tmp_path: Path) -> None:
+    file = tarred(tmp_path / "new.tar.gz", lambda packed: add(packed, "stage.toml", TEXT.encode()), b'{"velatura": 2}')
+    with pytest.raises(UsageError, match="newer Velatura"):
+        archive.restore(stage, file)
+
+
+@pytest.mark.parametrize(("network", "there", "refused"), [
+    ("0.0.0.0/0", "", True), ("::/0", "", True), ("8.0.0.0/8", "", True), ("192.168.0.0/16", "", False),
+    ("0.0.0.0/0", "0.0.0.0/0", False), ("0.0.0.0/0", None, False),
+])  # fmt: skip
+def test_a_backup_that_opens_a_stage_to_the_world_is_refused(
+    stage: Path, tmp_path: Path, network: str, there: str | None, refused: bool
+) -> None:
+    table = '[pjlink]\nhost = "0.0.0.0"\nallow = ["{}"]\n'
+    (stage / "building.toml").write_text(table.format(network))
+    file = archive.backup(stage).rename(tmp_path / "b.tar.gz")
+    (stage / "building.toml").write_text(table.format(there or "10.0.0.0/8"))
+    place = tmp_path / "empty" if there is None else stage
+    if refused:
+        with pytest.raises(UsageError, match="command the stage"):
+            archive.restore(place, file)
+    else:
+        archive.restore(place, file)
+    assert (network in (place / "building.toml").read_text()) != refused
+
+
+@pytest.mark.parametrize("left", ["a file", "a folder of before", "damaged settings", "a damaged list"])
+def test_a_start_gives_up_what_can_not_be_finished(stage: Path, left: str) -> None:
+    work = stage / archive.RESTORING
+    if left == "a file":
+        work.write_text("x")
+    else:
+        (work / "fresh").mkdir(parents=True)
+        (work / "runs").write_text("x")
+        (work / "fresh/schedule.toml").write_text("new")
+        (work / "fresh/stage.toml").write_text(TEXT if left == "a damaged list" else "damaged")
+    if left.startswith("damaged") or left == "a damaged list":
+        (work / "parts.json").write_text(
+            "{" if left == "a damaged list" else '{"parts": ["schedule.toml", "stage.toml"]}'
+        )
+        with pytest.raises(WorkError, match="as it was before"):
+            archive.finish_restore(stage)
+    assert not archive.finish_restore(stage)
+    assert not work.exists()
+    assert (stage / "stage.toml").read_text() == TEXT
+    assert not (stage / "schedule.toml").exists()
+
+
+def test_a_part_that_can_not_be_moved_brings_all_others_back(stage: Path, tmp_path: Path) -> None:
+    (stage / "stage.toml").write_text(TEXT.replace("appearances/glass.png", "pictures/glass.png"))
+    for name in ("pictures/glass.png", "schedule.toml"):
+        (stage / name).parent.mkdir(exist_ok=True)
+        (stage / name).write_text("of the backup")
+    file = archive.backup(stage).rename(tmp_path / "b.tar.gz")
+    (stage / "appearances/glass.png").write_text("of now")
+    (stage / "schedule.toml").write_text("of now")
+    shutil.rmtree(stage / "pictures")
+    (stage / "pictures").write_text("a file where the backup has a folder")
+    before = {path: path.read_bytes() for path in stage.rglob("*") if path.is_file()}
+    with pytest.raises(WorkError, match="as it was before"):
+        archive.restore(stage, file)
+    after = {path: path.read_bytes() for path in stage.rglob("*") if path.is_file()}
+    assert after == before
 
 
 def test_a_backup_that_would_fill_the_disk_is_refused(stage: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,57 +306,14 @@ def test_a_disk_that_takes_nothing_is_told_and_leaves_nothing(stage: Path, monke
     assert list((stage / archive.FOLDER).iterdir()) == []
 
 
-class Cut(Exception):
-    """The power went."""
-
-
-def test_a_restore_that_is_cut_off_anywhere_leaves_the_old_stage_or_becomes_the_new_one(
-    stage: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    before = tmp_path / "before"
-    file = tmp_path / "backup.tar.gz"
-    archive.backup(stage).rename(file)
-    (stage / "stage.toml").write_text(TEXT.replace("The vase", "Another vase"))
-    (stage / "appearances" / "glass.png").write_bytes(b"later")
-    shutil.copytree(stage, before, symlinks=True)
-    rename, outcomes = Path.rename, set()
-    for cut_at in range(1, 30):
-        shutil.rmtree(stage)
-        shutil.copytree(before, stage, symlinks=True)
-        done = 0
-
-        def cut(self: Path, target: Path, cut_at: int = cut_at) -> Path:
-            nonlocal done
-            done += 1
-            if done == cut_at:
-                raise Cut
-            return rename(self, target)
-
-        with monkeypatch.context() as patched:
-            patched.setattr(Path, "rename", cut)
-            try:
-                archive.restore(stage, file)
-                whole = True
-            except Cut:
-                whole = False
-        finished = archive.finish_restore(stage)
-        settings = (stage / "stage.toml").read_text()
-        picture = (stage / "appearances" / "glass.png").read_bytes()
-        outcomes.add(("Another" in settings, picture == b"later"))
-        assert finished == (not whole and "Another" not in settings)
-        assert not (stage / archive.RESTORING).exists()
-        if whole:
-            break
-    assert outcomes == {(True, True), (False, False)}
-    assert cut_at > 3
-
-
 def test_what_a_kill_left_of_restores_and_backups_is_gone_with_the_next_start(
     stage: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def start(service: Service) -> None:
         raise WorkError("far-enough", what="This is all.", remedy="None.")
 
+    (stage / archive.RESTORING / "fresh").mkdir(parents=True)
+    (stage / archive.RESTORING / "parts.json").write_text("damaged")
     unpacked, part, going_on = (
         stage / ".restore-abc/fresh",
         stage / FOLDER / ".backup-1.part",
@@ -246,3 +328,5 @@ def test_what_a_kill_left_of_restores_and_backups_is_gone_with_the_next_start(
     with pytest.raises(WorkError, match="This is all"), serving(stage, threading.Event()):
         pass
     assert [file.exists() for file in (unpacked.parent, part, going_on)] == [False, False, True]
+    with contextlib.closing(EventLog(stage / EventLog.FILE)) as log:
+        assert [row.code for row in log.after(0)] == ["restore-given-up", "service-ended"]
