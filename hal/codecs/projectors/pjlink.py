@@ -300,10 +300,12 @@ def _parsed(line: bytes) -> Notification:
     name, value = match[1].upper(), match[2].decode("ascii")
     if name == b"ERST":
         return TroubleChanged(parse_errors(value))
-    if name == b"POWR":
-        return PowerChanged(parse_power(value))
+    if name == b"POWR" and value in _POWERS:
+        return PowerChanged(_POWERS[value])
     if name == b"INPT":
         return InputChanged(parse_input(value))
+    if name == b"POWR":
+        raise _garbage(line)
     return SearchAck(_mac(value)) if name == b"ACKN" else LinkUp(_mac(value))
 
 

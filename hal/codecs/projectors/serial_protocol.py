@@ -173,7 +173,7 @@ def parse_line(
     if table.json:
         return _object(table, parse_message(line, sent), query, line)
     text = _text(table, line, sent)
-    if table.notices.prefix and text.startswith(table.notices.prefix):
+    if table.notices.prefix and text.upper().startswith(table.notices.prefix.upper()):
         return _notice(table, text)
     meaning = _reply(table, text, ((table.cooling, Reply.COOLING), (table.refused, Reply.REFUSED)))
     if meaning is None and table.quirks.ack_first:
@@ -190,7 +190,7 @@ def parse_line(
 
 def _shaped(table: SerialTable, query: Query, text: str, line: bytes) -> Answer | Reply | None:
     for shape in query.answers:
-        if (match := _pattern(shape, _flags(table), table.binary).fullmatch(text)) is not None:
+        if (match := _pattern(shape, table.binary).fullmatch(text)) is not None:
             return _answer(table, query, match[1], line)
     return None
 
@@ -211,17 +211,15 @@ def _object(table: SerialTable, message: Message, query: Query | None, line: byt
 
 def _reply(table: SerialTable, text: str, meanings: Sequence[tuple[tuple[str, ...], Reply]]) -> Reply | None:
     for shapes, reply in meanings:
-        if any(_pattern(shape, _flags(table), table.binary).fullmatch(text) for shape in shapes):
+        if any(_pattern(shape, table.binary).fullmatch(text) for shape in shapes):
             return reply
     return None
 
 
-def _flags(table: SerialTable) -> int:
-    return re.IGNORECASE if table.quirks.any_case else 0
-
-
 def _text(table: SerialTable, line: bytes, sent: bytes) -> str:
-    """What a line says: without terminator, prompt and echo; a binary frame as hexadecimal without its checksum."""
+    """What a line says: without terminator, prompt, echo and addresses; a binary frame as hexadecimal without its
+    checksum.
+    """
     if table.binary:
         if table.frame is not None and table.frame.checksum != "none":
             begin = 1 if table.frame.checksum == "sum-but-first" else 0
@@ -235,13 +233,17 @@ def _text(table: SerialTable, line: bytes, sent: bytes) -> str:
         text = text.lstrip(table.quirks.prompt + "\r\n ")
     echo = sent.strip(b"\r\n\0 ").decode("latin-1")
     if table.quirks.echo and echo:
+        # Letter by letter: an answer may differ from it only in case.
         while text.startswith(echo):
             text = text.removeprefix(echo).lstrip(table.quirks.prompt + "\r\n ")
+    if table.quirks.addressed:
+        text = re.sub(rf"\A(\W?)(?:{table.quirks.addressed})", r"\1", text, flags=re.IGNORECASE)
     return text
 
 
 def _notice(table: SerialTable, text: str) -> UnaskedMessage:
-    code = text.removeprefix(table.notices.prefix).strip()
+    code = text[len(table.notices.prefix) :].strip()
+    code = _plain(code) if code.isdigit() else code
     if code in table.notices.power:
         return UnaskedMessage(table.notices.power[code], None)
     if (word := table.notices.trouble.get(code)) is not None:
@@ -256,19 +258,23 @@ def _notice(table: SerialTable, text: str) -> UnaskedMessage:
 
 
 def _answer(table: SerialTable, query: Query, value: str, line: bytes) -> Answer | Reply:
-    value = _read(query, value)
-    known, wanted = query.values, value
-    if table.quirks.any_case:
-        known, wanted = {name.upper(): word for name, word in known.items()}, value.upper()
-    if wanted in query.absent:
+    value = _read(query, value).strip()
+    plain = str.upper if table.binary else _plain
+    known, wanted = {plain(name): word for name, word in query.values.items()}, plain(value)
+    if wanted in map(plain, query.absent):
         return Reply.REFUSED
-    if wanted in query.unknown:
-        return Answer(Power.UNKNOWN.value)
-    if not known:
-        return Answer(value)
-    if wanted not in known:
+    if known and wanted not in known:
+        if value in query.unknown or ("*" in query.unknown and value.isdigit()):
+            return Answer(Power.UNKNOWN.value)
         raise _garbage(line)
-    return Answer(known[wanted])
+    if not value:
+        raise _garbage(line)
+    return Answer(known[wanted] if known else value)
+
+
+def _plain(value: str) -> str:
+    """A value as it is compared: models differ in case, and in how many zeros come before a number."""
+    return value.upper().lstrip("0") or "0"
 
 
 def _read(query: Query, value: str) -> str:
@@ -285,20 +291,23 @@ def _read(query: Query, value: str) -> str:
 
 
 @lru_cache(maxsize=512)
-def _pattern(shape: str, flags: int, binary: bool) -> re.Pattern[str]:
+def _pattern(shape: str, binary: bool) -> re.Pattern[str]:
     byte = "[0-9A-F]{2}"
     meanings = {"{any}": f"[ -~]{{0,{4 * _LONGEST_VALUE}}}", "{value}": f"([ -~]{{1,{_LONGEST_VALUE}}}?)"}
     if binary:
         meanings = {"{value}": f"((?:{byte}){{1,{_LONGEST_VALUE}}})", " ": "", "?": byte}
     parts = []
     for part in _SHAPE_PARTS.findall(shape):
-        if binary and part.startswith("?*"):
+        if part in meanings:
+            parts.append(meanings[part])
+        elif not binary:
+            parts += [" +" if mark == " " else mark if mark.isalnum() else f" *{re.escape(mark)} *" for mark in part]
+        elif part.startswith("?*"):
             parts.append(f"(?:{byte}){{{int(part[2:])}}}")
-        elif binary and part not in meanings:
-            parts.append(part.replace(" ", "").upper())
         else:
-            parts.append(meanings.get(part) or ("" if part in meanings else re.escape(part)))
-    return re.compile("".join(parts), flags)
+            parts.append(part.replace(" ", "").upper())
+    # Users report models that differ from their makers' documents in case and in blanks.
+    return re.compile("".join(parts), re.IGNORECASE)
 
 
 def parse_power(value: str) -> Power:

@@ -32,7 +32,7 @@ _HEX_SHAPE: Final = re.compile(
 class Query:
     """One query: its bytes, the shapes of its answer (``{value}`` marks the value) and the meaning of values.
 
-    ``absent``: values for "not known now"; ``unknown``: power states with an unknown meaning.
+    ``absent``: values for "not known now"; ``unknown``: power states with an unknown meaning, ``*`` any other number.
     ``reads``: how a number or name is written: ``text``, ``hex-digits``, or in binary frames ``little-endian``,
     ``big-endian`` and ``ascii`` (up to a NUL). ``per_hour``: units of lamp time in an hour.
     """
@@ -77,14 +77,15 @@ class Quirks:
     """Special behaviour of a family.
 
     ``prompt``: bytes before a line that mean nothing; ``echo``: what was sent comes back first, any number of times;
-    ``any_case``: upper and lower case are the same; ``quote``: a terminator between two of these does not end the line;
+    ``addressed``: a regular expression for the addresses that may stand before an answer, after its first mark;
+    ``quote``: a terminator between two of these does not end the line;
     ``abnormal_terminator``: in an abnormal state an answer ends in this instead of the terminator. ``ack_first``: every
     message is acknowledged by a line of its own, which is never an answer.
     """
 
     prompt: str = ""
     echo: bool = False
-    any_case: bool = False
+    addressed: str = ""
     quote: str = ""
     abnormal_terminator: bytes = b""
     ack_first: bool = False
@@ -180,14 +181,19 @@ def _frame(table: Table) -> Frame:
 
 
 def _quirks(table: Table) -> Quirks:
+    table.has("any_case")  # of older profiles: case never counts now
     made = Quirks(
         prompt=table.string("prompt", ""),
         echo=table.flag("echo"),
-        any_case=table.flag("any_case"),
+        addressed=table.string("addressed", ""),
         ack_first=table.flag("ack_first"),
         quote=table.string("quote", ""),
         abnormal_terminator=_bytes(table, "abnormal_terminator", table.string("abnormal_terminator", "")),
     )
+    try:
+        re.compile(made.addressed)
+    except re.error as error:
+        raise table.wrong("addressed", f"it is not a regular expression: {error}") from None
     table.finish()
     return made
 

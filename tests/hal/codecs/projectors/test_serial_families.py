@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import random
+import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.codecs.projectors.profiles import parse_profile
@@ -22,6 +24,7 @@ from hal.codecs.projectors.serial_protocol import (
 )
 from hal.codecs.projectors.serial_table import Query, SerialTable
 from hal.errors import ProtocolError
+from hal.values import Power
 
 FOLDER = Path(__file__).parents[4] / "firmware_configs" / "projectors"
 
@@ -76,7 +79,7 @@ def test_every_command_of_nec_bears_the_sum_of_its_bytes() -> None:
         ("benq", "power", b">*pow=?#*pow=off#\r", Answer("off")),
         ("benq", "power", b">*pow=?#\r", Reply.NOTHING),
         ("benq", "power", b">\r", Reply.NOTHING),
-        ("benq", "lamp_hours", b"*LTIM= 1383\r", Answer(" 1383")),
+        ("benq", "lamp_hours", b"*LTIM= 1383\r", Answer("1383")),
         ("benq", "model", b"*Block item#\r", Reply.REFUSED),
         ("christie", "power", b'(PWR!001 "On")', Answer("on")),
         ("christie", "power", b"(PWR!010)", Answer("cooling")),
@@ -151,3 +154,76 @@ def test_no_line_ends_in_anything_but_a_meaning_or_a_protocol_error(
         assert error.theirs  # noqa: PT017 - whether it raises at all depends on the line
         return
     assert isinstance(meaning, Answer | UnaskedMessage | Reply)
+
+
+def letters(text: str, source: random.Random) -> str:
+    return "".join(source.choice((mark.lower(), mark.upper())) for mark in text)
+
+
+def blanks(text: str, source: random.Random) -> str:
+    """With blanks beside each mark that is no letter, figure or control character."""
+    return re.sub(r"([*=#!;])", lambda mark: f"{' ' * source.randrange(3)}{mark[1]}{' ' * source.randrange(3)}", text)
+
+
+DIALECTS = {
+    "epson-escvp21": ("PWR={}\r:", {"00": "off", "01": "on", "02": "warming", "03": "cooling", "05": "fault"}),
+    "optoma-later": ("OK{}\r", {"0": "off", "1": "on"}),
+    "panasonic": ("\x02{}\x03", {"0": "off", "1": "warming", "2": "on", "3": "cooling"}),
+    "panasonic-dz": ("\x02{}\x03", {"0": "off", "1": "warming", "2": "on", "3": "cooling"}),
+    "benq": ("*POW={}#\r", {"ON": "on", "OFF": "off"}),
+    "christie": ('(PWR!{} "Text")', {"0": "off", "1": "on", "10": "cooling", "11": "warming", "23": "unknown"}),
+}
+"""The answer to the question for the power state, and its values, in the makers' documents."""
+ADDRESSES = {
+    "panasonic": ("\x02", ("", "ADZZ;", "AD01;", "adzz;")),
+    "panasonic-dz": ("\x02", ("", "ADZZ;", "AD64;")),
+    "christie": ("(", ("", "65535 00001 ", "00001 ", "0 65535 ")),
+}
+
+
+@pytest.mark.parametrize(("name", "value", "word"), [
+    (name, value, word) for name, (_, values) in DIALECTS.items() for value, word in values.items()
+])  # fmt: skip
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_the_dialects_of_models_that_users_report_are_understood(name: str, value: str, word: str, seed: int) -> None:
+    source = random.Random(seed)
+    digits = value.zfill(source.randrange(6)) if value.isdigit() else value
+    text = blanks(letters(DIALECTS[name][0].format(digits), source), source)
+    mark, addresses = ADDRESSES.get(name, ("", ("",)))
+    text = text.replace(mark, mark + source.choice(addresses), 1) if mark else text
+    query = TABLES[name].queries["power"]
+    sent = query_bytes(TABLES[name], query, "ZZ")
+    assert parse_line(TABLES[name], text.encode("latin-1"), query, sent=sent) == Answer(word)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "meaning"),
+    [
+        ("epson-escvp21", b"err\r:", Reply.REFUSED),
+        ("optoma-later", b"p\r", Reply.ACCEPTED),
+        ("optoma-later", b"info01\r", UnaskedMessage(Power.WARMING, None)),
+        ("panasonic-dz", b"\x02ADZZ;PON\x03", Reply.ACCEPTED),
+        ("panasonic-dz", b"\x02AD01;ER401\x03", Reply.REFUSED),
+        ("benq", b"* POW = ON #\r", Reply.ACCEPTED),
+        ("benq", b"*pow=?#\r", Reply.NOTHING),
+        ("benq", b"*block item#\r", Reply.REFUSED),
+        ("christie", b"(65535 00001 #PWR 1)", Reply.ACCEPTED),
+        ("christie", b'(00001 65535 ERR00005 "Bad")', Reply.REFUSED),
+    ],
+)
+def test_replies_in_a_dialect_are_understood(name: str, line: bytes, meaning: object) -> None:
+    assert parse_line(TABLES[name], line, None, sent=b"\r*pow=?#\r" if name == "benq" else b"") == meaning
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("optoma-later", b"OK12\r"), ("optoma-later", b"OKOK1\r"), ("epson-escvp21", b"PWR=11\r:"),
+        ("panasonic", b"\x0200004\x03"), ("christie", b'(PWR!on "On")'), ("benq", b"*POW=ONE#\r"),
+        ("benq", b"*P O W=ON#\r"),
+    ],
+)  # fmt: skip
+def test_a_dialect_is_no_licence(name: str, line: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        parse_line(TABLES[name], line, TABLES[name].queries["power"])

@@ -61,7 +61,7 @@ def test_lines_mean_what_the_manual_says(line: bytes, meaning: object) -> None:
     assert parse_line(TABLE, line, POWER) == meaning
 
 
-@pytest.mark.parametrize("line", [b"\r", b"OK\r", b"OK2\r", b"OK1200\r", b"PF\r", b"p\r", b"INFO\r", b"\xff\xfe\r"])
+@pytest.mark.parametrize("line", [b"\r", b"OK\r", b"OK2\r", b"OK1200\r", b"PF\r", b"pp\r", b"INFO\r", b"\xff\xfe\r"])
 def test_lines_that_do_not_answer_the_power_question_are_refused(line: bytes) -> None:
     with pytest.raises(ProtocolError) as caught:
         parse_line(TABLE, line, POWER)
