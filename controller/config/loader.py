@@ -13,11 +13,12 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from controller.config.models import AlertsTable, ConfigTable, OpenConfigTable, SolveTable, StageTables
-from controller.config.problems import KeyLines, KeyPath, Place
+from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, read_bytes
 from controller.core.text import printable
 from hal.registry import Driver
+from hal.toml_lines import KeyLines, KeyPath
 
 Tables = TypeVar("Tables", bound=ConfigTable)
 LARGEST_BYTES: Final = 1 << 20

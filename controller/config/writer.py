@@ -16,10 +16,11 @@ import tomlkit.items
 
 from controller.config.loader import parse_stage
 from controller.config.models import StageTables
-from controller.config.problems import KeyLines, KeyPath, Place
+from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
+from hal.toml_lines import KeyLines, KeyPath
 
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 _HEADING: Final = """\

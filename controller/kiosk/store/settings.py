@@ -11,7 +11,7 @@ from typing import Final
 
 from controller.config.loader import FILE, LARGEST_BYTES, parse_stage
 from controller.config.models import StageTables
-from controller.config.problems import KeyLines, Place
+from controller.config.problems import Place
 from controller.config.writer import rewrite_stage
 from controller.core import kiosk_places
 from controller.core.errors import UsageError, VelaturaError
@@ -23,6 +23,7 @@ from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import Checked, check_stage
 from hal.notices import Level, Notice
 from hal.registry import Drivers
+from hal.toml_lines import KeyLines
 
 BEFORE: Final = "stage.toml.before"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from hal.errors import ProtocolError
 from hal.escapes import toml_value
+from hal.toml_lines import KeyLines
 
-_HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(#.*)?")
-_KEY: Final = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*=""")
 _LONGEST: Final = 1 << 20
 
 
@@ -111,7 +109,7 @@ class Table:
 
     def wrong(self, key: str, why: str) -> ProtocolError:
         dotted = ".".join((*self._path, key))
-        return _wrong(self._file, self._line(key), f"{dotted}: {why}")
+        return _wrong(self._file, KeyLines(self._text).line((*self._path, key)), f"{dotted}: {why}")
 
     def _value(self, key: str, kind: type | tuple[type, ...], wanted: str, default: Any) -> Any:
         self._asked.add(key)
@@ -123,29 +121,6 @@ class Table:
         if not isinstance(value, kind) or isinstance(value, bool):
             raise self.wrong(key, f"{toml_value(value)} is not {wanted}")
         return value
-
-    def _line(self, key: str) -> int | None:
-        """The line of ``key``, else the first line of its table (or of the key of its inline table)."""
-        for path in (self._path, self._path[:-1]):
-            if (line := _find(self._text, path, key)) is not None:
-                return line
-            key = path[-1] if path else key
-        return None
-
-
-def _find(text: str, path: tuple[str, ...], key: str) -> int | None:
-    """The line of ``key`` in the table ``path``, else that of the table's header."""
-    header: tuple[str, ...] = ()
-    begins = None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if match := _HEADER.fullmatch(line):
-            header = tuple(part.strip().strip("\"'") for part in match[1].split("."))
-            if header == (*path, key):
-                return number
-            begins = number if header == path else begins
-        elif header == path and (match := _KEY.match(line)) and key in match.groups():
-            return number
-    return begins
 
 
 def _wrong(file: str, line: int | None, why: str) -> ProtocolError:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
 from hal.errors import DeviceError
+from hal.toml_lines import KeyLines, KeyPath
 
 Table = TypeVar("Table")
-Path_ = tuple[str | int, ...]
-_HEADER: Final = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]\]?")
 _ALLOWED: Final = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text in quotes"}
 
 
@@ -96,10 +94,10 @@ def _literal(value: object) -> str:
 
 class _Reader:
     def __init__(self, text: str, file: str) -> None:
-        self._lines = text.splitlines()
+        self._lines = KeyLines(text)
         self._file = file
 
-    def table(self, content: Mapping[str, Any], kind: type[Table], path: Path_) -> Table:
+    def table(self, content: Mapping[str, Any], kind: type[Table], path: KeyPath) -> Table:
         hints = get_type_hints(kind, include_extras=True)
         fields = {field.name: field.default for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         for key in content:
@@ -111,7 +109,7 @@ class _Reader:
         values = {key: self.value(content[key], hints[key], (*path, key)) for key in fields if key in content}
         return kind(**values)
 
-    def value(self, item: Any, hint: Any, path: Path_, limits: Between | OneOf = _ANY_NUMBER) -> Any:
+    def value(self, item: Any, hint: Any, path: KeyPath, limits: Between | OneOf = _ANY_NUMBER) -> Any:
         if get_origin(hint) is Annotated:
             return self.value(item, get_args(hint)[0], path, get_args(hint)[1])
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
@@ -122,7 +120,7 @@ class _Reader:
             return self._sequence(item, get_args(hint), path, limits)
         return self._scalar(item, hint, path, limits)
 
-    def _sequence(self, item: Any, hints: tuple[Any, ...], path: Path_, limits: Between | OneOf) -> tuple[Any, ...]:
+    def _sequence(self, item: Any, hints: tuple[Any, ...], path: KeyPath, limits: Between | OneOf) -> tuple[Any, ...]:
         open_ended = len(hints) == 2 and hints[1] is Ellipsis
         if not isinstance(item, list) or (not open_ended and len(item) != len(hints)) or not item:
             count = "one or more" if open_ended else str(len(hints))
@@ -132,7 +130,7 @@ class _Reader:
             self.value(one, hint, (*path, i), limits) for i, (one, hint) in enumerate(zip(item, each, strict=True))
         )
 
-    def _scalar(self, item: Any, hint: type, path: Path_, limits: Between | OneOf) -> Any:
+    def _scalar(self, item: Any, hint: type, path: KeyPath, limits: Between | OneOf) -> Any:
         if hint is float and isinstance(item, int) and not isinstance(item, bool):
             item = float(item)
         if type(item) is not hint or (isinstance(item, float) and not math.isfinite(item)):
@@ -145,43 +143,10 @@ class _Reader:
             raise self._error("wrong", path, f"is {item}, and must lie between {limits.low:g} and {limits.high:g}")
         return item
 
-    def _error(self, code: str, path: Path_, what: str) -> DeviceError:
+    def _error(self, code: str, path: KeyPath, what: str) -> DeviceError:
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).lstrip(".")
         return DeviceError(
             f"bench-key-{code}",
-            what=f"{self._file}, line {self._line(path)}: the key {key} {what}.",
+            what=f"{self._file}, line {self._lines.line(path)}: the key {key} {what}.",
             remedy="Correct that line, or prepare the stage again.",
         )
-
-    def _line(self, path: Path_) -> int:
-        """Line of the key, or of the table that should hold it; 1-based. tomllib keeps no positions."""
-        best, matched, counts = 1, 0, dict[str, int]()
-        names = [(i, part) for i, part in enumerate(path) if isinstance(part, str)]
-        current: Path_ = ()
-        for number, line in enumerate(self._lines, start=1):
-            header = _HEADER.match(line)
-            if header:
-                current = _position(header.group(2), header.group(1) == "[[", counts)
-                depth = len(current) if path[: len(current)] == current else 0
-                if depth > matched:
-                    best, matched = number, depth
-                continue
-            key = line.partition("=")[0].strip().strip("\"'")
-            for index, part in names:
-                if key == part and path[:index] == current and "=" in line:
-                    return number
-        return best
-
-
-def _position(name: str, is_array: bool, counts: dict[str, int]) -> Path_:
-    """The path of a table header, with the running index of each array of tables it goes through."""
-    if is_array:
-        counts[name] = counts.get(name, -1) + 1
-    path: list[str | int] = []
-    parts = name.split(".")
-    for i, part in enumerate(parts):
-        path.append(part)
-        whole = ".".join(parts[: i + 1])
-        if whole in counts:
-            path.append(counts[whole])
-    return tuple(path)

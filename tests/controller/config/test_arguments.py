@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.config.problems import KeyLines, Place
+from controller.config.problems import Place
 from controller.config.table import allowed, checked_arguments
 from controller.core.errors import UsageError
+from hal.toml_lines import KeyLines
 
 PLACE = Place("stage.toml", KeyLines("a = 0\nb = 0\n"))
 Colour = tuple[float, float, float]

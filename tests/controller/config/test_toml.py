@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.config import toml_text
-from controller.config.problems import KeyLines, KeyPath
+from hal.toml_lines import KeyLines, KeyPath
 
 KEYS = st.text(string.ascii_letters + string.digits + "_- .\"'#[]=é\\\n\t\x00\x7f", min_size=0, max_size=6)
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)

@@ -13,11 +13,12 @@ import pytest
 
 from controller.config.loader import parse_stage
 from controller.config.models import AlertsTable
-from controller.config.problems import KeyLines, Place
+from controller.config.problems import Place
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.alerts import AGAIN_S, GATHER_S, PAUSE_S, Alerts
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
+from hal.toml_lines import KeyLines
 from tests.controller.kiosk.alerts.servers import MailServer, WebServer
 
 MAIL: dict[str, Any] = {"mail_to": ("care@example.org",), "mail_from": "kiosk@example.org", "mail_host": "127.0.0.1"}
