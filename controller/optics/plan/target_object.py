@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from controller.core.arrays import Float64, Mask
 from controller.core.errors import UsageError
-from controller.core.files import LARGEST_MESH, require_regular
 from controller.optics.plan.values import Surface
+from hal.runtime.mesh_file import MeshUnreadable, read_mesh
 
 AXES: Final = {"+x": 0, "+y": 1, "+z": 2, "-x": 3, "-y": 4, "-z": 5}
 BIAS: Final = 1e-4
@@ -129,19 +129,15 @@ def sampled(target_object: TargetObject, count: int, audience_m: Float64, seed: 
 
 
 def _read(path: Path) -> tuple[Float64, npt.NDArray[np.int32]]:
-    trimesh: Any = importlib.import_module("trimesh")
     try:
-        require_regular(path, LARGEST_MESH)
-        mesh = trimesh.load(path, force="mesh", process=False)
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)
-    except OSError as error:
-        raise _unreadable(path, error.strerror or str(error)) from error
-    # Every format's reader has its own errors, and there are thirty of them: to the planner they are one.
-    except Exception as error:
-        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
-    if len(faces) and (not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices)):
-        raise _unreadable(path, "its coordinates or face indices are not valid numbers")
+        mesh = read_mesh(path, coloured=False)
+    except MeshUnreadable as error:
+        raise UsageError(
+            "plan-mesh-unreadable",
+            what=f"The object {path} can't be read as a mesh ({error}).",
+            remedy="Check the file, or export it again as .obj, .ply or .glb.",
+        ) from error
+    vertices, faces = mesh.vertices, mesh.faces
     if len(faces):
         size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
         if not SMALLEST < size < LARGEST:
@@ -168,14 +164,6 @@ def _no_size(path: Path, why: str) -> UsageError:
         "plan-mesh-no-size",
         what=f"The object {path} can't be lit: {why}.",
         remedy="Export it as a surface in metres, or correct [object] height_m, up and front.",
-    )
-
-
-def _unreadable(path: Path, why: str) -> UsageError:
-    return UsageError(
-        "plan-mesh-unreadable",
-        what=f"The object {path} can't be read as a mesh ({why}).",
-        remedy="Check the file, or export it again as .obj, .ply or .glb.",
     )
 
 

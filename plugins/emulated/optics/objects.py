@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from hal.errors import DeviceError
 from hal.runtime.compute import digest_of
-from hal.runtime.files import LARGEST_MESH, require_regular
+from hal.runtime.files import require_regular
+from hal.runtime.mesh_file import MeshUnreadable, read_mesh
 from plugins.emulated.core.truth import SurfaceTruth
 from plugins.emulated.optics.light_cache import read_arrays, users_folder, write_arrays
 from plugins.emulated.optics.shapes import Floats, Rgb, bust, dot, length, paint_bust, paint_solid, paint_vase, vase
@@ -133,28 +134,24 @@ def load_object(path: Path) -> StageObject:
     Its texture or vertex colours (taken as sRGB) become its albedo; without either it is painted procedurally.
     Raises DeviceError ``object-unreadable``, ``object-no-faces`` or ``object-no-size``.
     """
-    import trimesh
-
     try:
-        require_regular(path, LARGEST_MESH)
-        mesh: Any = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
-    except OSError as error:
-        raise _unreadable(path, error.strerror or str(error)) from error
-    # Every format's reader has its own errors, and there are thirty of them: to the technician they are one.
-    except Exception as error:
-        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
-    if faces.ndim != 2 or len(faces) == 0:
+        mesh = read_mesh(path)
+    except MeshUnreadable as error:
+        raise _unreadable(path, str(error)) from error
+    vertices, faces = mesh.vertices, mesh.faces
+    if len(faces) == 0:
         raise DeviceError(
             "object-no-faces",
             what=f"{path} contains no faces, so there is no surface to light.",
             remedy="Export the object as a triangle mesh (.obj or .ply), not as a point cloud.",
         )
-    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise _unreadable(path, "its coordinates or face indices are not valid numbers")
     vertices = _fitted(_with_size(path, vertices, faces), faces)
-    colour = _corner_colours(mesh.visual, faces)
-    return _assembled(vertices, faces, **colour)
+    if mesh.texture is not None:
+        return _assembled(vertices, faces, "texture", corner_values=mesh.uv, texture=_linear(mesh.texture))
+    if mesh.colours is not None:
+        light = mesh.colours if mesh.linear else _linear(np.rint(255 * mesh.colours).astype(np.uint8))
+        return _assembled(vertices, faces, "corners", corner_values=light)
+    return _assembled(vertices, faces, "solid")
 
 
 def _with_size(path: Path, vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
@@ -179,20 +176,6 @@ def _fitted(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
     extent = np.maximum(high - low, 1e-12)
     scale = min(HEIGHT_M / extent[1], WIDTH_M / extent[0], HEIGHT_M / extent[2])
     return np.asarray((vertices - 0.5 * (low + high)) * scale * (1.0, -1.0, -1.0))
-
-
-def _corner_colours(visual: Any, faces: npt.NDArray[np.int32]) -> dict[str, Any]:
-    """What of ``StageObject`` describes the colour of a mesh that trimesh read."""
-    if getattr(visual, "kind", None) == "vertex":
-        colours = _linear(np.asarray(visual.vertex_colors)[:, :3])
-        return {"paint": "corners", "corner_values": colours[faces]}
-    if getattr(visual, "kind", None) == "texture" and visual.uv is not None:
-        material = visual.material
-        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-        if image is not None and min(image.size) > 2:  # trimesh makes up a few grey pixels for a missing file
-            texture = _linear(np.asarray(image.convert("RGB")))
-            return {"paint": "texture", "corner_values": np.asarray(visual.uv, np.float32)[faces], "texture": texture}
-    return {"paint": "solid"}
 
 
 def _assembled(
