@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from typing import Any, Final, TypeVar
 
 from hal.deadline import Deadline
-from hal.errors import DeviceGone, DeviceRefused, PluginError
+from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError, ProtocolError
 from hal.registry import Driver, OpenContext, setting
 from hal.runtime.call_threads import CallThread
 from hal.values import DeviceIdentity
@@ -84,10 +84,17 @@ class OutletSwitch:
         """Switch a channel, and check it; no effect if it is so already. Raises as ``state``, "relay-stuck" too."""
         if self.state(channel, deadline=deadline) is closed:
             return
-        self._run(lambda: self._outlets.set(channel, closed), deadline)
+        lost: DeviceError | None = None
+        try:
+            self._run(lambda: self._outlets.set(channel, closed), deadline)
+        except (DeviceGone, DeviceTimeout, ProtocolError) as error:
+            self._thread.require_open()
+            lost = error  # the answer may be lost, and not the command: the outlet shows which
         patience = deadline.within(self._outlets.settle_s)
         while self.state(channel, deadline=deadline) is not closed:
             if patience.passed:
+                if lost is not None:
+                    raise lost
                 raise DeviceRefused(
                     "relay-stuck",
                     what=f"Channel {channel} of {self._outlets.name} did not switch {'on' if closed else 'off'}.",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import shutil
 import socket
+import socketserver
+import struct
 import subprocess
 import threading
 import time
@@ -201,3 +203,87 @@ def test_silence_ends_at_the_deadline_and_a_cancelled_call_sooner(open_it: Any, 
 def test_wrong_settings_are_found_without_a_device(tmp_path: Path, driver: Any, settings: dict[str, Any]) -> None:
     with pytest.raises(DeviceError):
         driver.check({"address": "127.0.0.1", **settings}, OpenContext(tmp_path))
+
+
+class OddBoard(socketserver.ThreadingTCPServer):
+    """A Modbus board of one coil that misbehaves as real ones do.
+
+    ``late_s``: its coil follows so much later; ``closes``: so many connections are closed before an answer, a write is
+    done all the same; ``refusals``: exception codes of the next answers.
+    """
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), OddLine)
+        self.late_s, self.closes, self.refusals = 0.0, 0, list[int]()
+        self.coil, self.follows_at_s, self.writes = [False, False], 0.0, 0
+
+    def now(self) -> bool:
+        return self.coil[time.monotonic() >= self.follows_at_s]
+
+
+class OddLine(socketserver.BaseRequestHandler):
+    server: OddBoard
+
+    def handle(self) -> None:
+        board = self.server
+        while len(data := self.request.recv(256)) >= 12:
+            function, value = data[7], data[10:12] == b"\xff\x00"
+            refusal = board.refusals.pop(0) if board.refusals else 0
+            if function == 5 and refusal in (0, 5):
+                board.coil, board.writes = [board.now(), value], board.writes + 1
+                board.follows_at_s = time.monotonic() + board.late_s
+            if board.closes:
+                board.closes -= 1
+                return
+            body = data[8:12] if function == 5 else bytes([1, board.now()])
+            body = bytes([function | 0x80, refusal]) if refusal else bytes([function]) + body
+            self.request.sendall(data[:4] + struct.pack(">HB", len(body) + 1, data[6]) + body)
+
+
+@pytest.fixture
+def odd_board(tmp_path: Path) -> Iterator[tuple[OddBoard, PowerSwitch]]:
+    with OddBoard() as board:
+        threading.Thread(target=board.serve_forever, args=(0.02,), daemon=True).start()
+        table = {"address": f"127.0.0.1:{board.server_address[1]}", "channels": 1}
+        switch = modbus_relay.DRIVER.open(table, OpenContext(tmp_path), in_seconds(SOON))
+        assert isinstance(switch, PowerSwitch)
+        yield board, switch
+        switch.close()
+        board.shutdown()
+
+
+@pytest.mark.parametrize(
+    "oddity", [{"late_s": 0.5}, {"refusals": [6]}, {"refusals": [0, 5]}, {"refusals": [0, 6, 6]}, {"closes": 1}]
+)
+def test_a_modbus_board_is_read_back_until_it_has_followed(
+    odd_board: tuple[OddBoard, PowerSwitch], oddity: dict[str, Any]
+) -> None:
+    board, switch = odd_board
+    vars(board).update(oddity)
+    switch.switch(1, True, deadline=in_seconds(SOON))
+    assert switch.state(1, deadline=in_seconds(SOON))
+    assert board.writes == 1
+
+
+def test_a_modbus_command_whose_answer_is_lost_is_sent_once_and_read_back(
+    odd_board: tuple[OddBoard, PowerSwitch],
+) -> None:
+    board, switch = odd_board
+    board.refusals = [6]  # the reading before it is repeated, the closing meets the command
+    assert not switch.state(1, deadline=in_seconds(SOON))
+    board.closes, board.late_s = 2, 0.3
+    switch.switch(1, True, deadline=in_seconds(SOON))
+    assert board.writes == 1
+
+
+@pytest.mark.parametrize(("code", "words"), [(2, "no coil"), (4, "fault"), (6, "busy"), (11, "behind the gateway")])
+def test_a_refusal_of_a_modbus_board_is_told_in_words(
+    odd_board: tuple[OddBoard, PowerSwitch], code: int, words: str
+) -> None:
+    board, switch = odd_board
+    board.refusals = [code] * 9
+    with pytest.raises(DeviceError, match=words) as caught:
+        switch.state(1, deadline=in_seconds(SOON))
+    assert caught.value.code == "outlets-refused"
