@@ -72,9 +72,12 @@ def kept_contrast(
     rng = np.random.default_rng(seed)
     x = np.arange(0.0, LENGTH_PX, 1.0 / SAMPLES)
     kept = np.zeros(len(frequencies))
-    for _ in range(draws):
-        places = rng.uniform(0, 1, len(projectors))
-        phase = 2 * np.pi * (frequencies[:, None] * x + rng.uniform(0, 1, len(frequencies))[:, None])
+    # even steps from the first projector's pixels on: at half a cycle a pixel, what it keeps depends on where they lie
+    turns = rng.uniform(0, 1, len(frequencies)) + np.arange(draws)[:, None] / draws
+    # row by row: a projector lies where it does without those that follow
+    every_place = rng.uniform(0, 1, (len(projectors), draws)).T
+    for turn, places in zip(turns, every_place, strict=True):
+        phase = 2 * np.pi * (frequencies[:, None] * (x - places[0]) + turn[:, None])
         lights = [_light_of(one, place, x) for one, place in zip(projectors, places, strict=True)]
         made = solved(lights, MEAN + FAINT * np.cos(phase), smoothness) @ np.hstack(lights).T
         kept += [_amplitude(*one, x) / FAINT for one in zip(made, phase, strict=True)]
@@ -214,8 +217,10 @@ def _finest_waves(lit: Sequence[Illumination], useful: Sequence[Mask], weight: F
             )
             for n in there
         ]
-        one.append(side_mm / finest_wave(line[:1]))
-        every.append(side_mm / finest_wave(line))
+        alone = finest_wave(line[:1])
+        one.append(side_mm / alone)
+        # coarse projectors that cost the sharpest one some of its contrast can stay dark
+        every.append(side_mm / max(alone, finest_wave(line)))
     return {"wave_mm_one": float(np.median(one)), "wave_mm_all": float(np.median(every))}
 
 

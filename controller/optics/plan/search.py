@@ -50,7 +50,7 @@ def aimed(model: ProjectorModel, mounting_point: MountingPoint, surface: Surface
             return None
         flat = local[:, :2] / local[:, 2:]
         low, high = flat.min(axis=0), flat.max(axis=0)
-        wanted = fill * float(np.min(size / (high - low)))
+        wanted = fill * float(np.min(size / np.maximum(high - low, 1e-12)))  # a sheet is edge-on from some places
         focal = float(np.clip(wanted, model.throw_ratio[0] * size[0], model.throw_ratio[1] * size[0]))
         miss = 0.5 * (low + high) + (centre - middle) / focal
         if np.abs(miss).max() * focal < 0.01:

@@ -17,7 +17,7 @@ from controller.optics.plan.figures import combined_light, figures_of, layout, v
 from controller.optics.plan.optics import lit_by
 from controller.optics.plan.plan_file import EXAMPLE, PlanTables, read_plan
 from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_placements
-from controller.optics.plan.target_object import TargetObject, read_target_object, sampled, seen_from
+from controller.optics.plan.target_object import AudienceView, TargetObject, read_target_object, sampled, seen_from
 from controller.optics.plan.values import Placement, PlanGoal, Surface
 from controller.run.progress import Reporter, Tracker
 from controller.stage.report.page import Goal, Page, ReportPicture, render
@@ -90,9 +90,10 @@ def _page(
     galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]
     for number, eye in enumerate(audience):
         name = "from the audience" if len(audience) == 1 else f"from the audience's place {number + 1}"
-        galleries.append(
-            (f"Light and detail on the object, seen {name}", "", _maps(target_object, eye, placements, goal))
-        )
+        view = seen_from(target_object, eye, rows=VIEW_ROWS)
+        maps = _maps(target_object, view, placements, goal) if view.mask.any() else ()
+        note = "" if maps else "From there the object is edge-on: no surface of it is visible."
+        galleries.append((f"Light and detail on the object, seen {name}", note, maps))
     return Page(
         title=f"Plan for {Path(tables.object.mesh).stem}",
         summary=f"{len(placements)} projectors in {places} places; {best.tried} sets compared. "
@@ -141,9 +142,8 @@ def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _maps(
-    target_object: TargetObject, eye: Float64, placements: list[Placement], goal: PlanGoal
+    target_object: TargetObject, view: AudienceView, placements: list[Placement], goal: PlanGoal
 ) -> tuple[ReportPicture, ...]:
-    view = seen_from(target_object, eye, rows=VIEW_ROWS)
     lit = [lit_by(placement, view.surface, target_object) for placement in placements]
     useful = np.stack([values.useful(goal.steepest_degrees) for values in lit])
     found = combined_light(lit, useful)

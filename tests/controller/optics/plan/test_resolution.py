@@ -35,6 +35,19 @@ def test_one_projector_ends_at_half_a_cycle_and_three_sharp_ones_go_on() -> None
     assert finest_wave([blurred] * 3) / finest_wave([blurred]) < 1.2
 
 
+@pytest.mark.parametrize(
+    ("alone", "coarse"),
+    [((0.67, 1.86), (1.45, 0.5, 1.53)), ((0.45, 0.73), (1.69, 0.43, 0.28)), ((0.45, 1.49), (2.52, 0.48, 0.56))],
+)
+def test_a_coarse_projector_beside_a_sharp_one_makes_no_wave_coarser(
+    alone: tuple[float, float], coarse: tuple[float, float, float]
+) -> None:
+    sharp = LineProjector(1.0, *alone)
+    first, both = finest_wave([sharp]), finest_wave([sharp, LineProjector(*coarse)])
+    assert first <= 0.5
+    assert both >= first
+
+
 @settings(max_examples=5, deadline=None)
 @given(st.floats(0.2, 0.7), st.floats(1.2, 4.0))
 def test_more_projectors_lose_no_contrast_and_more_blur_gains_none(blur_px: float, light: float) -> None:
