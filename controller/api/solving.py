@@ -81,9 +81,11 @@ def solve(
 ) -> Solution:
     """The projectors' pictures that make the camera see ``target`` (paper 2.2 to 2.4, eqs 2 and 3).
 
-    Minimises  sum over camera pixels of w |T p + K - C|^2  +  s sum over adjacent projector pixels of
+    Minimises  sum over camera pixels of the object of w |T p + K - C|^2  +  s sum over adjacent projector pixels of
     a^2 (p_i - p_j)^2   with 0 <= p <= 1.  K is ``black``, C ``target``, w ``weights``; a is small where the target has
-    an edge; s is ``smoothness`` times the mean diagonal of the data's majoriser.
+    an edge; s is ``smoothness`` times the mean diagonal of the data's majoriser. Pixels of the object are those of
+    ``transport.object_mask``; with ``transport_from_matrices`` those that some projector lights. The light wanted at
+    other pixels counts for nothing, in ``objective`` neither.
 
     Parameters
     ----------

@@ -73,6 +73,18 @@ def test_without_smoothness_the_solve_is_bounded_least_squares() -> None:
     np.testing.assert_allclose(solution.frames[0].reshape(-1, 3), wanted, atol=5e-4)
 
 
+def test_the_objective_is_the_squared_error_of_the_camera_pixels_that_have_light() -> None:
+    A = spots(1).toarray()
+    lit = np.arange(A.shape[0]) % CAMERA[0] >= 10
+    A[~lit] = 0
+    transport = api.transport_from_matrices([A], CAMERA, [PROJECTOR])
+    target = np.random.default_rng(7).random((CAMERA[1], CAMERA[0], 3))
+    solution = api.solve(transport, target, smoothness=0)
+    error = (A @ solution.frames[0].reshape(-1, 3) - target.reshape(-1, 3)) ** 2
+    assert solution.objective == pytest.approx(float(error[lit].sum()), rel=1e-3)
+    np.testing.assert_array_equal(transport.object_mask.ravel(), lit)
+
+
 def test_weights_and_black_are_those_of_the_least_squares() -> None:
     A, random = spots(1), np.random.default_rng(8)
     transport = api.transport_from_matrices([A], CAMERA, [PROJECTOR])

@@ -94,7 +94,8 @@ class Solution:
     """Result of a solve.
 
     ``frames``: one (rows, columns, 3) float32 linear image a projector, in [0, 1]
-    ``objective``: weighted squared residual plus smoothness, in camera units squared
+    ``objective``: weighted squared residual plus smoothness, in camera units squared. The residual is of the pixels
+    of ``transport.object_mask`` alone: what is wanted beside them adds the same to every solution
     ``kkt``: rms of the last projected, scaled gradient step, in units of projector light; 0 at the optimum
     ``converged``: the KKT residual fell below the tolerance before the cap on iterations
     """
