@@ -21,6 +21,8 @@ PICTURE: Final = "verification.png"
 """The map of errors and their reasons, the projectors in rows of ``ACROSS``."""
 ACROSS: Final = 3
 """A screen is wider than high."""
+LEGEND: Final = 0.5
+"""More than the height of a projector's legend, by its width."""
 FIGURES: Final = "verification.json"
 BEFORE, RESOLUTION = "before.png", "resolution.png"
 """Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
@@ -50,9 +52,15 @@ def in_rows(pictures: Sequence[ByteImage]) -> ByteImage:
     return np.concatenate(rows, axis=0)
 
 
-def parts_of(picture: ByteImage, count: int) -> list[ByteImage]:
-    """The ``count`` pictures that ``in_rows`` has put together."""
+def parts_of(picture: ByteImage, count: int, camera: tuple[int, ...]) -> list[ByteImage]:
+    """The ``count`` pictures that ``in_rows`` has put together, each as high as wide as ``camera`` (rows, columns), or
+
+    higher by a legend. Before 0.2.0 they were all below each other.
+    """
     across = min(ACROSS, count)
+    height = len(picture) / -(-count // across) / (picture.shape[1] / across)
+    if height > camera[0] / camera[1] + LEGEND:
+        across = 1
     rows = np.split(picture, -(-count // across), axis=0)
     return [np.ascontiguousarray(one) for row in rows for one in np.split(row, across, axis=1)][:count]
 

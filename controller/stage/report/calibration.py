@@ -89,7 +89,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
              (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
-            *causes_gallery(run, figures["verification"]),
+            *causes_gallery(run, figures["verification"], calibration.object_mask.shape),
             *light_gallery(calibration, crop),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures, when)),
         ),

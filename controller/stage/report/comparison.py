@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 
-from controller.core.arrays import ByteImage
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.run.journal import Journal
@@ -34,7 +32,15 @@ from controller.stage.report.page import (
     refined_row,
     write_report,
 )
-from controller.stage.report.pictures import crop_around, encoded, error_picture, fitted, sharpness_picture, to_screen
+from controller.stage.report.pictures import (
+    crop_around,
+    encoded,
+    error_picture,
+    fitted,
+    read_picture,
+    sharpness_picture,
+    to_screen,
+)
 from controller.stage.report.words import When, moment, spent
 from controller.stage.steps.appearance.compare import compared_mask
 
@@ -171,15 +177,10 @@ def _row(run: Path, one: Compared, zone: tzinfo | None) -> PictureRow:
     )
     pictures = []
     for kind, caption, note in _SHOWN:
-        path = picture_path(run, one.name, kind)
-        image = cv2.imread(str(path)) if path.exists() else None
+        image = read_picture(picture_path(run, one.name, kind))
         if image is not None:
-            pictures.append(ReportPicture(caption, _rgb(image), note))
+            pictures.append(ReportPicture(caption, image, note))
     return PictureRow(one.title, nearness(one.delta_e00_median, one.reachable_share), tuple(known), tuple(pictures))
-
-
-def _rgb(image: Any) -> ByteImage:
-    return np.ascontiguousarray(image[..., ::-1], np.uint8)
 
 
 def _beside(

@@ -183,7 +183,7 @@ def _page(
         goals=_goals(judged, figures),
         rows=rows,
         galleries=(
-            *causes_gallery(run, figures["verification"]),
+            *causes_gallery(run, figures["verification"], calibration.object_mask.shape),
             *light_gallery(calibration, crop),
             _frames_gallery(judged, checked),
         ),

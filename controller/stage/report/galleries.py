@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 
 from controller.core import channels
@@ -15,7 +14,7 @@ from controller.optics.calibrate.values import Calibration
 from controller.stage.artefacts.grade import PICTURE, parts_of
 from controller.stage.report import plots
 from controller.stage.report.page import Gallery, ReportPicture
-from controller.stage.report.pictures import Crop, to_screen
+from controller.stage.report.pictures import Crop, read_picture, to_screen
 
 SHOWN: Final = 3
 """Reasons of a projector, the most important first."""
@@ -25,14 +24,15 @@ TEXT: Final = (
 )
 
 
-def causes_gallery(run: Path, verification: Mapping[str, Any]) -> tuple[Gallery, ...]:
+def causes_gallery(run: Path, verification: Mapping[str, Any], camera: tuple[int, ...]) -> tuple[Gallery, ...]:
     """One picture for each projector of the graded ``run``; nothing for a run from before there was such a map.
 
-    ``verification``: ``read_grade_figures(run)``
+    ``verification``: ``read_grade_figures(run)``; ``camera``: (rows, columns) of its picture
     """
-    whole = cv2.imread(str(run / PICTURE))
+    whole = read_picture(run / PICTURE)
     if whole is None:
         return ()
+    parts = parts_of(whole, len(verification), camera)
     pictures = tuple(
         ReportPicture(
             f"{name}: {100 * row['relative_rms']:.2f} % error",
@@ -40,9 +40,7 @@ def causes_gallery(run: Path, verification: Mapping[str, Any]) -> tuple[Gallery,
             large=True,
             points=tuple(reason["sentence"] for reason in row.get("reasons", [])[:SHOWN]),
         )
-        for (name, row), part in zip(
-            verification.items(), parts_of(np.asarray(whole[..., ::-1], np.uint8), len(verification)), strict=True
-        )
+        for (name, row), part in zip(verification.items(), parts, strict=True)
     )
     return (("Where the calibration has errors, and why", TEXT, pictures),)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +30,14 @@ class Crop:
 
     rows: slice
     columns: slice
+
+
+def read_picture(path: Path) -> ByteImage | None:
+    """(rows, columns, 3) uint8 RGB of a picture of a run; None if it is missing or damaged."""
+    # not by cv2.imread, which ends the program where a folder's name is not UTF-8
+    data = np.frombuffer(path.read_bytes(), np.uint8) if path.exists() else np.zeros(0, np.uint8)
+    decoded: Any = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    return None if decoded is None else np.asarray(decoded, np.uint8)
 
 
 def crop_around(mask: Mask, *, margin: float = 0.04) -> Crop:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from controller.core.errors import UsageError
 from controller.stage.artefacts.comparison import COMPARE
+from controller.stage.artefacts.grade import read_grade_figures
 from controller.stage.artefacts.names import REPORT_FIGURES, run_kind
 from controller.stage.report.calibration import StageDescription, graded_runs, write_calibration_report
 from controller.stage.sessions.calibrations import worst_grade
@@ -34,8 +35,9 @@ def report_of(where: Path, out: Path | None) -> Mapping[str, str]:
 
 
 def calibration_report(run: Path, checked: Checked, out: Path | None = None) -> Path:
-    """As ``write_calibration_report``, for a run of this stage."""
-    asked = StageDescription(checked.stage.tables.stage.name, checked.names, worst_grade(checked), time_zone(checked))
+    """As ``write_calibration_report``, for a run of this stage, with the projectors that the run had."""
+    names = tuple(read_grade_figures(run)) or checked.names
+    asked = StageDescription(checked.stage.tables.stage.name, names, worst_grade(checked), time_zone(checked))
     return write_calibration_report(run, asked, out)
 
 
