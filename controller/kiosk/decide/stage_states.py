@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from controller.kiosk.decide.interfaces import Condition, ProjectorView
+from controller.kiosk.decide.interfaces import DISK_FULL, Condition, ProjectorView
 from controller.kiosk.store.event_log import EventLog
 from controller.run.state_machine import Event, Machine, State
 from hal.notices import Level, Notice
@@ -160,5 +160,9 @@ def _without_light(names: Collection[str]) -> str:
 
 
 def _reasons(views: Sequence[ProjectorView]) -> str:
-    # One reason that all have is said once.
-    return " ".join(dict.fromkeys(view.problem.text for view in views if view.problem is not None))
+    """What is wrong, the disk first; a remedy that several problems have is said once."""
+    problems = [view.problem for view in views if view.problem is not None]
+    by_remedy: dict[str, list[str]] = {}
+    for problem in sorted(problems, key=lambda one: one.code != DISK_FULL):
+        by_remedy.setdefault(problem.remedy, []).append(problem.what)
+    return " ".join(" ".join([*dict.fromkeys(whats), remedy]).strip() for remedy, whats in by_remedy.items())

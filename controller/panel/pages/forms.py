@@ -26,9 +26,10 @@ from controller.kiosk.values import NewTarget
 from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
+from controller.panel.pages.drawing import flags
 from controller.panel.pages.routes import Pages
 from controller.panel.words.days import canonical
-from controller.panel.words.language import gettext
+from controller.panel.words.language import gettext, mark
 
 MOST_FIELDS = 2000
 _COLUMNS: Final = tuple(HoursRow.model_fields)
@@ -46,6 +47,8 @@ LEADS_TO: Final = {
     "save-settings": "/settings",
 }
 """The operations that have a form, and the page to show afterwards."""
+WHEN_LIT: Final = mark("{name} is chosen. It is shown when the lamps are lit.")
+ALL_WHEN_LIT: Final = mark("All appearances are shown in turn when the lamps are lit.")
 Handler = Callable[[Request, Visitor, "Sent"], Awaitable[Response]]
 
 
@@ -95,10 +98,15 @@ class Forms:
                 self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
-            visitor.session.notes.append(("good", gettext(operation.done).format_map(values)))
+            visitor.session.notes.append(("good", gettext(self._done(operation)).format_map(values)))
             return RedirectResponse("/" if back == "/" else _then(operation, result, values), 303)
 
         return answer
+
+    def _done(self, operation: Operation) -> str:
+        if operation.name in ("play", "rotate") and "plays" not in flags(self._panel.kiosk.snapshot()):
+            return WHEN_LIT if operation.name == "play" else ALL_WHEN_LIT
+        return operation.done
 
     async def _question(self, operation: Operation, values: Values) -> str:
         """What a person has to agree to first, or nothing."""

@@ -57,6 +57,15 @@ def test_the_picture_is_made_darker_black_and_followed_by_the_next(fresh: Served
             expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
 
 
+def test_what_is_chosen_is_not_said_to_play_while_the_lamps_are_dark(fresh: Served) -> None:
+    kiosk_of(fresh).change(state="powering", playing="")
+    with fresh.entered("otto") as otto:
+        sent = {"csrf": csrf(otto.get("/").text), "name": "warm wood", "back": "/"}
+        kiosk_of(fresh).play = lambda name, fade_s=None: None  # type: ignore[method-assign]
+        otto.post("/do/play", data=sent)
+        assert "warm wood is chosen. It is shown when the lamps are lit." in otto.get("/").text
+
+
 def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served, browser: Browser) -> None:
     out = io.BytesIO()
     Image.new("RGB", (240, 160), "white").save(out, "PNG")

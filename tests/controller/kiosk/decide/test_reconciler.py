@@ -142,6 +142,17 @@ def test_a_degraded_stage_says_what_is_wrong_now_not_what_was_wrong_first(kiosk:
     kiosk.run_until(State.PLAYING)
 
 
+def test_a_remedy_that_several_have_is_said_once(kiosk: Kiosk) -> None:
+    kiosk.run_until(State.PLAYING)
+    for name in ("left", "right"):
+        kiosk.lamps[name].trouble = "silent"
+        kiosk.gone.add(name)
+    kiosk.run_until(State.DEGRADED)
+    kiosk.run(60)
+    reason = kiosk.reconciler.machine.reason
+    assert (reason.count("Plug it in."), "left" in reason, "right" in reason) == (1, True, True)
+
+
 def test_a_lamp_that_never_lights_is_struck_three_times_and_left_alone_until_somebody_opens_again(kiosk: Kiosk) -> None:
     kiosk.lamps["left"].dud = True
     kiosk.run_until(State.DEGRADED, within_s=300)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from controller.kiosk.interface import BundleIdentity, EventRow, Job, JobStep, KioskState, NextEvent
+from controller.kiosk.interface import BundleIdentity, DeviceRow, EventRow, Job, JobStep, KioskState, NextEvent
 from controller.panel.pages.drawing import EVENTS_SHOWN, STATES, Drawing
 from controller.run.state_machine import State
 
@@ -33,6 +33,30 @@ def test_every_state_of_the_machine_has_words() -> None:
     assert {one.value for one in State} == set(STATES)
     parts = Drawing().parts(state(state="unheard of"), [])
     assert "unheard of" in parts["top"]
+
+
+def test_each_cause_has_one_line_with_its_advice_once_and_the_disk_comes_first() -> None:
+    cable, full = "Check its cable.", "Remove files."
+    rows = (
+        DeviceRow("camera", "camera", "ptp", (), "It is not connected.", "Plug it in."),
+        DeviceRow("left", "projector", "serial", (), "It does not answer.", cable),
+        DeviceRow("middle", "projector", "serial", (), "The lamp failed.", "Replace the lamp."),
+        DeviceRow("right", "projector", "serial", (), "It does not answer.", cable),
+        DeviceRow("disk", "disk", "", (), "The disk is full.", full),
+        DeviceRow("display", "display", "player"),
+    )
+    shown = state(devices=rows, state="degraded", reason=f"left: It does not answer. {cable}", playing="wood")
+    top = Drawing().parts(shown, [])["top"]
+    assert [top.count(text) for text in (cable, full, "It does not answer.")] == [1, 1, 1]
+    places = [top.index(text) for text in ("disk:", "left, right:", "middle:", "camera:")]
+    assert places == sorted(places)
+    assert cable not in Drawing().parts(shown, [])["devices"]
+
+
+def test_nothing_is_said_to_play_while_nothing_does() -> None:
+    assert "Nothing plays" in Drawing().parts(state(state="degraded", playing=""), [])["top"]
+    assert "Playing with problems" in Drawing().parts(state(state="degraded", playing="wood"), [])["top"]
+    assert "Nothing plays" not in Drawing().parts(state(state="degraded", black=True), [])["top"]
 
 
 def test_times_are_those_of_the_stage() -> None:
