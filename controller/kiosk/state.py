@@ -5,8 +5,9 @@ Any text may come from a device or a file, so it is untrusted: escape it where i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 EventLevel = Literal["info", "warning", "error"]
 
@@ -206,3 +207,27 @@ class KioskState:
     brightness: float = 100.0
     drifts: tuple[DriftCheck, ...] = ()
     dose_klx_h: float | None = None
+
+
+_WORST: Final = ("disk", "display", "projector")
+
+
+def troubles(devices: Iterable[DeviceRow]) -> list[tuple[str, str, str]]:
+    """Problems of devices, worst first: names, problems, and the remedy; one line for each remedy.
+
+    First the disk, without which nothing can be kept, then what takes the whole picture away, then the most devices.
+    """
+    groups: dict[tuple[str, str], list[DeviceRow]] = {}
+    for row in devices:
+        if row.problem is not None:
+            groups.setdefault((row.kind, row.remedy or row.problem), []).append(row)
+    rank = {kind: number for number, kind in enumerate(_WORST)}
+    ordered = sorted(groups.values(), key=lambda rows: (rank.get(rows[0].kind, len(rank)), -len(rows)))
+    return [
+        (
+            ", ".join(row.name for row in rows),
+            " ".join(dict.fromkeys(row.problem or "" for row in rows)),
+            rows[0].remedy,
+        )
+        for rows in ordered
+    ]

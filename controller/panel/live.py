@@ -10,7 +10,8 @@ from typing import Final
 
 import anyio
 
-KEEP_ALIVE_S: Final = 15.0
+KEEP_ALIVE_S: Final = 2.0
+"""A page that hears nothing for three times as long says so."""
 QUEUED: Final = 8
 AGAIN_S: Final = 1.0
 """Pause after a failed rendering."""
@@ -114,7 +115,7 @@ class Hub:
                 try:
                     yield await asyncio.wait_for(queue.get(), KEEP_ALIVE_S)
                 except TimeoutError:
-                    yield ": still here\n\n"
+                    yield "event: still\ndata: {}\n\n"
         finally:
             self._listeners.pop(queue, None)
 

@@ -14,6 +14,7 @@ from controller.config.writer import toml_text
 from controller.core.text import printable
 from controller.kiosk.interface import FoundDevice, TriedDevice
 from controller.kiosk.service import Service
+from controller.kiosk.state import troubles
 from controller.run.progress import Silent
 from controller.stage.doctor.examine import Tools, examine
 from controller.stage.doctor.values import Examination
@@ -45,11 +46,9 @@ class Examinations:
 
 
 def findings(stage: Path, service: Service | None, *, tools: Tools | None = None) -> Sequence[Notice]:
-    """Problems of the devices, the player, the disk and the buses."""
-    problems = []
-    for row in () if service is None else service.rows():
-        if row.problem is not None:
-            problems.append(Notice("", row.problem, row.remedy, Level.ERROR, f"{row.kind} {row.name}"))
+    """Problems of the disk, the devices, the player and the buses, worst first, and what was examined."""
+    rows = () if service is None else (service.disk.row, *service.rows())
+    problems = [Notice("", what, remedy, Level.ERROR, names) for names, what, remedy in troubles(rows)]
     if service is not None:
         player = service.player.view
         problems += [
@@ -59,10 +58,14 @@ def findings(stage: Path, service: Service | None, *, tools: Tools | None = None
         problems.append(Notice.warning("disk-low", "Less than 2 GiB are free on the stage's disk.",
                                        "Delete old runs or backups. Playback continues; calibration may fail.",
                                        about="disk"))  # fmt: skip
-    for found in _search(tools).findings:
+    searched = _search(tools)
+    for found in searched.findings:
         problems.append(Notice.warning(found.code, printable(found.what), printable(found.remedy),
                                        about=printable(found.about or "bus")))  # fmt: skip
-    return problems
+    problems.sort(key=lambda notice: notice.level is not Level.ERROR)
+    names = ", ".join((*(row.name for row in rows), "player", "ports", "network", "USB", "outputs"))
+    what = f"{names}. Devices there: {', '.join(printable(one.what) for one in searched.found) or 'none'}."
+    return [*problems, Notice("examined", what, "", about="Examined")]
 
 
 def _search(tools: Tools | None) -> Examination:

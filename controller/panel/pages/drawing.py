@@ -14,7 +14,8 @@ from typing import Any, Final
 import jinja2
 
 from controller.core.text import duration
-from controller.kiosk.interface import DeviceRow, EventRow, KioskState
+from controller.kiosk.interface import EventRow, KioskState
+from controller.kiosk.state import troubles
 from controller.panel.pages import curves
 from controller.panel.words import days, figures, spoken
 from controller.panel.words.language import LANGUAGES, gettext, language, mark, ngettext
@@ -62,28 +63,6 @@ def flags(state: KioskState) -> frozenset[str]:
 def holds(condition: str, now: frozenset[str]) -> bool:
     """Whether ``condition``, "open !busy", is true; as in the page's script."""
     return all((word[1:] not in now) if word.startswith("!") else word in now for word in condition.split())
-
-
-def troubles(state: KioskState) -> list[tuple[str, str, str]]:
-    """What is wrong with devices, worst first: names, what it is, and what to do; one line for each remedy.
-
-    First the disk, without which nothing else can be kept, then what takes the whole picture away, then the most
-    devices.
-    """
-    worst = ("disk", "display", "projector")
-    rows = [row for row in state.devices if row.problem is not None]
-    groups: dict[tuple[str, str], list[DeviceRow]] = {}
-    for row in rows:
-        groups.setdefault((row.kind, row.remedy or row.problem or ""), []).append(row)
-    ordered = sorted(
-        groups.values(),
-        key=lambda group: (worst.index(group[0].kind) if group[0].kind in worst else len(worst), -len(group)),
-    )
-    return [
-        (", ".join(row.name for row in group), " ".join(dict.fromkeys(row.problem or "" for row in group)),
-         group[0].remedy)
-        for group in ordered
-    ]  # fmt: skip
 
 
 def around(state: KioskState) -> list[dict[str, Any]]:

@@ -63,23 +63,36 @@
   }
 
   function say(text) {
-    if (link) link.textContent = text;
+    if (link && link.textContent !== text) link.textContent = text;
+  }
+
+  const LATE_MS = 6000;
+  let heard = Date.now();
+
+  function hear() {
+    heard = Date.now();
+    say("");
   }
 
   function listen() {
     const source = new EventSource(body.dataset.live);
-    source.addEventListener("open", () => say(""));
-    source.addEventListener("parts", (event) => draw(JSON.parse(event.data)));
-    source.addEventListener("reload", () => { source.close(); listen(); });
+    heard = Date.now();
+    source.addEventListener("open", hear);
+    source.addEventListener("still", hear);
+    source.addEventListener("parts", (event) => { hear(); draw(JSON.parse(event.data)); });
+    // A server that hangs, or a network that is gone, ends no stream.
+    const watch = setInterval(() => { if (Date.now() - heard > LATE_MS) say(body.dataset.lost); }, 1000);
+    source.addEventListener("reload", () => { clearInterval(watch); source.close(); listen(); });
     source.addEventListener("full", () => say(body.dataset.full));
     source.addEventListener("error", () => {
       say(body.dataset.lost);
       if (source.readyState === EventSource.CLOSED) {
         // Refused: the session has ended, or the service is starting.
+        clearInterval(watch);
         setTimeout(async () => {
           try {
             const answer = await fetch(body.dataset.live, { method: "HEAD", redirect: "manual" });
-            if (answer.status === 401 || answer.type === "opaqueredirect") { location.assign("/login"); return; }
+            if (answer.status === 401 || answer.type === "opaqueredirect") { keep(); location.assign("/login"); return; }
           } catch { /* not reachable yet */ }
           listen();
         }, 1000);
@@ -135,15 +148,51 @@
   addEventListener("resize", reachable);
   reachable();
 
+  // What was typed outlives the session: it is kept in this tab until its page is open again.
+  const changed = (field) => !["password", "hidden", "file"].includes(field.type) && (["checkbox", "radio"].includes(field.type)
+    ? field.checked !== field.defaultChecked : field.value !== (field.defaultValue ?? [...field.options].find((one) => one.defaultSelected)?.value));
+  const fields = () => [...document.querySelectorAll("main input, main textarea, main select")];
+  function keep() {
+    const typed = fields().map((field, at) => [at, field.name, field.checked, field.value, field]).filter((row) => changed(row[4]));
+    if (!typed.length) return;
+    sessionStorage.setItem("typed", JSON.stringify({ path: location.pathname, who: body.dataset.who, rows: typed.map((row) => row.slice(0, 4)) }));
+  }
+  function restore() {
+    const typed = JSON.parse(sessionStorage.getItem("typed") ?? "null");
+    if (!typed) return;
+    if (body.dataset.entrance) { sessionStorage.setItem("typed", JSON.stringify({ ...typed, entered: true })); return; }
+    if (!body.dataset.live) return;
+    sessionStorage.removeItem("typed");
+    // Without a log-in in between the form was taken.
+    if (!typed.entered || typed.who !== body.dataset.who) return;
+    if (typed.path !== location.pathname) {
+      if (typed.led) return;
+      sessionStorage.setItem("typed", JSON.stringify({ ...typed, led: true }));
+      location.replace(typed.path);
+      return;
+    }
+    const now = fields();
+    for (const [at, name, checked, value] of typed.rows) {
+      if (now[at] && now[at].name === name) Object.assign(now[at], ["checkbox", "radio"].includes(now[at].type) ? { checked } : { value });
+    }
+    const note = document.createElement("p");
+    note.className = "note";
+    note.setAttribute("role", "status");
+    note.textContent = body.dataset.kept;
+    document.getElementById("main").prepend(note);
+  }
+
   // A second press before the first one is answered would start the job twice.
   document.addEventListener("submit", (event) => {
     if (event.target.dataset.sent) { event.preventDefault(); return; }
     event.target.dataset.sent = "yes";
+    if (body.dataset.live && event.target.closest("main")) keep();
     setTimeout(() => delete event.target.dataset.sent, 3000);
   });
 
   const here = document.querySelector("nav.pages [aria-current]");
   if (here) here.parentElement.scrollLeft = here.offsetLeft - 24;
 
+  restore();
   if (body.dataset.live) { follow(); listen(); setInterval(look, 2000); }
 })();

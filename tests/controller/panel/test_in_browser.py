@@ -15,11 +15,12 @@ from playwright.sync_api import Browser, Page, expect
 
 from controller.kiosk.interface import BundleIdentity, Grade
 from controller.kiosk.store.accounts import Accounts
+from controller.panel import live
 from controller.panel.pages.routes import NAVIGATION
 from hal.notices import Notice
 from tests.controller.panel.browser import SHELL, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import TOML, MemoryKiosk
-from tests.controller.panel.served import QUICK_HASH, Served, served
+from tests.controller.panel.served import PASSWORD, QUICK_HASH, Served, served
 from tests.ports import kept_port
 
 pytestmark = pytest.mark.skipif(
@@ -107,6 +108,42 @@ def test_a_new_appearance_comes_to_open_pages_and_is_announced_until_it_plays(fr
         page.locator("#made").get_by_role("button", name="Play now").click()
         expect(page.get_by_text("herbst is ready.")).to_be_hidden()
         expect(page.get_by_role("button", name="Show herbst")).to_have_attribute("aria-pressed", "true")
+
+
+def test_a_server_that_hangs_is_told_within_seconds(
+    fresh: Served, browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        expect(page.get_by_text("No connection, trying again")).to_be_hidden()
+        monkeypatch.setattr(live, "KEEP_ALIVE_S", 60.0)
+        expect(page.get_by_text("No connection, trying again")).to_be_visible(timeout=12_000)
+
+
+def test_what_was_typed_is_there_again_after_a_session_that_ended(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "tina")
+        page.goto("/settings")
+        page.locator("#text").fill("[stage]\nname = 'half written'\n")
+        fresh.app.state.panel.sessions.end_all("tina")
+        page.wait_for_url("**/login")
+        page.get_by_label("Name").fill("tina")
+        page.get_by_label("Password").fill(PASSWORD)
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/settings")
+        expect(page.locator("#text")).to_have_value("[stage]\nname = 'half written'\n")
+        expect(page.get_by_text("What you typed is here again.")).to_be_visible()
+        fresh.app.state.panel.sessions.end_all("tina")
+        page.get_by_role("button", name="Check", exact=True).click()
+        page.goto("/login")
+        page.get_by_label("Name").fill("tina")
+        page.get_by_label("Password").fill(PASSWORD)
+        page.get_by_role("button", name="Log in").click()
+        page.wait_for_url("**/settings")
+        expect(page.locator("#text")).to_have_value("[stage]\nname = 'half written'\n")
+        page.get_by_role("button", name="Check", exact=True).click()
+        page.goto("/settings")
+        expect(page.get_by_text("What you typed is here again.")).to_be_hidden()
 
 
 def test_a_reload_in_the_middle_of_a_job_loses_nothing(slow: Served, browser: Browser) -> None:
@@ -272,8 +309,11 @@ def test_first_start_leads_from_the_one_time_password_to_a_stage(tmp_path: Path,
         page.get_by_label("Password").fill(password)
         page.get_by_role("button", name="Log in").click()
         page.wait_for_url("**/password")
+        expect(page.get_by_role("navigation")).to_have_count(0)
         page.goto("/settings")
         page.wait_for_url("**/password")
+        time.sleep(1.2)
+        expect(page.get_by_text("No connection")).to_be_hidden()
         page.get_by_label("New password, 10 characters or more").fill("seven tall horses")
         page.get_by_label("New password again").fill("seven tall horses")
         page.get_by_role("button", name="Change").click()

@@ -125,7 +125,9 @@ def test_a_device_that_vanishes_or_is_in_use_is_told_in_words(tmp_path: Path) ->
 
 def test_what_is_wrong_on_a_bus_is_told_in_harmless_words_without_a_service(tmp_path: Path) -> None:
     problem = Notice.warning("no-rights", f"No rights for {HOSTILE}.", "Install the udev rules.")
-    (found,) = findings(tmp_path, None, tools=Bus(camera(problems=(problem,))).tools)
+    found, examined = findings(tmp_path, None, tools=Bus(camera(problems=(problem,))).tools)
+    assert examined.what.startswith("player, ports, network, USB, outputs. Devices there: ")
+    assert examined.level == "info"
     assert found.level == "warning"
     assert found.what.isprintable()
     assert found.remedy == "Install the udev rules."
