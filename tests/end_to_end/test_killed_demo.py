@@ -16,6 +16,7 @@ from tests.end_to_end.program import REPOSITORY, Command, lamps, processes_on
 pytestmark = pytest.mark.timeout(600)
 
 
+@pytest.mark.long
 def test_a_killed_demos_bench_ends_by_itself_and_the_same_command_goes_on(prepared_once: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(prepared_once, tmp_path / "out"))
     with_ports_of_its_own(out / "stage")

@@ -11,7 +11,7 @@ from tests.campaigns.mini_stage import prepare_mini
 from tests.campaigns.wired_kiosk import tether
 from tests.end_to_end.program import Command, velatura, wrong_code
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 PULLED_AT_S = range(4, 240, 6)
 
 

@@ -21,7 +21,9 @@ from lab.emulated.usb.bus import PRELOAD, environment
 FOLDER = Path(__file__).parent / "on_usb_bus"
 ROOT = FOLDER.parents[2]
 NAMES = sorted(path.name for path in FOLDER.glob("test_*.py"))
-LONG = ("test_ptp_usb_recovery.py", "test_ptp_usb.py", "test_hid.py")
+RECOVERY = "test_ptp_usb_recovery.py"
+"""Waits for the time limits of a cable that is pulled and of a camera that hangs: for `make test-long`."""
+LONG = (RECOVERY, "test_ptp_usb.py", "test_hid.py")
 SIDE_BY_SIDE = 3
 
 Outcome = subprocess.CompletedProcess[str]
@@ -61,7 +63,9 @@ def outcomes(request: pytest.FixtureRequest) -> Iterator[Mapping[str, Future[Out
         pool.shutdown(cancel_futures=True)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name == RECOVERY else name for name in NAMES]
+)
 def test_under_the_preload_library(outcomes: Mapping[str, Future[Outcome]], name: str) -> None:
     done = outcomes[name].result()
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-4000:]
