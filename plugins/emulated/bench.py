@@ -51,7 +51,6 @@ from plugins.emulated.optics.staging import (
     random_truth,
     size_named,
 )
-from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming, quick_profile
 from plugins.emulated.projectors.projector import BoardProjector
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
@@ -224,6 +223,8 @@ def _start(
         with _explained(stage):
             _write_fast_profile(stage, family)
 
+    dmx_nodes = extension("dousers", asked_by="[[dousers]] in bench.toml") if truth.dousers else lambda *_: ()
+
     def progress(share: float) -> None:
         if stopped.is_set():
             raise _Interrupted
@@ -238,7 +239,7 @@ def _start(
             wire.scenario = ScenarioPlayer(scenario, device=name, faults=wire.faults, lamp=wire.lamp, plug=wire)
         stack.enter_context(wire)
         out.served(name, "projector", wire.address)
-    covered = {one.name: lamp for one, lamp in zip(truth.projectors, lamps, strict=True)}
+    covered = {name: wire.lamp for name, wire in wires.items()}
     for node in dmx_nodes(truth.dousers, covered, out.douser):
         out.served("douser", "dmx", stack.enter_context(node).address)
     if usb is None or not usb.have_camera:

@@ -41,8 +41,8 @@ from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription,
 from hal.errors import DeviceBusy, DeviceRefused, ProtocolError
 from hal.escapes import unescaped
 from lab.emulated.projectors.boards import BOARDS
+from lab.emulated.projectors.dousers import read_levels
 from lab.emulated.tape import parse_tape
-from plugins.emulated.projectors.dousers import read_levels
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 

@@ -27,9 +27,9 @@ from hal.interfaces import Douser
 from hal.notices import Notice
 from hal.registry import OpenContext, load_drivers, open_device
 from hal.values import Power
+from lab.emulated.projectors.dousers import EmulatedDouser, EmulatedNode, dmx_nodes, read_levels
 from plugins.dousers.sacn_douser import DRIVER, SacnDouser, open_sacn_douser
 from plugins.emulated.core.truth import DouserTruth
-from plugins.emulated.projectors.dousers import EmulatedDouser, EmulatedNode, dmx_nodes, read_levels
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming
 from tests.ports import kept_port
 from tests.processes import children, command_of

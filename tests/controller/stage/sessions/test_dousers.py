@@ -10,9 +10,9 @@ from controller.core.errors import UsageError
 from controller.stage.sessions.check import check_stage
 from hal.errors import DeviceGone
 from hal.registry import Drivers
+from lab.emulated.projectors.dousers import dmx_nodes
 from plugins.dousers.sacn_douser import DRIVER
 from plugins.emulated.core.truth import DouserTruth
-from plugins.emulated.projectors.dousers import dmx_nodes
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from tests.controller.stage.sessions.run_models import STAGE, Models
 from tests.waiting import wait_for
