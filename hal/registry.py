@@ -66,7 +66,7 @@ class Driver:
     open: Callable[[Mapping[str, Any], OpenContext, Deadline], Any]
     settings: Mapping[str, str] = field(default_factory=dict)
     required: tuple[str, ...] = ()
-    check: Callable[[Mapping[str, Any], OpenContext], None] | None = None
+    check: Callable[[Mapping[str, Any], OpenContext], object] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,7 @@ def check_device(driver: Driver, settings: Mapping[str, Any], context: OpenConte
     """Check ``settings`` as ``check_settings``, then by the driver's own ``check``. Raises as ``open_device``."""
     check_settings(driver, settings)
     if driver.check is not None:
-        _caller(driver, name).call("check", driver.check, None, settings, context)
+        _caller(driver, name).call("check", driver.check, Any, settings, context)
 
 
 def open_device(

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, TypeAdapter, ValidationError
 
-from controller.config.problems import KeyPath, Place, check_keys
+from controller.config.problems import Place, check_keys
+from hal.toml_lines import KeyPath
 
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f/\\]+$")]
 Seconds = Annotated[float, Field(ge=0, le=86_400)]

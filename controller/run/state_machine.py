@@ -123,13 +123,6 @@ def allowed_events(state: State) -> tuple[Event, ...]:
     return tuple(event for event in Event if (state, event) in TRANSITIONS)
 
 
-def mermaid() -> str:
-    """The table as a Mermaid state diagram."""
-    lines = ["stateDiagram-v2", f"    [*] --> {State.OFF.name}"]
-    lines += [f"    {before.name} --> {after.name}: {event.value}" for (before, event), after in TRANSITIONS.items()]
-    return "\n".join(lines)
-
-
 @dataclass(frozen=True, slots=True)
 class Change:
     """A transition. ``reason`` is a sentence for the technician, or empty."""

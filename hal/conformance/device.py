@@ -21,8 +21,10 @@ from hal.interfaces import ButtonPanel, Device, Douser, LightSensor, PowerSwitch
 
 
 class DeviceConformance:
-    """Tests for every kind of device; subclasses add those of their kind."""
+    """Tests for every kind of device; subclasses have a fixture ``device``, and add the tests of their ``kind``."""
 
+    kind: ClassVar[str]
+    interface: ClassVar[type]
     patience_s: ClassVar[float] = 30.0
     """Deadline of an ordinary call."""
     prompt_s: ClassVar[float] = 6.0
@@ -31,11 +33,15 @@ class DeviceConformance:
     def soon(self) -> Deadline:
         return in_seconds(self.patience_s)
 
+    def test_says_who_it_is(self, device: Device) -> None:
+        assert isinstance(device, self.interface)
+        self.check_identity(device)
+
     def check_identity(self, device: Device) -> None:
         who = device.identity(deadline=self.soon())
         assert who.model.strip(), "the device must report its model"
 
-    def check_closes_twice(self, device: Device) -> None:
+    def test_closing_twice_is_harmless(self, device: Device) -> None:
         for _ in range(2):
             started = time.monotonic()
             device.close()
@@ -43,13 +49,13 @@ class DeviceConformance:
         with pytest.raises(DeviceError):
             device.identity(deadline=self.soon())
 
-    def check_types(self, kind: str, device: Device, *calls: Callable[[Any], object]) -> None:
+    def check_types(self, device: Device, *calls: Callable[[Any], object]) -> None:
         """Each call returns what ``hal.interfaces`` says, and raises a ``DeviceError`` once the device is closed.
 
         A driver that raises or returns anything else is stopped by the controller (``hal.driver_calls``), which then
         can only say that it is broken.
         """
-        checked = Caller("The driver under test").device(kind, device)
+        checked = Caller("The driver under test").device(self.kind, device)
         calls = (lambda it: it.identity(deadline=self.soon()), *calls)
         for call in calls:
             call(checked)
@@ -59,7 +65,7 @@ class DeviceConformance:
                 call(checked)
             assert not isinstance(caught.value, DriverFault), caught.value
 
-    def check_deadline_and_cancel(self, device: Device) -> None:
+    def test_keeps_deadlines_and_stops_when_cancelled(self, device: Device) -> None:
         started = time.monotonic()
         with pytest.raises(DeviceTimeout) as caught:
             device.identity(deadline=in_seconds(-1.0))
@@ -76,9 +82,12 @@ class DeviceConformance:
 class ButtonPanelConformance(DeviceConformance):
     """Run on every key panel driver; supply a fixture ``button_panel``. Do not press a key during the test."""
 
-    def test_says_who_it_is(self, button_panel: ButtonPanel) -> None:
-        assert isinstance(button_panel, ButtonPanel)
-        self.check_identity(button_panel)
+    kind = "button_panel"
+    interface = ButtonPanel
+
+    @pytest.fixture
+    def device(self, button_panel: ButtonPanel) -> ButtonPanel:
+        return button_panel
 
     def test_has_keys(self, button_panel: ButtonPanel) -> None:
         keys = button_panel.capabilities
@@ -116,18 +125,14 @@ class ButtonPanelConformance(DeviceConformance):
             button_panel.wait_pressed(deadline=in_seconds(self.patience_s, stop))
         assert time.monotonic() - started < 0.2 + self.prompt_s
 
-    def test_keeps_deadlines_and_stops_when_cancelled(self, button_panel: ButtonPanel) -> None:
-        self.check_deadline_and_cancel(button_panel)
+    def test_shows_no_picture_late(self, button_panel: ButtonPanel) -> None:
         if button_panel.capabilities.picture_px is not None:
             with pytest.raises(DeviceTimeout):
                 button_panel.show(0, self.picture(button_panel), deadline=in_seconds(-1.0))
 
     def test_every_answer_and_error_is_of_its_type(self, button_panel: ButtonPanel) -> None:
         assert Caller("The driver under test").device("button_panel", button_panel).capabilities.keys > 0
-        self.check_types("button_panel", button_panel)
-
-    def test_closing_twice_is_harmless(self, button_panel: ButtonPanel) -> None:
-        self.check_closes_twice(button_panel)
+        self.check_types(button_panel)
 
     def picture(self, button_panel: ButtonPanel) -> npt.NDArray[np.uint8]:
         """A grey picture of the right size."""
@@ -138,9 +143,12 @@ class ButtonPanelConformance(DeviceConformance):
 class DouserConformance(DeviceConformance):
     """Run on every driver of dousers; supply a fixture ``douser``. Its blades move."""
 
-    def test_says_who_it_is(self, douser: Douser) -> None:
-        assert isinstance(douser, Douser)
-        self.check_identity(douser)
+    kind = "douser"
+    interface = Douser
+
+    @pytest.fixture
+    def device(self, douser: Douser) -> Douser:
+        return douser
 
     def test_closes_and_opens_also_twice(self, douser: Douser) -> None:
         for closed in (True, True, False, False, True):
@@ -153,19 +161,12 @@ class DouserConformance(DeviceConformance):
             douser.move(False, deadline=in_seconds(-1.0))
         assert douser.closed(deadline=self.soon()) is True
 
-    def test_keeps_deadlines_and_stops_when_cancelled(self, douser: Douser) -> None:
-        self.check_deadline_and_cancel(douser)
-
     def test_every_answer_and_error_is_of_its_type(self, douser: Douser) -> None:
         self.check_types(
-            "douser",
             douser,
             lambda it: it.move(True, deadline=self.soon()),
             lambda it: it.closed(deadline=self.soon()),
         )
-
-    def test_closing_twice_is_harmless(self, douser: Douser) -> None:
-        self.check_closes_twice(douser)
 
 
 _SUNLIGHT_LUX = 150_000.0
@@ -174,9 +175,12 @@ _SUNLIGHT_LUX = 150_000.0
 class LightSensorConformance(DeviceConformance):
     """Run on every light sensor driver; supply a fixture ``light_sensor``."""
 
-    def test_says_who_it_is(self, light_sensor: LightSensor) -> None:
-        assert isinstance(light_sensor, LightSensor)
-        self.check_identity(light_sensor)
+    kind = "light_sensor"
+    interface = LightSensor
+
+    @pytest.fixture
+    def device(self, light_sensor: LightSensor) -> LightSensor:
+        return light_sensor
 
     def test_light_is_told_in_lux(self, light_sensor: LightSensor) -> None:
         for _ in range(3):
@@ -184,24 +188,23 @@ class LightSensorConformance(DeviceConformance):
             assert math.isfinite(lux)
             assert 0 <= lux < _SUNLIGHT_LUX
 
-    def test_keeps_deadlines_and_stops_when_cancelled(self, light_sensor: LightSensor) -> None:
+    def test_measures_nothing_late(self, light_sensor: LightSensor) -> None:
         with pytest.raises(DeviceTimeout):
             light_sensor.illuminance_lux(deadline=in_seconds(-1.0))
-        self.check_deadline_and_cancel(light_sensor)
 
     def test_every_answer_and_error_is_of_its_type(self, light_sensor: LightSensor) -> None:
-        self.check_types("light_sensor", light_sensor, lambda it: it.illuminance_lux(deadline=self.soon()))
-
-    def test_closing_twice_is_harmless(self, light_sensor: LightSensor) -> None:
-        self.check_closes_twice(light_sensor)
+        self.check_types(light_sensor, lambda it: it.illuminance_lux(deadline=self.soon()))
 
 
 class PowerSwitchConformance(DeviceConformance):
     """Run on every driver of relays; supply a fixture ``power_switch``. It switches every channel: connect no lamp."""
 
-    def test_says_who_it_is(self, power_switch: PowerSwitch) -> None:
-        assert isinstance(power_switch, PowerSwitch)
-        self.check_identity(power_switch)
+    kind = "power_switch"
+    interface = PowerSwitch
+
+    @pytest.fixture
+    def device(self, power_switch: PowerSwitch) -> PowerSwitch:
+        return power_switch
 
     def test_every_channel_closes_and_opens_alone(self, power_switch: PowerSwitch) -> None:
         channels = range(1, power_switch.channels(deadline=self.soon()) + 1)
@@ -234,18 +237,10 @@ class PowerSwitchConformance(DeviceConformance):
             power_switch.switch(1, True, deadline=in_seconds(-1.0))
         assert not power_switch.state(1, deadline=self.soon())
 
-    def test_keeps_deadlines_and_stops_when_cancelled(self, power_switch: PowerSwitch) -> None:
-        self.check_deadline_and_cancel(power_switch)
-
     def test_every_answer_and_error_is_of_its_type(self, power_switch: PowerSwitch) -> None:
         self.check_types(
-            "power_switch",
             power_switch,
             lambda it: it.channels(deadline=self.soon()),
             lambda it: it.state(1, deadline=self.soon()),
             lambda it: it.switch(1, False, deadline=self.soon()),
         )
-
-    def test_closing_leaves_the_relays_as_they_are_and_twice_is_harmless(self, power_switch: PowerSwitch) -> None:
-        power_switch.switch(1, False, deadline=self.soon())
-        self.check_closes_twice(power_switch)

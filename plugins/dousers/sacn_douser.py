@@ -123,11 +123,6 @@ def open_sacn_douser(settings: Mapping[str, Any], context: OpenContext, deadline
     return SacnDouser(target, numbers["channel"], levels=levels, travel_s=float(numbers["travel_s"]))
 
 
-def check_sacn_douser(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    _read(settings)
-
-
 DRIVER: Final = Driver(
     kind="douser",
     name="sacn",
@@ -144,5 +139,5 @@ DRIVER: Final = Driver(
         "interface": "an IPv4 address of this computer, for multicast (default: the system's choice)",
     },
     required=("address", "universe", "channel"),
-    check=check_sacn_douser,
+    check=lambda settings, context: _read(settings),
 )

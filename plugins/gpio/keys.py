@@ -324,11 +324,6 @@ class GpioKeys(WorkerLink[Lines]):
                 self._pressed.get_nowait()
 
 
-def check_keys(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    key_settings(settings)
-
-
 def open_keys(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> GpioKeys:
     """Open the keys of a stage's table."""
     found = key_settings(settings)
@@ -343,5 +338,5 @@ DRIVER: Final = Driver(
     open=open_keys,
     settings=EXPLAINED,
     required=("chip", "keys"),
-    check=check_keys,
+    check=lambda settings, context: key_settings(settings),
 )

@@ -247,11 +247,6 @@ def _settings(settings: Mapping[str, Any], context: OpenContext) -> tuple[str, i
     return host, port, password, load_profile(setting(settings, "profile", str, "pjlink"), context.stage)
 
 
-def check_pjlink_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    _settings(settings, context)
-
-
 def open_pjlink_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PjLinkProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     host, port, password, profile = _settings(settings, context)
@@ -277,5 +272,5 @@ DRIVER = Driver(
         "profile": "times of its lamp: pjlink (the default), or a .toml file of the stage",
     },
     required=("address",),
-    check=check_pjlink_projector,
+    check=_settings,
 )

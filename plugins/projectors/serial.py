@@ -297,11 +297,6 @@ class SerialProjector:
             yield
 
 
-def check_serial_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    read_settings(settings, context)
-
-
 def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> SerialProjector:
     """Open the projector of a stage.toml table; see ``DRIVER`` for the settings."""
     profile, port, baud, address = read_settings(settings, context)
@@ -335,5 +330,5 @@ DRIVER = Driver(
         "address": "the projector's number on the line (default: the profile's)",
     },
     required=("profile", "port"),
-    check=check_serial_projector,
+    check=read_settings,
 )

@@ -96,11 +96,6 @@ def _settings(settings: Mapping[str, Any]) -> tuple[str, PictureStorage, Timing]
     return address, storage, _timing(settings)
 
 
-def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    _settings(settings)
-
-
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> PtpCamera:
     """Open the camera of a ``[camera]`` table."""
     address, storage, timing = _settings(settings)  # a wrong address leaves no file
@@ -186,5 +181,5 @@ DRIVER: Final = Driver(
         "keep_on_card": "true to keep pictures on the card after the transfer (default false)",
     },
     required=("address",),
-    check=check_camera,
+    check=lambda settings, context: _settings(settings),
 )

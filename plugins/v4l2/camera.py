@@ -23,11 +23,6 @@ class VideoCamera(LibraryCamera):
         )
 
 
-def check_camera(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    video_settings(settings)
-
-
 def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> VideoCamera:
     """Open the camera of a ``[camera]`` table."""
     return VideoCamera(video_settings(settings), serial=str(settings.get("serial", "")), deadline=deadline)
@@ -39,5 +34,5 @@ DRIVER: Final = Driver(
     summary="USB cameras (UVC) and other video devices of Linux (V4L2).",
     open=open_camera,
     settings=EXPLAINED,
-    check=check_camera,
+    check=lambda settings, context: video_settings(settings),
 )

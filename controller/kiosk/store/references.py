@@ -12,11 +12,11 @@ from typing import Any, Final, TypeAlias
 
 from controller.config import load_stage
 from controller.config.loader import FILE
-from controller.config.problems import KeyPath
 from controller.config.table import Holds, texts
 from controller.core.errors import UsageError
 from controller.core.files import read_text
 from hal.secret_words import is_secret
+from hal.toml_lines import KeyPath
 
 BUILDING: Final = "building.toml"
 OWN: Final = frozenset({

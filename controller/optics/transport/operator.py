@@ -105,11 +105,6 @@ class LightTransport(LinearOperator[np.float32], ABC):
         planes[:, self.span(n)] = frame_planes([p])
         return plane_image(self.forward_planes(planes, projectors=(n, n + 1)))
 
-    def adjoint_part(self, n: int, r: FloatImage) -> FloatImage:
-        """T_n' r: (rows, columns, 3) of projector ``n`` from a camera image (rows, columns, 3)."""
-        planes = self.adjoint_planes(image_planes(self._checked(r)), projectors=(n, n + 1))
-        return plane_frames(planes[:, self.span(n)], [self.sizes[n]])[0]
-
     def part(self, n: int) -> LinearOperator[np.float32]:
         """T_n as a SciPy operator, from the flat planes (3, its pixels) of projector ``n`` alone to the camera's."""
         span, only = self.span(n), (n, n + 1)

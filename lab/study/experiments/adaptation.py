@@ -14,9 +14,10 @@ from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.feasibility import choose_exposure, feasibility
 from controller.optics.solve.result.ghosting import Ghosting, ghosting
-from controller.optics.solve.result.metrics import TITLES, PixelSet, by_pixels, lab_of
+from controller.optics.solve.result.metrics import TITLES, PixelSet, by_pixels
 from controller.stage.report.pictures import Crop, crop_around
 from lab.study.output.drawing import LabelledPicture, Line, plotted, screen, strip
+from lab.study.subject.likeness import lab_of
 from lab.study.subject.subject import Subject
 from lab.study.subject.trial import photograph_target
 from lab.study.values import Cell, Criterion, Experiment, Figure, Result, ResultTable

@@ -18,12 +18,12 @@ from controller.optics.solve.result.metrics import (
     by_pixels,
     compare,
     sharpness_around,
-    structural_similarity,
 )
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import image_planes, plane_frames
 from controller.stage.report.pictures import Crop, crop_around
 from lab.study.output.drawing import LabelledPicture, detail, screen, strip
+from lab.study.subject.likeness import structural_similarity
 from lab.study.subject.subject import ReachableTarget, Subject
 from lab.study.values import Cell, Criterion, Figure, ResultTable
 

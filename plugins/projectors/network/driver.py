@@ -297,11 +297,6 @@ def read_settings(settings: Mapping[str, Any], context: OpenContext) -> Settings
     return Settings(profile, profile.network, host, port, account, sleeper, to)
 
 
-def check_network_projector(settings: Mapping[str, Any], context: OpenContext) -> None:
-    """As ``hal.registry.Driver.check``."""
-    read_settings(settings, context)
-
-
 class _Line:
     """Opens the connection, and wakes a network that sleeps."""
 
@@ -359,5 +354,5 @@ DRIVER: Final = Driver(
         "wake_to": 'where that packet is sent (default: "255.255.255.255:9")',
     },
     required=("profile", "address"),
-    check=check_network_projector,
+    check=read_settings,
 )

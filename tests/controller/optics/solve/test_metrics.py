@@ -11,7 +11,8 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import structural_similarity as scikit_images_similarity
 
 from controller.core.errors import UsageError
-from controller.optics.solve.result.metrics import colour_difference, compare, lab_of, sharpness, structural_similarity
+from controller.optics.solve.result.metrics import colour_difference, compare, sharpness
+from lab.study.subject.likeness import lab_of, structural_similarity
 
 SRGB = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]

@@ -63,9 +63,8 @@ def test_its_parts_are_its_columns_of_one_projector(transport: LightTransport) -
         part, x = transport.part(n), frame_planes([frame]).ravel()
         total += part @ x
         np.testing.assert_array_equal(part @ x, image_planes(transport.forward_part(n, frame)).ravel())
-        back = transport.adjoint_part(n, r)
+        back = transport.adjoint(r)[n]
         np.testing.assert_array_equal(part.rmatvec(image_planes(r).ravel()), frame_planes([back]).ravel())
-        np.testing.assert_allclose(back, transport.adjoint(r)[n], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(transport @ frame_planes(frames).ravel(), total, rtol=1e-5, atol=1e-6)
 
 

@@ -181,10 +181,10 @@ def test_wrong_settings_are_found_without_a_device(tmp_path: Path, settings: dic
 
 
 def test_a_serial_line_refuses_a_profile_that_has_only_a_network_port(tmp_path: Path) -> None:
-    from plugins.projectors.serial import check_serial_projector
+    from plugins.projectors.profile_files import read_settings
 
     with pytest.raises(PluginError, match="network"):
-        check_serial_projector({"profile": "sony-adcp", "port": "/dev/ttyS0"}, OpenContext(tmp_path))
+        read_settings({"profile": "sony-adcp", "port": "/dev/ttyS0"}, OpenContext(tmp_path))
 
 
 def test_the_packet_that_wakes_is_that_of_wakeonlan() -> None:
