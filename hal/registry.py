@@ -13,6 +13,7 @@ from hal.deadline import Deadline
 from hal.driver_calls import Caller, closed_quietly, mismatch
 from hal.errors import PluginError
 from hal.escapes import toml_value
+from hal.secret_words import HIDDEN, is_secret
 from hal.tape import Tape, Transcript
 
 GROUP = "velatura.devices"
@@ -250,9 +251,10 @@ def setting(settings: Mapping[str, Any], key: str, kind: type | tuple[type, ...]
     value = settings.get(key, default)
     if key in settings and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool)):
         kinds = kind if isinstance(kind, tuple) else (kind,)
+        shown = HIDDEN if is_secret(key) else toml_value(value)
         raise PluginError(
             "setting-wrong",
-            what=f"The setting '{key}' is {toml_value(value)}, not {' or '.join(_KIND_WORDS[k] for k in kinds)}.",
+            what=f"The setting '{key}' is {shown}, not {' or '.join(_KIND_WORDS[k] for k in kinds)}.",
             remedy=f"Correct {key} in stage.toml.",
         )
     return value

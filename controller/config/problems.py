@@ -10,6 +10,7 @@ from typing import Any
 from controller.core.errors import UsageError
 from controller.core.text import printable
 from hal.escapes import toml_value
+from hal.secret_words import HIDDEN, concealed, is_secret
 from hal.toml_lines import KeyLines, KeyPath
 
 LONGEST_SHOWN = 40
@@ -38,10 +39,10 @@ class Place:
 
     def wrong_value(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
         """``problem`` follows the value ("is not ..."); ``allowed`` says what the key may be."""
-        return self._error("key-value", key, f"'{key}' = {quoted(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-value", key, f"'{key}' = {_shown(key, value)} {problem}", f"'{key}' is {allowed}.")
 
     def wrong_type(self, key: str, value: object, problem: str, allowed: str) -> UsageError:
-        return self._error("key-type", key, f"'{key}' = {quoted(value)} {problem}", f"'{key}' is {allowed}.")
+        return self._error("key-type", key, f"'{key}' = {_shown(key, value)} {problem}", f"'{key}' is {allowed}.")
 
     def missing(self, key: str, allowed: str, written: Collection[str] = ()) -> UsageError:
         """``written`` are the keys that the table has; one of them may be the missing one, misspelt."""
@@ -84,6 +85,10 @@ def table_name(path: KeyPath) -> str:
     names = ".".join(str(part) for part in path if isinstance(part, str))
     numbers = [part for part in path if isinstance(part, int)]
     return f"[[{names}]] number {numbers[-1] + 1}" if isinstance(path[-1], int) else f"[{names}]"
+
+
+def _shown(key: str, value: object) -> str:
+    return HIDDEN if is_secret(key) else concealed(quoted(value))
 
 
 def quoted(value: Any) -> str:

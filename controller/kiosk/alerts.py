@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import smtplib
 import ssl
@@ -13,6 +14,7 @@ from dataclasses import asdict
 from email.message import EmailMessage
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from controller.config.models import AlertsTable
 from controller.core.errors import UsageError, WorkError
@@ -21,6 +23,7 @@ from controller.core.text import printable
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
+from hal.secret_words import concealed
 
 PATIENCE_S: Final = 20.0
 SUBJECT: Final = 120
@@ -70,8 +73,9 @@ def webhook(stage: Path, name: str, table: AlertsTable, rows: Sequence[EventRow]
     try:
         with urllib.request.build_opener(*handlers).open(request, timeout=PATIENCE_S):
             return
-    except (OSError, ValueError) as error:
-        raise _not_sent("The webhook", error) from error
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        # Who knows its path may write there.
+        raise _not_sent("The webhook", error, (address, urlsplit(address).path)) from error
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
@@ -85,8 +89,8 @@ def _context(stage: Path, table: AlertsTable) -> ssl.SSLContext:
     return ssl.create_default_context(cafile=None if table.certificates is None else str(stage / table.certificates))
 
 
-def _not_sent(who: str, error: Exception) -> WorkError:
-    detail = printable(str(error) or type(error).__name__)[:200]
+def _not_sent(who: str, error: Exception, secrets: Sequence[str] = ()) -> WorkError:
+    detail = printable(concealed(str(error), secrets) or type(error).__name__)[:200]
     return WorkError("alert-not-sent", what=f"{who} took no alert: {detail}.",
                      remedy="Check [alerts] in stage.toml and the network; it is tried again.")  # fmt: skip
 

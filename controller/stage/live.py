@@ -26,6 +26,7 @@ from controller.core.extras import extra_missing
 from controller.core.files import UnfitFile, check_pixels
 from controller.core.pictures import read_picture_file
 from controller.optics.solve.targets import files
+from hal.secret_words import concealed
 
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr")
 SETTLED_S: Final = 0.2
@@ -249,7 +250,7 @@ def is_stream(source: str) -> bool:
 
 def without_password(source: str) -> str:
     """The address as messages show it."""
-    return _PASSWORD.sub(r"\1", source)
+    return concealed(_PASSWORD.sub(r"\1", source))
 
 
 class StreamSource:

@@ -8,6 +8,7 @@ is the playlist. There is no sound, no filter, no volume.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import hmac
 import logging
 import re
@@ -23,7 +24,7 @@ from pydantic import Field
 from controller.core.errors import UsageError, VelaturaError
 from controller.core.files import read_text
 from controller.kiosk.building.protocol import NetworkOptions, Protocol
-from controller.kiosk.building.verbs import Verbs
+from controller.kiosk.building.verbs import MOST_SOURCES, Verbs
 from controller.kiosk.interface import KioskState
 from controller.run.state_machine import State
 from hal.codecs.projectors import pjlink
@@ -184,9 +185,56 @@ class PjLinkOptions(NetworkOptions):
     password_file: Path | None = None
 
 
+WRONG_S: Final = 0.01
+"""How long an address waits after its first wrong password."""
+GROWTH: Final = 1.3
+"""Of that time with each other one: a desk that asks ten times does not notice, and 10,000 words last for days."""
+LONGEST_WAIT_S: Final = 30.0
+MOST_REMEMBERED: Final = 1 << 18
+
+
+class Logins:
+    """What is remembered of all log-ins: who guesses waits longer and longer, and none is taken twice."""
+
+    def __init__(self, verbs: Verbs) -> None:
+        self._verbs = verbs
+        self._wrong: dict[str, int] = {}
+        self._due_s: dict[str, float] = {}
+        self._used: dict[bytes, None] = {}
+
+    async def wait(self, peer: str) -> None:
+        """Wait until it is this log-in's turn: those of an address that guesses come one after the other."""
+        now_s = asyncio.get_running_loop().time()
+        turn_s = min(max(now_s, self._due_s.get(peer, 0.0)), now_s + LONGEST_WAIT_S)
+        if peer in self._wrong:
+            self._due_s[peer] = turn_s + self._pause_s(peer)
+            await asyncio.sleep(turn_s - now_s)
+
+    def judge(self, peer: str, right: bool, digest: bytes) -> bool:
+        """Whether the log-in is taken. ``digest``: what proved it; a second one like it is only a copy of the first."""
+        if right and digest not in self._used:
+            self._used[digest] = None
+            if len(self._used) > MOST_REMEMBERED:
+                del self._used[next(iter(self._used))]
+            self._wrong.pop(peer, None)
+            return True
+        wrong = self._wrong[peer] = self._wrong.get(peer, 0) + 1
+        if len(self._wrong) > MOST_SOURCES:
+            del self._wrong[next(iter(self._wrong))]
+        after_s = asyncio.get_running_loop().time() + self._pause_s(peer)
+        self._due_s[peer] = max(self._due_s.get(peer, 0.0), after_s)
+        if wrong & (wrong - 1) == 0:
+            times = "a wrong password" if wrong == 1 else f"{wrong} wrong passwords in a row"
+            self._verbs.record("pjlink-password-refused", f"{peer} sent {times}.")
+        return False
+
+    def _pause_s(self, peer: str) -> float:
+        return float(min(WRONG_S * GROWTH ** min(self._wrong[peer] - 1, 100), LONGEST_WAIT_S))
+
+
 async def serve(options: PjLinkOptions, verbs: Verbs) -> None:
     """Serve until cancelled. Raises OSError if it can't listen, and UsageError("pjlink-password-wrong")."""
-    password = _password(options.password_file)
+    password, logins = _password(options.password_file), Logins(verbs)
     clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
 
     async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -196,7 +244,7 @@ async def serve(options: PjLinkOptions, verbs: Verbs) -> None:
         try:
             if options.allows(peer) and len(clients) < MOST_CLIENTS:
                 clients[task] = writer
-                await _Session(reader, writer, verbs, password, peer).run()
+                await _Session(reader, writer, verbs, password, peer, logins).run()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             _LOG.debug("A PJLink connection ended.", exc_info=True)
         finally:
@@ -218,10 +266,11 @@ class _Session:
     """One connection."""
 
     def __init__(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, verbs: Verbs, password: str, peer: str
-    ) -> None:
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, verbs: Verbs, password: str, peer: str,
+        logins: Logins,
+    ) -> None:  # fmt: skip
         self._reader, self._writer, self._verbs, self._peer = reader, writer, verbs, peer
-        self._password = password
+        self._password, self._logins = password, logins
         self._random = secrets.token_hex(4)
         self._salt: bytes | None = None
 
@@ -239,6 +288,7 @@ class _Session:
                 await self._send(b"PJLINK 2 " + self._salt.hex().upper().encode() + b"\r")
                 continue
             if not entered:
+                await self._logins.wait(self._peer)
                 checked = self._without_digest(line)
                 if checked is None:
                     await self._send(b"PJLINK ERRA\r")
@@ -259,13 +309,16 @@ class _Session:
             try:
                 theirs = bytes.fromhex(line[:length].decode("ascii"))
             except ValueError:
-                return None
+                theirs = b""
             if len(theirs) != pjlink.SALT_BYTES:
+                self._logins.judge(self._peer, False, b"")
                 return None
             # The same digest from either side: both random numbers are mixed.
             right = pjlink.second_level_digest(self._salt, theirs, self._password)
         given, command = line[: len(right)].lower(), line[len(right) :]
-        return command if hmac.compare_digest(given, right.lower()) else None
+        # The client chooses half of what is mixed at the second level, so that it could lead to an earlier digest.
+        proof = given[-2 * hashlib.sha256().digest_size :]
+        return command if self._logins.judge(self._peer, hmac.compare_digest(given, right.lower()), proof) else None
 
     def _answer(self, line: bytes) -> bytes:
         command = parse_command(line)

@@ -20,6 +20,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from controller.config import load_stage
 from controller.config.loader import FILE
@@ -44,6 +45,7 @@ from controller.stage.sessions.check import PANELS_FILE
 from controller.stage.sessions.run import tapes
 from hal.registry import Drivers
 from hal.runtime.caches import kept
+from hal.secret_words import concealed, is_secret
 
 FOLDER: Final = "kiosk/archives"
 MARK: Final = "velatura-backup.json"
@@ -436,21 +438,36 @@ LARGEST_TAPE: Final = 64 << 20
 def diagnostics(stage: Path, facts: Mapping[str, Any]) -> Path:
     """A new file for remote support: ``facts``, events, journals and logs, without secrets and pictures."""
     path = new_file(stage, "diagnostics", "tar.gz")
+    secrets = _secrets(stage)
     system = {"system": platform.platform(), "python": platform.python_version(), "disk": _disk(stage),
               "outside_the_stage": [dataclasses.asdict(cache) for cache in kept()]}  # fmt: skip
 
     def write(archive: tarfile.TarFile) -> None:
-        add(archive, "facts.json", json.dumps({**system, **facts}, indent=1, default=str).encode())
-        for name in ("stage.toml", "schedule.toml", "lamps.json"):
-            if (stage / name).is_file():
-                archive.add(stage / name, name)
+        add(archive, "facts.json", concealed(json.dumps({**system, **facts}, indent=1, default=str), secrets).encode())
         for database in sorted([*stage.glob("runs/*/journal.sqlite"), *stage.glob("kiosk/events.sqlite")])[-20:]:
             with contextlib.suppress(sqlite3.Error):
-                add(archive, str(database.relative_to(stage)), _copy_of(database))
-        for text in [*_texts(stage), *_last_tape(stage)]:
-            archive.add(text, str(text.relative_to(stage)))
+                add(archive, str(database.relative_to(stage)), _without(secrets, _copy_of(database), same_length=True))
+        settings = (stage / name for name in (FILE, PANELS_FILE, "lamps.json") if (stage / name).is_file())
+        for text in [*settings, *_texts(stage), *_last_tape(stage)]:
+            add(archive, str(text.relative_to(stage)), _without(secrets, text.read_bytes()))
 
     return write_tar(path, write)
+
+
+def _secrets(stage: Path) -> set[str]:
+    """The values of secret settings, which may stand in any text."""
+    try:
+        found = [(str(path[-1]), text) for path, text, _ in texts(load_stage(stage).tables)]
+    except UsageError:
+        return set()
+    addresses = [urlsplit(text) for key, text in found if "://" in text]
+    return {text for key, text in found if is_secret(key)} | {one.password for one in addresses if one.password} | {
+        one.path for one in addresses if one.path.strip("/") and one.scheme in ("http", "https")}  # fmt: skip
+
+
+def _without(secrets: Collection[str], data: bytes, *, same_length: bool = False) -> bytes:
+    words = [secret.encode().decode("latin-1") for secret in secrets]
+    return concealed(data.decode("latin-1"), words, same_length=same_length).encode("latin-1")
 
 
 def _last_tape(stage: Path) -> list[Path]:

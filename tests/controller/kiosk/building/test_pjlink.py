@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pytest
 from aiopjlink import PJLinkERR3, PJLinkPassword
@@ -162,6 +164,67 @@ def test_the_password_check_of_version_two(kiosk: MemoryKiosk, tmp_path: Path) -
         salt = bytes.fromhex(line().split()[2].decode())
         link.sendall(second_level_digest(salt, bytes(range(16)), PASSWORD) + b"%2POWR ?\rnonsense\r%1FREZ ?\r")
         assert [line(), line(), line()] == [b"%2POWR=1\r", b"%1ERR1\r", b"%1FREZ=ERR1\r"]
+
+
+def first_line(link: socket.socket) -> bytes:
+    found = b""
+    while not found.endswith(b"\r"):
+        found += link.recv(1) or b"\r"
+    return found
+
+
+Seen: TypeAlias = tuple[bytes, bytes, bytes]
+
+
+def second_level(port: int, copied: Seen | None = None) -> tuple[bytes, Seen]:
+    """Log in by SHA-256, or as somebody who saw the random numbers and the digest of another log-in; returns the
+    answer and what could be seen.
+    """
+    with socket.create_connection(("127.0.0.1", port), 20) as link:
+        first_line(link)
+        link.sendall(b"PJLINK 2\r")
+        salt = bytes.fromhex(first_line(link).split()[2].decode())
+        if copied is None:
+            ours = bytes(range(16))
+            sent = second_level_digest(salt, ours, PASSWORD)
+        else:
+            ours = bytes(a ^ b ^ c for a, b, c in zip(copied[0], copied[1], salt, strict=True))
+            sent = ours.hex().encode() + copied[2][32:]
+        link.sendall(sent + b"%2POWR ?\r")
+        return first_line(link), (salt, ours, sent)
+
+
+def test_a_login_that_was_seen_is_not_taken_again(kiosk: MemoryKiosk, tmp_path: Path) -> None:
+    with stage(kiosk, tmp_path, PASSWORD) as port:
+        answer, seen = second_level(port)
+        assert answer == b"%2POWR=1\r"
+        assert second_level(port, seen)[0] == b"PJLINK ERRA\r"
+        assert second_level(port)[0] == b"%2POWR=1\r"
+
+
+def test_one_who_guesses_waits_longer_each_time_and_is_logged(
+    kiosk: MemoryKiosk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lines, "WRONG_S", 0.05)
+    monkeypatch.setattr(lines, "GROWTH", 2.0)
+
+    def guess(_: int) -> bytes:
+        with socket.create_connection(("127.0.0.1", port), 20) as link:
+            first_line(link)
+            link.sendall(b"0" * 32 + b"%1POWR 0\r")
+            return first_line(link)
+
+    with stage(kiosk, tmp_path, PASSWORD) as port, ThreadPoolExecutor(4) as pool:
+        began_s = time.monotonic()
+        assert set(pool.map(guess, range(4))) == {b"PJLINK ERRA\r"}
+        assert time.monotonic() - began_s > 0.1, "also at the same time they come one after the other"
+        assert guess(0) == b"PJLINK ERRA\r"
+        assert time.monotonic() - began_s > 0.5
+    assert [text for code, text in kiosk.recorded if code == "pjlink-password-refused"] == [
+        f"PJLink: 127.0.0.1 sent {what}." for what in
+        ("a wrong password", "2 wrong passwords in a row", "4 wrong passwords in a row")
+    ]  # fmt: skip
+    assert kiosk.snapshot().state == "playing"
 
 
 def test_a_viewer_may_only_ask(kiosk: MemoryKiosk, tmp_path: Path) -> None:

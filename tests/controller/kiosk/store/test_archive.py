@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import shutil
+import sqlite3
 import tarfile
 import threading
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from controller.kiosk.store import archive
 from controller.kiosk.store.archive import FOLDER, LARGEST_TAPE, diagnostics
 from controller.kiosk.store.event_log import EventLog
 from controller.stage.sessions.run import new_tape
+from hal.notices import Notice
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
 
 OLD, NEW = "20260501-100000-calibrate", "20260601-100000-calibrate"
@@ -284,6 +286,38 @@ def test_diagnostics_hold_facts_and_journals_and_no_secret_and_no_picture(stage:
     assert not [name for name in held if name.endswith(".png") or "keys" in name or "accounts" in name]
     assert b"SECRET" not in contents(file)
     assert b'"state": "playing"' in contents(file)
+
+
+def test_no_secret_of_the_settings_is_in_diagnostics(stage: Path) -> None:
+    secrets = ("geheim-1", "/T0/hook-2", "post-3@example.org", "write-4", "anna-5", "pass-6", "tok-7", "kurz")
+    text = TEXT.replace(
+        'driver = "serial"\nport = "/dev/ttyUSB0"', 'driver = "pjlink"\naddress = "h"\npassword = "geheim-1"'
+    )
+    text = text.replace('"optoma-later"', '"pjlink"') + (
+        '[alerts]\nwebhook = "https://example.org/T0/hook-2"\nmail_user = "post-3@example.org"\n'
+        '[[relays]]\nname = "r"\ndriver = "snmp-pdu"\naddress = "h"\nchannels = 1\ncommunity = \'write-4\'\n'
+        'mains = [{ channel = 1, feeds = ["left"] }]\n[backup]\nssh = "ssh://anna-5@nas/x"\n'
+    )
+    (stage / "stage.toml").write_text(text)
+    (stage / "run").mkdir()
+    (stage / "run/player.log").write_text("rtsp://me:pass-6@host/x?token=tok-7 said geheim-1\n# password = kurz\n")
+    with contextlib.closing(EventLog(stage / EventLog.FILE)) as log:
+        log.add(Notice("x", "The server took /T0/hook-2 and geheim-1, from anna-5@nas."))
+    for settings in (text, text + "damaged"):
+        (stage / "stage.toml").write_text(settings)
+        file = diagnostics(stage, {"events": [{"password": "kurz"}, "ssh://anna-5@nas"]})
+        held = contents(file)
+        # Of damaged settings it is not known any more what is secret in other texts.
+        other = held if settings == text else held.split(b"SQLite format")[0]
+        assert [secret for secret in secrets if secret.encode() in other.replace(b"from anna-5@nas", b"")] == []
+        assert b"address" in held
+        assert b"snmp-pdu" in held
+    with tarfile.open(file) as packed:
+        database = packed.extractfile(EventLog.FILE)
+        assert database is not None
+        (stage / "copy.sqlite").write_bytes(database.read())
+    with contextlib.closing(sqlite3.connect(stage / "copy.sqlite")) as copy:
+        assert copy.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
 
 def test_diagnostics_hold_the_newest_tape_unless_it_is_too_large(stage: Path) -> None:
