@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import ipaddress
 import os
 import select
 import socket
@@ -277,11 +278,17 @@ class TcpLink(BufferedLink):
 
 
 def host_and_port(address: str, default_port: int) -> tuple[str, int]:
-    """Split ``"host:port"`` or ``"host"`` (an IPv6 host in brackets); DeviceError("address-wrong") otherwise."""
+    """Split ``"host:port"`` or ``"host"``; DeviceError("address-wrong") otherwise.
+
+    An IPv6 host stands in brackets, which may be left out where no port follows.
+    """
     host, colon, port = address.rpartition(":")
-    if not colon or address.endswith("]"):
+    if not colon or address.endswith("]") or _is_ipv6(address):
         host, port = address, str(default_port)
-    host = host.removeprefix("[").removesuffix("]")
+    if host.startswith("[") and host.endswith("]") and _is_ipv6(host[1:-1]):
+        host = host[1:-1]
+    elif set("[]/ ") & set(host) or (":" in host and not _is_ipv6(address)):
+        host = ""
     if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise DeviceError(
             "address-wrong",
@@ -289,6 +296,12 @@ def host_and_port(address: str, default_port: int) -> tuple[str, int]:
             remedy=f'Write it in stage.toml like this: "192.168.0.20:{default_port}".',
         )
     return host, int(port)
+
+
+def _is_ipv6(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(text).version == 6
+    return False
 
 
 def port_taken(name: str) -> DeviceBusy:

@@ -23,7 +23,7 @@ from controller.kiosk.building import protocol as building
 from controller.kiosk.building.protocol import Configured
 from controller.kiosk.building.protocol import read as read_protocols
 from controller.kiosk.operations.dispatch import socket_table
-from controller.kiosk.panel_address import PanelAccess, addresses, keep_first_login
+from controller.kiosk.panel_address import PanelAccess, addresses, bracketed, keep_first_login
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.kiosk.store.accounts import FOLDER
@@ -31,7 +31,8 @@ from controller.panel.mqtt.options import BrokerOptions, check_broker
 from controller.play.control.notify import Notifier
 from controller.run.progress import Reporter
 from controller.stage.sessions.run import leave_runtime_folder, stage_lock
-from hal.errors import CodedError
+from hal.errors import CodedError, DeviceError
+from hal.links import host_and_port
 from hal.notices import Level
 
 RETRY_S: Final = 5.0
@@ -52,16 +53,20 @@ class PanelAddress:
     broker: BrokerOptions | None = None
 
 
-def parse_address(text: str) -> tuple[str, int]:
-    """``HOST:PORT`` or ``PORT``. Raises UsageError("address-wrong")."""
-    host, _, port = text.rpartition(":")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
+def parse_address(text: str, usual_port: int = 0) -> tuple[str, int]:
+    """``HOST:PORT`` or ``PORT``, with a ``usual_port`` ``HOST`` alone, too; an IPv6 host in brackets.
+
+    Raises UsageError("address-wrong").
+    """
+    try:
+        port = text.removeprefix(":")
+        return host_and_port(f"127.0.0.1:{port}" if port.isdecimal() and not usual_port else text, usual_port)
+    except DeviceError as error:
         raise UsageError(
             "address-wrong",
             what=f"{text[:64]!r} is not a valid address.",
-            remedy="Write HOST:PORT, for example 127.0.0.1:8377.",
-        )
-    return host.strip("[]") or "127.0.0.1", int(port)
+            remedy="Write HOST:PORT, for example 127.0.0.1:8377 or [::1]:8377.",
+        ) from error
 
 
 def serve(
@@ -169,17 +174,22 @@ def _check_panel(where: PanelAddress) -> None:
     """Before any device is opened. Raises what the panel's start would raise, and UsageError("file-unreadable")."""
     from controller.core.files import require_regular
     from controller.panel.server import check_port
+    from controller.panel.tls import check_certificates, check_server_files
 
-    files = (where.certificate, where.key, *((where.broker.password_file, where.broker.certificates)
-                                             if where.broker is not None else ()))  # fmt: skip
+    broker = where.broker
+    files = (where.certificate, where.key, *((broker.password_file, broker.certificates) if broker is not None else ()))
     for file in filter(None, files):
         try:
             require_regular(file)
+            file.read_bytes()
         except OSError as error:
             raise UsageError("file-unreadable", what=f"{file} can't be read: {error.strerror}.",
                              remedy="Check the path, or omit the option.") from error  # fmt: skip
-    if where.broker is not None:
-        check_broker(where.broker)
+    check_server_files(where.certificate, where.key)
+    if broker is not None:
+        check_broker(broker)
+        if broker.certificates is not None:
+            check_certificates(broker.certificates)
     check_port(where.host, where.port)
 
 
@@ -227,12 +237,17 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
     from controller.panel.app import make_panel
     from controller.panel.context import PanelOptions
     from controller.panel.server import PanelServer
+    from controller.panel.tls import out_of_date
 
     options = PanelOptions(
         folder=kiosk.stage / FOLDER, host=where.host, port=where.port,
         tls_certificate=where.certificate, tls_key=where.key, broker=where.broker,
     )  # fmt: skip
-    options = replace(options, hosts=(*options.hosts, where.host, *where.names))
+    options = replace(options, names=tuple(bracketed(name).lower() for name in where.names))
+    options = replace(options, hosts=(*options.hosts, bracketed(where.host), *options.names))
+    if where.certificate is not None and (problem := out_of_date(where.certificate)):
+        kiosk.record("panel-certificate-date", problem, "warning")
+        kiosk.warn("certificate", problem)
     accounts = kiosk.held_accounts()
     password = accounts.first_start()
     app = make_panel(kiosk, accounts, options)

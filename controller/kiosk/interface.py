@@ -68,6 +68,9 @@ class Kiosk(Protocol):
     def record(self, code: str, what: str, level: EventLevel = "info") -> None:
         """Add one line to the event log: what a person or a program did here, and who it was."""
 
+    def warn(self, about: str, what: str) -> None:
+        """Show ``what`` among the warnings of the snapshot until the next call with the same ``about``; "": no more."""
+
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         """Call ``callback`` (quick, from any thread) after every change of the snapshot or the event log."""
 

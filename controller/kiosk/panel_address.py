@@ -29,6 +29,11 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def bracketed(host: str) -> str:
+    """A host as it stands in a URL and in the header Host: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host and not host.startswith("[") else host
+
+
 def own_addresses() -> tuple[str, ...]:
     """The IPv4 addresses of this computer in its networks, without those that only itself knows."""
     found = []

@@ -29,7 +29,8 @@ class PanelOptions:
     """The settings of the panel.
 
     ``folder``: private files of the panel (accounts, sessions, uploads). ``hosts``: the allowed host names, without
-    port. Loopback by default; with ``tls_certificate`` and ``tls_key`` (PEM files) it uses only TLS, also for cookies.
+    port; ``names``: those of them that a person gave, which a reverse proxy may serve. Loopback by default; with
+    ``tls_certificate`` and ``tls_key`` (PEM files) it uses only TLS, also for cookies.
     """
 
     folder: Path
@@ -43,6 +44,7 @@ class PanelOptions:
     most_restore_bytes: int = 8 << 30
     most_open_panels: int = 200
     frames_per_s: float = 4.0
+    names: tuple[str, ...] = ()
 
     @property
     def tls(self) -> bool:

@@ -14,7 +14,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.panel_address import is_loopback
+from controller.kiosk.panel_address import bracketed, is_loopback
 from controller.panel.context import PanelOptions
 
 START_S = 10.0
@@ -83,7 +83,7 @@ class PanelServer:
                 raise _not_started(self._options.host, self._options.port)
             time.sleep(0.005)
         port = self._server.servers[0].sockets[0].getsockname()[1]
-        return f"{'https' if self._options.tls else 'http'}://{self._options.host}:{port}/"
+        return f"{'https' if self._options.tls else 'http'}://{bracketed(self._options.host)}:{port}/"
 
     def stop(self) -> None:
         """Stop, and disconnect open panels; their pages reconnect after the next start."""
@@ -114,7 +114,7 @@ def check_port(host: str, port: int) -> None:
             raise WorkError(
                 "panel-port-taken",
                 what=f"Port {port} of {host} is used by another program.",
-                remedy=f"Stop that program, or choose another port: --panel {host}:{port % 65535 + 1}.",
+                remedy=f"Stop that program, or choose another port: --panel {bracketed(host)}:{port % 65535 + 1}.",
             ) from error
         raise _not_started(host, port, error.strerror) from error
 

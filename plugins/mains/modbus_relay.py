@@ -92,12 +92,13 @@ class ModbusBoard:
         raise AssertionError("the last attempt ends in an answer or an error")
 
     def _refused(self, code: int) -> DeviceError:
-        error, remedy = DeviceRefused, "Check unit, first and channels in stage.toml."
-        if code in (_ACCEPTED, _BUSY):
-            error, remedy = DeviceBusy, "Check that no other program uses the board, and try again."
+        busy = code in (_ACCEPTED, _BUSY)
+        remedy = "Check unit, first and channels in stage.toml."
+        if busy:
+            remedy = "Check that no other program uses the board, and try again."
         elif code in _BEHIND:
             remedy = "Check unit in stage.toml, and the board behind the gateway: its power and its cable."
-        return error(
+        return (DeviceBusy if busy else DeviceRefused)(
             "outlets-refused",
             what=f"{self.name} refused: {_WORDS.get(code, 'it gives no reason')} (exception {code}).",
             remedy=remedy,

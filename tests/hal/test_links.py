@@ -240,3 +240,42 @@ def test_a_port_is_held_by_one_program_only(pty: Pty) -> None:
 def test_a_port_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(DeviceGone, match="tty-nowhere"):
         SerialLink(tmp_path / "tty-nowhere", baud=9600, deadline=in_seconds(20))
+
+
+@pytest.mark.parametrize(
+    ("address", "place"),
+    [
+        ("host", ("host", 7)),
+        ("host:9", ("host", 9)),
+        ("192.0.2.1:9", ("192.0.2.1", 9)),
+        ("[2001:db8::1]", ("2001:db8::1", 7)),
+        ("[2001:db8::1]:9", ("2001:db8::1", 9)),
+        ("2001:db8::1", ("2001:db8::1", 7)),
+        ("::1", ("::1", 7)),
+    ],
+)
+def test_an_address_is_host_and_port_and_ipv6_stands_in_brackets(address: str, place: tuple[str, int]) -> None:
+    assert host_and_port(address, 7) == place
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "",
+        ":9",
+        "host:0",
+        "host:65536",
+        "host:x",
+        "[::1",
+        "::1]",
+        "[]:9",
+        "[host]:9",
+        "a:b:9",
+        "[1.2.3.4]:9",
+        "two words:9",
+    ],
+)
+def test_what_is_no_address_is_refused(address: str) -> None:
+    with pytest.raises(DeviceError) as caught:
+        host_and_port(address, 7)
+    assert caught.value.code == "address-wrong"

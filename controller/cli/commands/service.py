@@ -53,31 +53,41 @@ class Panel:
 class Broker:
     """The MQTT broker of the building's control."""
 
-    mqtt: Annotated[str | None, typer.Option(help="HOST[:PORT] of the MQTT broker for building control.")] = None
+    mqtt: Annotated[
+        str | None, typer.Option(help="HOST[:PORT] of the MQTT broker for building control, or mqtts://HOST for TLS.")
+    ] = None
     mqtt_topic: Annotated[str, typer.Option(help="First part of all MQTT topics.")] = "velatura"
     mqtt_user: Annotated[str | None, typer.Option(help="User name for the MQTT broker.")] = None
     mqtt_password_file: Annotated[
         Path | None, typer.Option(help="File that contains only the password for the MQTT broker.")
     ] = None
     mqtt_certificates: Annotated[
-        Path | None, typer.Option(help="CA certificates (PEM) to check the MQTT broker (default: no TLS).")
+        Path | None, typer.Option(help="CA certificates (PEM) to check the MQTT broker; TLS then.")
     ] = None
     mqtt_discovery: Annotated[
         str, typer.Option(help="Let Home Assistant find the stage: its discovery prefix, usually homeassistant.")
     ] = ""
 
     def options(self) -> BrokerOptions | None:
-        """None without a broker. Raises UsageError("address-wrong")."""
+        """None without a broker. Raises UsageError("address-wrong", "mqtt-address-wrong")."""
         from controller.cli.kiosk_process import parse_address
         from controller.panel.mqtt.options import BrokerOptions
 
         if self.mqtt is None:
             return None
-        usual_port = 1883 if self.mqtt_certificates is None else 8883
-        address = parse_address(self.mqtt if ":" in self.mqtt else f"{self.mqtt}:{usual_port}")
+        scheme, there, place = self.mqtt.rpartition("://")
+        user, _, place = place.rstrip("/").rpartition("@")
+        if (there and scheme not in ("mqtt", "mqtts")) or ":" in user or "/" in place:
+            raise UsageError(
+                "mqtt-address-wrong",
+                what="The address of the MQTT broker is not HOST[:PORT], mqtt://HOST[:PORT] or mqtts://HOST[:PORT].",
+                remedy="Correct --mqtt. A password stands in a file: --mqtt-password-file.",
+            )
+        tls = scheme == "mqtts" or self.mqtt_certificates is not None
+        host, port = parse_address(place, 8883 if tls else 1883)
         return BrokerOptions(
-            *address, self.mqtt_topic, self.mqtt_user, self.mqtt_password_file, self.mqtt_certificates,
-            self.mqtt_discovery,
+            host, port, self.mqtt_topic, self.mqtt_user or user or None, self.mqtt_password_file,
+            self.mqtt_certificates, self.mqtt_discovery, tls,
         )  # fmt: skip
 
 

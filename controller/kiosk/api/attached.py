@@ -140,6 +140,9 @@ class AttachedKiosk(FolderKiosk):
             else:
                 self._unlogged.append(notice)
 
+    def warn(self, about: str, what: str) -> None:
+        self._snapshots.others = {**self._snapshots.others, about: what}
+
     def subscribe(self, callback: Callable[[], None]) -> Unsubscribe:
         with self._lock:
             self._callbacks.append(callback)

@@ -95,6 +95,8 @@ class Snapshots:
         self._places: tuple[Place, ...] = ()
         self._drifts: tuple[DriftCheck, ...] = ()
         self._since = ("", 0.0)
+        self.others: Mapping[str, str] = {}
+        """Warnings of parts that belong to no service, such as the connection to a broker; "" for none."""
 
     def of(self, service: Service, revision: int) -> KioskState:
         """The state now; the grades come from the disk and may be some seconds old, but not older than the bundle."""
@@ -161,7 +163,8 @@ class Snapshots:
 
     def _warnings(self, service: Service) -> tuple[str, ...]:
         said = (service.problem, service.player.view.warning, service.bundle_watch.warning)
-        return (*service.devices.warnings, *(one.text for one in said if one is not None))
+        others = filter(None, self.others.values())
+        return (*service.devices.warnings, *(one.text for one in said if one is not None), *others)
 
     def _player_row(self, service: Service) -> DeviceRow:
         problem = service.player.view.problem

@@ -20,6 +20,8 @@ from controller.kiosk.building.protocol import NetworkOptions, Protocol, changes
 from controller.kiosk.building.verbs import Verbs
 from controller.kiosk.interface import KioskState
 from controller.kiosk.operations.fields import Field as Value
+from hal.errors import DeviceError
+from hal.links import host_and_port
 
 ROOT: Final = "/velatura/"
 MOST_WAITING: Final = 50
@@ -40,15 +42,15 @@ class OscOptions(NetworkOptions):
     @classmethod
     def _addresses(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for text in value:
-            host, _, port = text.rpartition(":")
-            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-                raise ValueError(f"{text!r} is not HOST:PORT")
+            try:
+                host_and_port(text, 0)
+            except DeviceError:
+                raise ValueError(f"{text!r} is not HOST:PORT") from None
         return value
 
     @property
     def listeners(self) -> tuple[Address, ...]:
-        parts = [text.rpartition(":") for text in self.feedback]
-        return tuple((host.strip("[]"), int(port)) for host, _, port in parts)
+        return tuple(host_and_port(text, 0) for text in self.feedback)
 
 
 def state_of(now: KioskState) -> State:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Final, Literal
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 
+from controller.kiosk.panel_address import is_loopback
 from controller.kiosk.store.accounts import Role
 from controller.panel.auth.sessions import Session
 from controller.panel.context import Panel
@@ -124,14 +124,23 @@ def _too_many(wait_s: float) -> Response:
     return answer
 
 
-def same_origin(headers: Headers) -> bool:
+def same_origin(panel: Panel, request: Request) -> bool:
     """Whether the browser says that the request comes from our own page. Old browsers say nothing; the CSRF token
     protects them.
+
+    A reverse proxy may have replaced the header Host: then the browser's own judgement counts (Sec-Fetch-Site), the
+    name that a proxy on this computer passes on (X-Forwarded-Host), or a name that was given for the panel.
     """
-    if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+    headers = request.headers
+    origin, judged = headers.get("origin"), headers.get("sec-fetch-site")
+    if judged is not None and judged not in ("same-origin", "none"):
         return False
-    origin = headers.get("origin")
-    return origin is None or urlsplit(origin).netloc.lower() == headers.get("host", "").lower()
+    if origin is None or judged == "same-origin":
+        return True
+    source, names = urlsplit(origin).netloc.lower(), {headers.get("host", "").lower()}
+    if request.client is not None and is_loopback(request.client.host):
+        names.add(headers.get("x-forwarded-host", "").partition(",")[0].strip().lower())
+    return bool(source) and (source in names or source in panel.options.names)
 
 
 def form_pair(panel: Panel) -> tuple[str, str]:

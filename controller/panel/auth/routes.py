@@ -53,7 +53,7 @@ class Entrance:
         """Keep the visitor's language in a cookie, and go back to the page."""
         form = await request.form(max_files=0, max_fields=4, max_part_size=4096)
         name, back = str(form.get("language", "")), str(form.get("back", "/"))
-        if name not in LANGUAGES or not same_origin(request.headers):
+        if name not in LANGUAGES or not same_origin(self._panel, request):
             raise refused()
         # Only a path of ours: it must not lead elsewhere.
         page = RedirectResponse(back if re.fullmatch(r"/[A-Za-z0-9._/-]*", back) and "//" not in back else "/", 303)
@@ -80,11 +80,9 @@ class Entrance:
         name, password, token = (str(form.get(key, ""))[:LONGEST_PASSWORD] for key in ("name", "password", "csrf"))
         cookie = request.cookies.get(cookie_name(panel) + "-form", "")
         expected = form_token(panel, cookie)
-        if (
-            not cookie
-            or not same_origin(request.headers)
-            or not hmac.compare_digest(expected, token.encode().decode("ascii", "replace"))
-        ):
+        if not same_origin(panel, request):
+            return self._form(mark("The panel does not know this address. Start the kiosk with --name for it."), 403)
+        if not cookie or not hmac.compare_digest(expected, token.encode().decode("ascii", "replace")):
             return self._form(mark("This page was out of date. Try again."), 403)
         address = request.client.host if request.client else ""
         wait_s = max(panel.by_address.wait_s(address), panel.by_account.wait_s(name))

@@ -20,6 +20,7 @@ from controller.kiosk.building.verbs import Verbs
 from controller.kiosk.interface import DriftCheck, Kiosk, KioskState
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.panel_address import bracketed
 from controller.panel.answers import FAILURES
 from controller.panel.mqtt import home_assistant
 from controller.panel.mqtt.options import BrokerOptions
@@ -90,7 +91,7 @@ class BuildingControl:
         self._kiosk, self._options = kiosk, options
         self._first_pause_s, self._patience_s = first_pause_s, patience_s
         self._verbs = Verbs(kiosk, "Building control", operations=operations)
-        self._changed = asyncio.Event()
+        self._changed, self._missing = asyncio.Event(), False
         self._found: set[str] = set()
         """Discovery topics of this stage that the broker retained."""
 
@@ -110,9 +111,9 @@ class BuildingControl:
                     await self._connected()
                 except* ValueError as errors:
                     _LOG.warning("The MQTT password file is not text, or the topic is not valid: %s", errors.exceptions)
-                except* (aiomqtt.MqttError, OSError):
+                except* (aiomqtt.MqttError, OSError) as errors:
                     # The kiosk continues without the broker; "available" shows "offline" to its clients.
-                    _LOG.debug("No MQTT broker at %s", self._options.host, exc_info=True)
+                    self._lost(str(errors.exceptions[0]))
                 except* Exception:  # noqa: BLE001 - one connection must not end the panel or the retries
                     _LOG.exception("The connection to the MQTT broker failed. Reconnecting.")
                 pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
@@ -121,10 +122,24 @@ class BuildingControl:
         finally:
             unsubscribe()
 
+    def _lost(self, why: str) -> None:
+        """An event once, and a line of the status until it is connected."""
+        if not self._missing:
+            self._missing = True
+            what = f"The MQTT broker at {bracketed(self._options.host)}:{self._options.port} can't be reached: {why}."
+            self._kiosk.record("mqtt-lost", f"{what} It is tried again.", "warning")
+            self._kiosk.warn("mqtt", what)
+
+    def _back(self) -> None:
+        if self._missing:
+            self._missing = False
+            self._kiosk.record("mqtt-back", "The MQTT broker is connected again.")
+            self._kiosk.warn("mqtt", "")
+
     async def _connected(self) -> None:
         options, topic = self._options, self._options.topic
         password = await anyio.to_thread.run_sync(_password, options.password_file)
-        tls = ssl.create_default_context(cafile=str(options.certificates)) if options.certificates else None
+        tls = ssl.create_default_context(cafile=options.certificates) if options.encrypted else None
         will = aiomqtt.Will(f"{topic}/available", "offline", qos=1, retain=True)
         async with aiomqtt.Client(
             options.host,
@@ -141,6 +156,7 @@ class BuildingControl:
                 self._found.clear()
                 await client.subscribe(home_assistant.own_topics(options.discovery, topic), qos=1)
             await client.publish(f"{topic}/available", "online", qos=1, retain=True)
+            self._back()
             try:
                 await self._both_ways(client)
             finally:

@@ -13,7 +13,8 @@ from controller.kiosk.panel_address import is_loopback
 class BrokerOptions:
     """The address of the broker. ``password_file`` contains only the password, so that no settings and no export do.
 
-    ``topic``: the first part of all topics; ``certificates``: the certificate authorities (PEM) for the broker's TLS;
+    ``topic``: the first part of all topics; ``tls``: the connection is encrypted; ``certificates``: the certificate
+    authorities (PEM) for it, None: those of this computer;
     ``discovery``: Home Assistant's discovery prefix, empty if it is not to find the stage.
     """
 
@@ -24,6 +25,11 @@ class BrokerOptions:
     password_file: Path | None = None
     certificates: Path | None = None
     discovery: str = ""
+    tls: bool = False
+
+    @property
+    def encrypted(self) -> bool:
+        return self.tls or self.certificates is not None
 
 
 def check_broker(options: BrokerOptions) -> None:
@@ -34,10 +40,10 @@ def check_broker(options: BrokerOptions) -> None:
         raise UsageError(
             "mqtt-topic-wrong", what="An MQTT topic must not contain + or #.", remedy="Choose another name for it."
         )
-    if options.password_file is None or options.certificates is not None or is_loopback(options.host):
+    if options.password_file is None or options.encrypted or is_loopback(options.host):
         return
     raise UsageError(
         "mqtt-password-without-tls",
         what=f"The password for the MQTT broker {options.host} would be sent without TLS.",
-        remedy="Set --mqtt-certificates, or use a broker on this computer.",
+        remedy="Use mqtts:// or --mqtt-certificates, or a broker on this computer.",
     )

@@ -179,7 +179,7 @@ def checked(panel: Panel, handler: Handler) -> Callable[[Request, Visitor], Awai
 
     async def answer(request: Request, visitor: Visitor) -> Response:
         assert visitor.session is not None
-        if not same_origin(request.headers):
+        if not same_origin(panel, request):
             raise refused()
         form = await request.form(max_files=1, max_fields=MOST_FIELDS, max_part_size=2 << 20)
         sent = Sent()

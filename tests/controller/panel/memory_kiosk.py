@@ -68,6 +68,7 @@ class MemoryKiosk(MemoryWork):
         self._toml = toml
         self.asked: list[tuple[str, object]] = []
         self.recorded: list[tuple[str, str]] = []
+        self.others: dict[str, str] = {}
         self.effect = ""
         self._appearances = {
             name: Appearance(name, BORN, 1.2, name == names[0], self._drawn(name), OUTPUTS, "picture") for name in names
@@ -145,6 +146,10 @@ class MemoryKiosk(MemoryWork):
 
     def record(self, code: str, what: str, level: EventLevel = "info") -> None:
         self.recorded.append((code, what))
+
+    def warn(self, about: str, what: str) -> None:
+        self.others[about] = what
+        self.change(warnings=tuple(filter(None, self.others.values())))
 
     def test_alerts(self) -> None:
         raise UsageError("alerts-none", what="stage.toml names no receiver of alerts.", remedy="Name somebody.")

@@ -15,12 +15,14 @@ from pathlib import Path
 import httpx
 import pytest
 
+from controller.cli.kiosk_process import PanelAddress, _check_panel
 from controller.core.errors import UsageError, WorkError
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions
 from controller.panel.server import PanelServer, check_exposure
+from controller.panel.tls import out_of_date
 from tests.controller.panel.memory_kiosk import MemoryKiosk
-from tests.controller.panel.served import PASSWORD, accounts_in, csrf
+from tests.controller.panel.served import PASSWORD, accounts_in, csrf, served
 from tests.waiting import wait_for
 
 
@@ -142,3 +144,116 @@ def test_with_tls_nothing_crosses_in_the_clear_and_cookies_stay(tmp_path: Path) 
             client.get(address.replace("https", "http") + "login")
     finally:
         server.stop()
+
+
+def openssl(*arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates and keys by OpenSSL: ``c.pem`` with ``k.pem``, another key, one with a passphrase, other formats."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl to make a certificate")
+    folder = tmp_path_factory.mktemp("tls")
+    curve = ("ec", "-pkeyopt", "ec_paramgen_curve:P-256")
+    key, certificate = str(folder / "k.pem"), str(folder / "c.pem")
+    openssl("req", "-x509", "-newkey", *curve, "-nodes", "-days", "2", "-keyout", key, "-out", certificate,
+            "-subj", "/CN=localhost")  # fmt: skip
+    openssl("genpkey", "-algorithm", *curve, "-out", str(folder / "other.pem"))
+    openssl("pkey", "-in", key, "-aes256", "-passout", "pass:secret", "-out", str(folder / "locked.pem"))
+    openssl("x509", "-in", certificate, "-outform", "DER", "-out", str(folder / "c.der"))
+    (folder / "both.pem").write_bytes((folder / "c.pem").read_bytes() + (folder / "k.pem").read_bytes())
+    (folder / "empty.pem").write_bytes(b"")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "words"),
+    [
+        ("c.pem", "k.pem", ""),
+        ("both.pem", None, ""),
+        ("c.pem", "other.pem", "does not belong to the certificate"),
+        ("c.pem", "locked.pem", "has a passphrase"),
+        ("c.pem", "c.pem", "no private key"),
+        ("c.pem", None, "no private key"),
+        ("c.der", "k.pem", "no certificate in PEM format"),
+        ("k.pem", "k.pem", "no certificate in PEM format"),
+        ("empty.pem", "k.pem", "no certificate in PEM format"),
+        (None, "k.pem", "has no certificate"),
+        ("missing.pem", "k.pem", "can't be read"),
+    ],
+)
+def test_the_files_of_tls_are_checked_before_anything_starts(
+    files: Path, certificate: str | None, key: str | None, words: str
+) -> None:
+    where = PanelAddress(
+        port=free_port(), certificate=certificate and files / certificate, key=key and files / key  # type: ignore[arg-type]
+    )  # fmt: skip
+    if not words:
+        _check_panel(where)
+        return
+    with pytest.raises(UsageError, match=words) as caught:
+        _check_panel(where)
+    named = key if words in ("has a passphrase", "no private key") and key else certificate or key
+    assert str(files / str(named)) in caught.value.what
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as one:
+        return int(one.getsockname()[1])
+
+
+def test_a_certificate_that_is_not_valid_now_is_told(files: Path, tmp_path: Path) -> None:
+    assert out_of_date(files / "c.pem") == ""
+    for days, words in ((("20010101000000Z", "20020101000000Z"), "expired on 2002-01-01"),
+                        (("20700101000000Z", "20800101000000Z"), "begins on 2070-01-01")):  # fmt: skip
+        certificate = tmp_path / "dated.pem"
+        request, database = tmp_path / "request.pem", tmp_path / "index.txt"
+        openssl("req", "-new", "-key", str(files / "k.pem"), "-subj", "/CN=localhost", "-out", str(request))
+        database.write_text("")
+        (tmp_path / "ca.cnf").write_text(
+            f"[ca]\ndefault_ca = own\n[own]\ndatabase = {database}\nrand_serial = yes\nnew_certs_dir = {tmp_path}\n"
+            "default_md = sha256\npolicy = any\n[any]\ncommonName = supplied\n"
+        )
+        signing = ("ca", "-batch", "-config", str(tmp_path / "ca.cnf"), "-selfsign", "-keyfile", str(files / "k.pem"))
+        times = ("-startdate", days[0], "-enddate", days[1])
+        openssl(*signing, "-in", str(request), *times, "-notext", "-out", str(certificate))
+        assert words in out_of_date(certificate)
+
+
+def test_the_address_of_a_panel_by_ipv6_stands_in_brackets(tmp_path: Path) -> None:
+    options = PanelOptions(tmp_path / "p", host="::1", port=0)
+    server = PanelServer(make_panel(MemoryKiosk(tmp_path / "pictures"), accounts_in(tmp_path / "p"), options), options)
+    try:
+        address = server.start()
+    except WorkError:
+        pytest.skip("this computer has no IPv6")
+    try:
+        assert address.startswith("http://[::1]:")
+        with httpx.Client(trust_env=False) as client:
+            assert client.get(f"{address}login").status_code == 200
+    finally:
+        server.stop()
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"origin": "https://kiosk.museum", "sec-fetch-site": "same-origin"}, 303),
+        ({"origin": "https://kiosk.museum", "x-forwarded-host": "kiosk.museum"}, 303),
+        ({"origin": "https://named.museum"}, 303),
+        ({"origin": "https://kiosk.museum"}, 403),
+        ({"origin": "https://evil.example", "x-forwarded-host": "kiosk.museum"}, 403),
+        ({"origin": "https://named.museum:444"}, 403),
+        ({"origin": "https://kiosk.museum", "sec-fetch-site": "same-site"}, 403),
+        ({"origin": "null"}, 403),
+    ],
+)
+def test_a_reverse_proxy_may_rewrite_the_host(tmp_path: Path, headers: dict[str, str], status: int) -> None:
+    options = PanelOptions(tmp_path, names=("named.museum",))
+    with served(MemoryKiosk(tmp_path / "pictures"), tmp_path, options=options) as panel, panel.client() as client:
+        token = csrf(client.get("/login").text)
+        answer = client.post("/login", data={"csrf": token, "name": "vera", "password": PASSWORD}, headers=headers)
+        assert answer.status_code == status
+        assert ("--name" in answer.text) is (status == 403)

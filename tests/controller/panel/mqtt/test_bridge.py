@@ -17,6 +17,8 @@ import aiomqtt
 import anyio
 import pytest
 
+from controller.cli.commands.service import Broker
+from controller.core.errors import UsageError
 from controller.kiosk.interface import KioskState
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.app import make_panel
@@ -290,3 +292,54 @@ def test_a_password_file_that_is_no_text_is_tried_again_until_it_is_mended(tmp_p
 
     with broker(tmp_path / "broker", port):
         asyncio.run(story())
+
+
+def test_a_broker_that_is_away_is_an_event_and_a_line_of_the_status_until_it_is_back(tmp_path: Path, port: int) -> None:
+    async def life() -> None:
+        kiosk = MemoryKiosk(tmp_path / "pictures")
+        control = BuildingControl(kiosk, options(tmp_path, port), first_pause_s=0.05)
+        running = asyncio.create_task(control.run())
+        with anyio.fail_after(60):
+            while not kiosk.snapshot().warnings:
+                await asyncio.sleep(0.02)
+            await asyncio.sleep(0.3)  # it tries again, and says nothing more
+            assert [code for code, _ in kiosk.recorded] == ["mqtt-lost"]
+            assert f"127.0.0.1:{port}" in kiosk.snapshot().warnings[0]
+            with broker(tmp_path / "broker", port):
+                while kiosk.snapshot().warnings:
+                    await asyncio.sleep(0.02)
+        assert [code for code, _ in kiosk.recorded] == ["mqtt-lost", "mqtt-back"]
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(life())
+
+
+@pytest.mark.parametrize(
+    ("written", "address"),
+    [
+        ("broker", ("broker", 1883, False)),
+        ("broker:1884", ("broker", 1884, False)),
+        ("mqtt://broker", ("broker", 1883, False)),
+        ("mqtts://broker/", ("broker", 8883, True)),
+        ("mqtts://kiosk@broker:8884", ("broker", 8884, True)),
+        ("[2001:db8::1]", ("2001:db8::1", 1883, False)),
+        ("2001:db8::1", ("2001:db8::1", 1883, False)),
+        ("mqtts://[2001:db8::1]:99", ("2001:db8::1", 99, True)),
+    ],
+)
+def test_the_address_of_a_broker_in_all_its_forms(written: str, address: tuple[str, int, bool]) -> None:
+    made = Broker(mqtt=written).options()
+    assert made is not None
+    assert (made.host, made.port, made.encrypted) == address
+    assert made.username == ("kiosk" if "@" in written else None)
+
+
+@pytest.mark.parametrize(
+    "written", ["http://broker", "mqtt://kiosk:secret@broker", "broker:0", "mqtt://", "mqtt://a/b", "[broker]:1"]
+)
+def test_other_addresses_of_a_broker_are_refused_without_their_password(written: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        Broker(mqtt=written).options()
+    assert caught.value.code in ("address-wrong", "mqtt-address-wrong")
+    assert "secret" not in str(caught.value)
