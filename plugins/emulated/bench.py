@@ -25,7 +25,6 @@ from plugins.emulated.cameras.body import CameraNames
 from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.generic import EmulatedGenericBody
 from plugins.emulated.core.extensions import extension
-from plugins.emulated.core.faults import ScenarioPlayer, read_scenario
 from plugins.emulated.core.shot import Expose
 from plugins.emulated.core.truth import (
     DEFAULT_BOARD,
@@ -212,7 +211,7 @@ def _start(
         _require_free(truth.camera.command_port, truth.camera.event_port)
     if script is None and truth.scenario:
         script = stage / truth.scenario
-    scenario = read_scenario(script) if script is not None else None
+    scripted = extension("scenario", asked_by="A script of faults")(script) if script is not None else None
     lamps = [EmulatedLamp(_timing(projector.lamp)) for projector in truth.projectors]
     boot_s = {name: one.boot_s for one in truth.mains for name in one.feeds}
     wires = {
@@ -235,8 +234,8 @@ def _start(
     world.warm()
     _follow_bumps(world, out)
     for name, wire in wires.items():
-        if scenario is not None:
-            wire.scenario = ScenarioPlayer(scenario, device=name, faults=wire.faults, lamp=wire.lamp, plug=wire)
+        if scripted is not None:
+            wire.scenario = scripted(name, wire)
         stack.enter_context(wire)
         out.served(name, "projector", wire.address)
     covered = {name: wire.lamp for name, wire in wires.items()}

@@ -27,7 +27,7 @@ from hal.registry import OpenContext
 from hal.values import Power
 from lab.emulated.projectors.boards import BOARDS, baud_of
 from lab.emulated.projectors.pjlink import EmulatedPjLinkProjector
-from plugins.emulated.core.faults import ScenarioPlayer, parse_scenario
+from lab.emulated.scenario import ScenarioPlayer, parse_scenario
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from plugins.projectors.pjlink import open_pjlink_projector

@@ -10,9 +10,9 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any, Final
 
+from lab.emulated.scenario import ONCE
 from lab.emulated.usb.device import EmulatedUsbDevice, UsbFaults
 from lab.emulated.usb.process import KINDS, USB_ACTIONS, UsbBusProcess
-from plugins.emulated.core.faults import ONCE
 from tests.campaigns.wired_faults import FOR_S, SLOW_S, Fault, Turn, goes_on, how_long, mend_projectors, values_of
 from tests.campaigns.wired_kiosk import TETHER, TETHER_KNOBS, USB, WiredKiosk
 

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
+from lab.emulated.scenario import ACTIONS, ONCE, FaultEvent, Scenario, ScenarioPlayer
 from plugins.emulated.cameras.body import CameraFaults
-from plugins.emulated.core.faults import ACTIONS, ONCE, FaultEvent, Scenario, ScenarioPlayer, WireFaults
+from plugins.emulated.core.faults import WireFaults
 from tests.campaigns.wired_kiosk import WiredKiosk
 
 FOR_S: Final = 8.0

@@ -17,14 +17,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from lab.emulated.scenario import ACTIONS, LAMP_ACTIONS, Scenario, ScenarioPlayer, parse_scenario
 from lab.emulated.usb.bus import UsbBus
 from lab.emulated.usb.camera import STAGE_CAMERA, numbered_camera, stage_camera
 from lab.emulated.usb.device import EmulatedUsbDevice
 from lab.emulated.usb.hid_devices import EmulatedKeyPanel, EmulatedLightSensor, EmulatedRelayBoard
-from plugins.emulated.core.faults import ACTIONS, LAMP_ACTIONS, Scenario, ScenarioPlayer, parse_scenario
 
 USB_ACTIONS: Final = tuple(deed for deed in ACTIONS if deed not in LAMP_ACTIONS)
-"""Those of ``faults.ACTIONS`` that can happen to a USB device."""
+"""Those of ``scenario.ACTIONS`` that can happen to a USB device."""
 _FOR_GOOD: Final = 1_000_000_000
 _TICK_S: Final = 0.02
 _COUNTS: Final = {"busy": "stalls", "garbage": "garble", "cut": "cut", "drop": "drop", "garble": "garble"}
@@ -135,7 +135,7 @@ class UsbBusProcess:
         self._request({"do": "add", "name": name, "kind": kind, "settings": settings})
 
     def play(self, name: str, scenario: str) -> None:
-        """Play the events of a TOML scenario (see ``plugins.emulated.core.faults``) on a device."""
+        """Play the events of a TOML scenario (see ``lab.emulated.scenario``) on a device."""
         self._request({"do": "play", "name": name, "scenario": scenario})
 
     def rest(self, name: str) -> None:

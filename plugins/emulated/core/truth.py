@@ -323,7 +323,7 @@ class BenchTruth:
     ``latency_s``: from a frame's presentation to its light, real seconds (projectors: one to eight frames, the stage's
     default is two).
 
-    ``scenario``: faults on the projectors' wires (``core.faults``), a file relative to the stage folder;
+    ``scenario``: faults on the projectors' wires (by velatura-lab), a file relative to the stage folder;
     ``mains``: which emulated relays feed which projectors, whose mains are on otherwise; ``dousers``: closed at first;
     ``indirect``: the share of all projected light that object and room throw back evenly on the object.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 
-from plugins.emulated.core.faults import Faults, ScenarioPlayer
+from plugins.emulated.core.faults import Faults, FaultScript
 from plugins.emulated.core.servers import Switchable
 from plugins.emulated.projectors.board import Board
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
@@ -20,7 +20,7 @@ class EmulatedProjector(Switchable):
     def __init__(self, lamp: EmulatedLamp, *, wedges_below_s: float) -> None:
         self.lamp = lamp
         self.faults = Faults()
-        self.scenario: ScenarioPlayer | None = None
+        self.scenario: FaultScript | None = None
         self.wedged = False
         self._wedges_below_s = wedges_below_s
         self._heard_at_s = 0.0

@@ -11,7 +11,8 @@ import serial
 
 from hal.deadline import in_seconds
 from hal.errors import DeviceError
-from plugins.emulated.core.faults import Faults, ScenarioPlayer, parse_scenario, read_scenario
+from lab.emulated.scenario import ScenarioPlayer, parse_scenario, read_scenario
+from plugins.emulated.core.faults import Faults
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from tests.plugins.emulated.conftest import Clock
