@@ -27,14 +27,13 @@ from pathlib import Path
 from typing import Final, Generic, TypeVar
 
 from hal.errors import ProtocolError
-from hal.escapes import unescaped
 from hal.runtime.files import require_regular
 from hal.serial_link import PtyLink
 from hal.tape import HEADER, MOST_BYTES, PACKED, Direction
+from lab.emulated.servers import BackgroundDevice, TcpServer
 from plugins.emulated.cameras.body import CameraNames, EmulatedBody
 from plugins.emulated.cameras.camera import PtpIpCamera
 from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome
-from plugins.emulated.core.servers import BackgroundDevice, TcpServer
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 
 LARGEST_PIECE: Final = 256 << 20
@@ -59,6 +58,22 @@ class Track:
     kind: str
     address: str
     entries: list[Entry] = field(default_factory=list)
+
+
+_ESCAPE: Final = re.compile(rb"\\(?:x([0-9a-f]{2})|([rnt\\]))")
+_LONG: Final = {b"r": b"\r", b"n": b"\n", b"t": b"\t", b"\\": b"\\"}
+
+
+def unescaped(text: str) -> bytes:
+    """The bytes that ``escaped`` wrote; ProtocolError for any other text."""
+    data = text.encode("ascii", "backslashreplace")
+    if not text.isascii() or b"\\" in _ESCAPE.sub(b"", data):
+        raise ProtocolError(
+            "tape-wrong",
+            what=f"The bytes {text[:80]!r} of the tape are not escaped correctly.",
+            remedy="Record it again. Its format is described in docs/reference/tape-format.md.",
+        )
+    return _ESCAPE.sub(lambda m: bytes.fromhex(m[1].decode()) if m[1] else _LONG[m[2]], data)
 
 
 def read_tape(path: Path) -> tuple[Track, ...]:

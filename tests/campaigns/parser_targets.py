@@ -39,10 +39,9 @@ from hal.codecs.ptp import usb as ptp_usb
 from hal.codecs.ptp import values as ptp
 from hal.codecs.ptp.datasets import DeviceInfo, ObjectInfo, PropertyDescription, StorageInfo
 from hal.errors import DeviceBusy, DeviceRefused, ProtocolError
-from hal.escapes import unescaped
 from lab.emulated.projectors.boards import BOARDS
 from lab.emulated.projectors.dousers import read_levels
-from lab.emulated.tape import parse_tape
+from lab.emulated.tape import parse_tape, unescaped
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.projectors.profile_files import load_profile, shipped_profiles
 

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.errors import ProtocolError
-from hal.escapes import escaped, unescaped
+from hal.escapes import escaped
+from lab.emulated.tape import unescaped
 
 
 @given(st.binary(max_size=200))

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from hal.errors import DeviceError
-from plugins.emulated.core.servers import HOST, BackgroundDevice
+from lab.emulated.servers import BackgroundDevice
+from plugins.emulated.core.servers import HOST
 from plugins.emulated.core.truth import FILE_NAME, DouserTruth
 from plugins.emulated.projectors.lamp import EmulatedLamp
 

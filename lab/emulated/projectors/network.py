@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from plugins.emulated.core.servers import TcpServer
+from lab.emulated.servers import TcpServer
 from plugins.emulated.projectors.board import Board
 from plugins.emulated.projectors.lamp import EmulatedLamp
 from plugins.emulated.projectors.projector import BoardProjector

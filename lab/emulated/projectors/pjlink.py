@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from plugins.emulated.core.servers import BackgroundDevice, TcpServer
+from lab.emulated.servers import BackgroundDevice, TcpServer
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from plugins.emulated.projectors.projector import EmulatedProjector
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from hal.errors import DeviceError
+from lab.emulated.servers import BackgroundDevice
 from lab.emulated.usb.bench import UsbDeviceTruth
-from plugins.emulated.core.servers import BackgroundDevice
 from plugins.emulated.core.truth import FILE_NAME, USB_FILE, MainsTruth, ProjectorTruth
 from plugins.emulated.projectors.projector import BoardProjector
 
