@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.api.arrays import as_images
-from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask, as_light
 from controller.core.colour import Unsuitable
 from controller.core.errors import UsageError, WorkError
+from controller.core.files import read_text
 from controller.optics.capture import brackets, linear_files, raw
 from controller.optics.capture.brackets import MergedBracket
 from controller.optics.capture.pattern_frames import device_frame
@@ -103,11 +103,12 @@ def merge_brackets(
 
     Errors: ``bracket-mismatch``.
     """
-    return brackets.merge_brackets(as_images(images), exposures_s, noise=noise)
+    return brackets.merge_brackets([as_light(one) for one in images], exposures_s, noise=noise)
 
 
 DESCRIPTION: Final = "captures.toml"
 _KEYS: Final = ("projector_px", "exposure_s", "pictures", "gray", "phase")
+_SUFFIXES: Final = (*raw.RAW_SUFFIXES, *linear_files.SUFFIXES, ".png", ".jpg", ".jpeg")
 Pictures = Mapping[str, "str | Sequence[tuple[str, float]]"]
 
 
@@ -170,7 +171,8 @@ def read_captures(
     """The photographs of one projector's patterns from a folder. Each is developed at its use.
 
     ``captures.toml`` in the folder lists the file of each pattern; arguments take precedence. Without a table
-    ``[pictures]``, each file has the name of its pattern, for example ``gray-x-0.CR2``.
+    ``[pictures]``, each file has the name of its pattern, for example ``gray-x-0.CR2``; other kinds of files are left
+    out, and of several photographs a RAW file counts before an EXR, TIFF, PNG and JPEG.
 
     ::
 
@@ -204,7 +206,7 @@ def read_captures(
     if size is None:
         raise unfit(folder, "it does not give the size of the projector", "Give projector_px = [width, height].")
     named = pictures if pictures is not None else _pictures(folder, said.get("pictures"))
-    each_s = float(exposure_s if exposure_s is not None else said.get("exposure_s", 1.0))
+    each_s = exposure_s if exposure_s is not None else said.get("exposure_s", 1.0)
     files = _existing_files(folder, named, each_s)
     first = next(iter(files.values()), None)
     if first is None:
@@ -223,8 +225,10 @@ def _existing_files(folder: Path, named: Pictures, each_s: float) -> dict[str, l
     """
     files: dict[str, list[tuple[Path, float]]] = {}
     for name, value in named.items():
-        taken = [(value, each_s)] if isinstance(value, str) else value
-        files[name] = [(folder / file, float(seconds or each_s)) for file, seconds in taken]
+        taken = [(value, each_s)] if isinstance(value, str) else [(file, seconds or each_s) for file, seconds in value]
+        if not all(brackets.is_time(seconds) for _, seconds in taken):
+            raise unfit(folder, f"an exposure time of {name} is not a number above 0", "Give it in seconds.")
+        files[name] = [(folder / file, float(seconds)) for file, seconds in taken]
         missing = next((path for path, _ in files[name] if not path.is_file()), None)
         if missing is not None:
             raise UsageError(
@@ -263,8 +267,10 @@ def description_of(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        said = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        said = tomllib.loads(read_text(path))
+    except UnicodeDecodeError as error:
+        raise unfit(path, "it is not UTF-8 text", "Save it as UTF-8.") from error
+    except tomllib.TOMLDecodeError as error:
         raise unfit(path, f"it is not TOML ({error})", "Correct the line.") from error
     unknown = sorted(set(said) - set(_KEYS))
     if unknown:
@@ -272,7 +278,7 @@ def description_of(path: Path) -> dict[str, Any]:
     size = said.get("projector_px", [1, 1])
     if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)):
         raise unfit(path, "projector_px is not two whole numbers", "Write it as [1400, 1050].")
-    if not _is_time(said.get("exposure_s", 1)):
+    if not brackets.is_time(said.get("exposure_s", 1)):
         raise unfit(path, "exposure_s is not a number above 0", "Write the exposure time in seconds.")
     return said
 
@@ -280,7 +286,10 @@ def description_of(path: Path) -> dict[str, Any]:
 def _pictures(folder: Path, table: Any) -> Pictures:
     """Files by pattern from the table ``[pictures]``; without it, from the names of the files."""
     if table is None:
-        return {path.stem: path.name for path in sorted(folder.iterdir()) if path.is_file() and _is_pattern(path.stem)}
+        # What says most of light comes last, and wins: RAW before a JPEG that the camera wrote beside it.
+        photographs = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
+        photographs.sort(key=lambda path: (-_SUFFIXES.index(path.suffix.lower()), path.name))
+        return {path.stem: path.name for path in photographs if _is_pattern(path.stem)}
     if not isinstance(table, dict):
         raise unfit(folder, "pictures is not a table", "Write one line for each pattern below [pictures].")
     found: dict[str, str | Sequence[tuple[str, float]]] = {}
@@ -289,7 +298,7 @@ def _pictures(folder: Path, table: Any) -> Pictures:
         if not rows or not all(_is_taken(row) for row in rows):
             raise unfit(
                 folder,
-                f"the pattern {name} has no file name",
+                f"the pattern {name} has no file name, or no exposure time above 0",
                 'Write "FILE", or a list of { file = "FILE", exposure_s = SECONDS }.',
             )
         found[name] = [(row["file"], float(row.get("exposure_s", 0))) for row in rows]
@@ -304,11 +313,7 @@ def _is_pattern(stem: str) -> bool:
 def _is_taken(row: Any) -> bool:
     if not isinstance(row, dict) or set(row) - {"file", "exposure_s"} or not isinstance(row.get("file"), str):
         return False
-    return _is_time(row.get("exposure_s", 1))
-
-
-def _is_time(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < np.inf
+    return brackets.is_time(row.get("exposure_s", 1))
 
 
 def unfit(where: Path, why: str, remedy: str) -> UsageError:

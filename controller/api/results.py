@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from controller.api.arrays import as_image
 from controller.bundle.describe import png
-from controller.core.arrays import save_arrays
+from controller.core.arrays import as_light, save_arrays
 from controller.core.colour import linear_to_srgb
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
@@ -51,7 +50,7 @@ def compare(
 
     Errors: ``nothing-to-compare``.
     """
-    ours, theirs = as_image(achieved), as_image(target)
+    ours, theirs = as_light(achieved), as_light(target)
     matrix = SRGB_TO_XYZ if camera_to_xyz is None else np.asarray(camera_to_xyz, np.float64)
     where = np.ones(theirs.shape[:2], np.bool_) if mask is None else np.asarray(mask, np.bool_)
     return metrics.compare(ours, theirs, matrix, white, where)
@@ -96,7 +95,7 @@ def export(
         _write_mesh(path, content, picture, step)
     elif kind in (".exr", ".png") and not isinstance(content, Mapping | Geometry):
         image = _checked(path, np.asarray(content))
-        write_atomically(path, _png(image) if kind == ".png" else exr_bytes({"RGB": as_image(image)}))
+        write_atomically(path, _png(image) if kind == ".png" else exr_bytes({"RGB": np.asarray(image)}))
     else:
         raise _wrong(path, type(content).__name__)
     return path
@@ -120,7 +119,7 @@ def _checked(path: Path, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _png(image: npt.NDArray[Any]) -> bytes:
     if image.dtype == np.uint8:
         return png(image)
-    return png(np.rint(255 * linear_to_srgb(as_image(np.nan_to_num(image)))).astype(np.uint8))
+    return png(np.rint(255 * linear_to_srgb(as_light(np.nan_to_num(image)))).astype(np.uint8))
 
 
 def _wrong(path: Path, what: str) -> UsageError:

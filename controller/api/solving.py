@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from controller.api.arrays import as_image, as_images
 from controller.config.defaults import SMOOTHNESS
-from controller.core.arrays import ByteImage, FloatImage, Mask
+from controller.core.arrays import ByteImage, FloatImage, Mask, as_light
 from controller.optics.calibrate.values import Calibration, Radiometry
 from controller.optics.solve import appearance
 from controller.optics.solve.appearance import Base
@@ -61,7 +60,7 @@ def reachable_target(
 
     Errors: ``image-wrong-size``, ``target-not-finite``, ``share-out-of-range``, ``no-light``.
     """
-    wanted = as_image(picture)
+    wanted = as_light(picture)
     dark = _black(black, wanted)
     found = expose_target(transport, wanted, dark, share=share, indirect=indirect)
     radiance, direct = (target_radiance(image, dark, 1.0) for image in (found.wanted, found.needed))
@@ -105,15 +104,15 @@ def solve(
 
     Errors: ``image-wrong-size``, ``target-not-finite``, ``solve-arguments``.
     """
-    wanted = as_image(target)
+    wanted = as_light(target)
     return solve_bounded(
         transport,
         wanted,
         _black(black, wanted),
         SolveSettings(
             smoothness,
-            None if weights is None else as_image(weights),
-            None if start is None else as_images(start),
+            None if weights is None else as_light(weights),
+            None if start is None else [as_light(one) for one in start],
             tolerance,
             most_iterations,
         ),
@@ -157,7 +156,7 @@ def solve_base(
 
     Errors: as ``solve``.
     """
-    wanted = as_image(image)
+    wanted = as_light(image)
     dark = _black(black, wanted)
     return appearance.solve_base(transport, wanted, dark, SolveSettings(smoothness, tolerance=tolerance))
 
@@ -181,7 +180,7 @@ def scale(
 
     Errors: ``image-wrong-size``, ``target-not-finite``.
     """
-    wanted = as_image(target)
+    wanted = as_light(target)
     return appearance.scale_frames(transport, base, wanted, _black(black, wanted))
 
 
@@ -205,8 +204,8 @@ def encode(
 
     Errors: ``frame-shape-wrong``, ``response-not-rising``.
     """
-    return to_device(as_image(frame), radiometry, method=dither)
+    return to_device(as_light(frame), radiometry, method=dither)
 
 
 def _black(black: npt.ArrayLike | None, like: FloatImage) -> FloatImage:
-    return np.zeros_like(like) if black is None else as_image(black)
+    return np.zeros_like(like) if black is None else as_light(black)

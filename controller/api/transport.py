@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from controller.api.arrays import as_image
 from controller.core import channels
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, as_light
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import LightTransport, factory
@@ -101,7 +100,7 @@ def transport_from_matrices(
     """
     shape = (camera_px[1], camera_px[0])
     rows = [_matrix(matrix, shape, size) for matrix, size in zip(matrices, projectors_px, strict=True)]
-    light = [_row_sums(matrix, shape) for matrix in rows] if whites is None else [as_image(white) for white in whites]
+    light = [_row_sums(matrix, shape) for matrix in rows] if whites is None else [as_light(white) for white in whites]
     mixed = np.broadcast_to(np.eye(3), (len(rows), 3, 3)) if mixing is None else np.asarray(mixing, np.float64)
     parts = tuple(
         ProjectorCalibration(str(n), _without_metapixels(size), Radiometry(LINEAR.response, mixed[n]), white)

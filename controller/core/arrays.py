@@ -170,3 +170,18 @@ def _is_mapped(array: npt.NDArray[Any]) -> bool:
     while isinstance(owner, np.ndarray):
         owner = owner.base
     return isinstance(owner, memoryview | mmap.mmap)
+
+
+def as_light(values: npt.ArrayLike) -> FloatImage:
+    """Linear light as contiguous float32; without a copy where it is that already.
+
+    Raises UsageError("image-not-light") for whole numbers above 1, which are those of a file.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind in "iu" and array.size and array.max() > 1:
+        raise UsageError(
+            "image-not-light",
+            what=f"The array has whole numbers up to {array.max()}, and linear light goes from 0 to 1.",
+            remedy="Divide by the largest number of the file's type, and set saturated samples to NaN.",
+        )
+    return np.ascontiguousarray(array, np.float32)

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import numba
 import numpy as np
@@ -89,9 +90,11 @@ def merge_brackets(
             what="The photographs of a bracket differ in size, or their number differs from the number of exposures.",
             remedy="Give one exposure time for each photograph, and use photographs of one size.",
         )
-    if min(exposures_s) <= 0:
+    if not all(is_time(one) for one in exposures_s):
         raise UsageError(
-            "bracket-mismatch", what="An exposure time is not above zero.", remedy="Give exposure times in seconds."
+            "bracket-mismatch",
+            what="An exposure time is not a number above zero.",
+            remedy="Give exposure times in seconds, for example 0.04 for 1/25.",
         )
     noise = noise or _noise_of(images, exposures_s)
     flat = [np.ascontiguousarray(image, np.float32).reshape(-1) for image in images]
@@ -100,6 +103,11 @@ def merge_brackets(
     for part in strips(len(radiance), AT_ONCE):
         _merge([image[part] for image in flat], exposures_s, noise, radiance[part], sigma[part])
     return MergedBracket(radiance.reshape(images[0].shape), sigma.reshape(images[0].shape))
+
+
+def is_time(value: object) -> bool:
+    """Whether a value is an exposure time in seconds: a finite number above 0."""
+    return isinstance(value, Real) and not isinstance(value, bool) and 0 < float(value) < math.inf
 
 
 def _noise_of(images: Sequence[FloatImage], exposures_s: Sequence[float]) -> CameraNoise:

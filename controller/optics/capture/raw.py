@@ -25,6 +25,10 @@ from controller.optics.capture.profile import CameraProfile
 SATURATED_SHARE = 0.985
 """Of full scale: sensors become nonlinear shortly before they clip."""
 JPEG_SATURATED = 254
+RAW_SUFFIXES = (
+    ".dng", ".cr3", ".cr2", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".rw2", ".raw", ".orf", ".pef",
+    ".srw", ".3fr", ".fff", ".iiq", ".erf", ".mef", ".mos", ".mrw", ".dcr", ".kdc", ".x3f",
+)  # fmt: skip
 SINGULAR = 1e-6
 SRGB_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 """D65, with the digits that LibRaw uses."""
@@ -159,14 +163,16 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
 
 def _unreadable(path: Path, reason: Exception) -> WorkError:
     words = reason.strerror if isinstance(reason, OSError) and reason.strerror else reason
-    if reason.args and isinstance(reason.args[0], bytes):  # LibRaw's
+    remedy = "Take it again; if this happens often, check the camera's card and cable."
+    if isinstance(reason, Unsuitable):
+        remedy = "Take it again, or convert it to a TIFF of 16 bits in red, green and blue."
+    elif reason.args and isinstance(reason.args[0], bytes):  # LibRaw's
         words = reason.args[0].decode("ascii", "replace")
         with path.open("rb") as file:
-            words = HEIC if is_heic(file.read(12)) else words
+            if is_heic(file.read(12)):
+                words, remedy = HEIC, "Set the camera to RAW or JPEG, and take it again."
     return WorkError(
-        "photograph-unreadable",
-        what=f"The photograph {path.name} can't be read ({words}).",
-        remedy="Take it again; if this happens often, check the camera's card and cable.",
+        "photograph-unreadable", what=f"The photograph {path.name} can't be read ({words}).", remedy=remedy
     )
 
 

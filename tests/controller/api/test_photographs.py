@@ -124,6 +124,61 @@ def test_files_named_after_their_patterns_need_only_the_projectors_size(tmp_path
     np.testing.assert_array_equal(found.pictures["gray-x-0"], np.full((4, 5, 3), 2, np.float32))
 
 
+def test_what_says_most_of_light_is_taken_and_nothing_else(tmp_path: Path) -> None:
+    light = np.full((4, 5, 3), 0.25, np.float32)
+    for name in ("black.exr", "white.exr"):
+        api.export(tmp_path / name, light)
+    for beside in ("white.JPG", "white.xmp", "white.txt", "black.png", "black.pp3", "._white.exr"):
+        (tmp_path / beside).write_bytes(b"no photograph")
+    (tmp_path / "gray-x-0.dng").mkdir()
+    found = api.read_captures(tmp_path, projector_px=(64, 48))
+    assert set(found.pictures) == {"black", "white"}
+    np.testing.assert_array_equal(found.pictures["white"], light)
+
+
+@pytest.mark.parametrize("raw", ["white.DNG", "white.cr3", "white.ARW"])
+def test_a_raw_file_goes_before_the_jpeg_beside_it(tmp_path: Path, raw: str) -> None:
+    for name in (raw, "white.JPG", "white.tif"):
+        (tmp_path / name).write_bytes(b"none")
+    with pytest.raises(api.VelaturaError, match=raw):
+        api.read_captures(tmp_path, projector_px=(64, 48))
+
+
+def test_a_description_by_other_editors_is_read_or_told_how_to_save_it(tmp_path: Path) -> None:
+    api.export(tmp_path / "black.exr", np.zeros((4, 5, 3), np.float32))
+    file = tmp_path / "captures.toml"
+    file.write_text("projector_px = [64, 48]\r\n", encoding="utf-8-sig")
+    assert api.read_captures(tmp_path).projector_px == (64, 48)
+    for encoding in ("utf-16", "latin-1"):
+        file.write_text("projector_px = [64, 48] # Gr\xf6\xdfe", encoding=encoding)
+        with pytest.raises(api.VelaturaError, match="Save it as UTF-8"):
+            api.read_captures(tmp_path)
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), "1/25", 0.0, -1.0, float("inf"), None, True])
+def test_an_exposure_time_that_is_none_is_refused(tmp_path: Path, seconds: Any) -> None:
+    light = np.full((4, 5, 3), 0.25, np.float32)
+    with pytest.raises(api.VelaturaError) as refused:
+        api.merge_brackets([light, light], [0.04, seconds])
+    assert refused.value.code == "bracket-mismatch"
+    api.export(tmp_path / "white.exr", light)
+    if seconds:
+        with pytest.raises(api.VelaturaError) as refused:
+            api.read_captures(tmp_path, projector_px=(64, 48), pictures={"white": [("white.exr", seconds)]})
+        assert refused.value.code == "captures-description-wrong"
+
+
+def test_numbers_of_files_are_not_taken_for_light() -> None:
+    coded = np.full((4, 5, 3), 200, np.uint8)
+    with pytest.raises(api.VelaturaError, match="200") as refused:
+        api.merge_brackets([coded, coded], [0.1, 0.4])
+    assert refused.value.code == "image-not-light"
+    captures = api.CaptureSet(dict.fromkeys(api.draw_patterns((64, 48)), coded), (64, 48))  # type: ignore[arg-type]
+    with pytest.raises(api.VelaturaError) as refused:
+        api.decode(captures)
+    assert refused.value.code == "image-not-light"
+
+
 def test_several_exposures_of_a_pattern_are_merged(tmp_path: Path) -> None:
     api.export(tmp_path / "short.png", np.full((4, 5, 3), 51, np.uint8))
     api.export(tmp_path / "long.png", np.full((4, 5, 3), 255, np.uint8))

@@ -18,7 +18,7 @@ from typing import Final, TypeAlias
 import cv2
 import numpy as np
 
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, as_light
 from controller.core.channels import every, finite
 from controller.core.errors import CalibrationError
 from controller.optics.capture.patterns import Pattern, PatternPlan
@@ -30,7 +30,7 @@ Captures: TypeAlias = Mapping[str, FloatImage]
 def coloured(captures: Captures, name: str, shape: tuple[int, ...] | None = None) -> FloatImage:
     """The photograph of one pattern, checked against the ``shape`` (rows, columns) of the others.
 
-    Raises CalibrationError("capture-missing") or CalibrationError("capture-shape-wrong").
+    Raises CalibrationError("capture-missing", "capture-shape-wrong"), UsageError("image-not-light").
     """
     try:
         image = captures[name]
@@ -46,7 +46,7 @@ def coloured(captures: Captures, name: str, shape: tuple[int, ...] | None = None
             what=f"The photograph of pattern {name} has the shape {image.shape}, unlike the others.",
             remedy="Do not change the camera's picture size during a calibration, and take the photographs again.",
         )
-    return np.ascontiguousarray(image, dtype=np.float32)
+    return as_light(image)
 
 
 def grey(captures: Captures, name: str, shape: tuple[int, ...] | None = None) -> FloatImage:

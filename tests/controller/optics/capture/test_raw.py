@@ -107,6 +107,27 @@ def test_a_damaged_or_missing_file_is_explained(content: bytes | None, tmp_path:
         assert caught.value.code == "photograph-unreadable"
 
 
+def test_the_reason_for_a_refusal_is_in_words(scene: Float64, tmp_path: Path) -> None:
+    write_dng(tmp_path / "cut.dng", mosaic_of(scene, RGGB))
+    whole = (tmp_path / "cut.dng").read_bytes()
+    (tmp_path / "cut.dng").write_bytes(whole[: len(whole) * 6 // 10])
+    (tmp_path / "phone.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(2000))
+    for name, reason in (("cut.dng", r"\(Input/output error\)"), ("phone.heic", "HEIC.*not read")):
+        with pytest.raises(WorkError, match=reason) as refused:
+            read_photograph(tmp_path / name)
+        assert "b'" not in str(refused.value)
+    assert "JPEG" in refused.value.remedy
+
+
+def test_a_sensor_without_colours_is_refused(scene: Float64, tmp_path: Path) -> None:
+    tags = [(50706, "B", 4, bytes([1, 4, 0, 0]), True), (50708, "s", 0, "Test Camera", True)]
+    values = mosaic_of(scene, RGGB)
+    tifffile.imwrite(tmp_path / "mono.dng", values, photometric=34892, extratags=tags, metadata=None)
+    with pytest.raises(UsageError) as refused:
+        read_photograph(tmp_path / "mono.dng")
+    assert refused.value.code == "raw-not-bayer"
+
+
 def test_a_jpeg_is_read_through_its_response_and_refused_without(tmp_path: Path) -> None:
     grey = np.full((32, 32, 3), 128, np.uint8)
     grey[:8] = 255
