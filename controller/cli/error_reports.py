@@ -129,8 +129,8 @@ def _kept(report: str, name: str) -> Path | None:
             place.mkdir(parents=True, exist_ok=True)
             path = place / name
             # Only a new file, readable only for this user: the folder may be shared.
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-                file.write(report)
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(report.encode(errors="backslashreplace"))
         except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
             continue
         return path

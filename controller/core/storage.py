@@ -129,7 +129,7 @@ def runtime_path(stage: Path) -> Path:
     if kiosk_places.is_installed(stage):
         return kiosk_places.RUNTIME
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir())
-    digest = hashlib.sha256(str(stage.resolve()).encode()).hexdigest()[:12]
+    digest = hashlib.sha256(os.fsencode(stage.resolve())).hexdigest()[:12]
     folder = base / f"velatura-{os.getuid()}-{digest}"
     with contextlib.suppress(FileNotFoundError):
         _refuse_unsafe(folder)

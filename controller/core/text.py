@@ -10,6 +10,11 @@ def printable(text: str) -> str:
     )
 
 
+def well_formed(text: str) -> str:
+    """Text that can be written as UTF-8: "?" for each byte of a file's name that is not."""
+    return text.encode(errors="replace").decode()
+
+
 def duration(seconds: float) -> str:
     """A duration for people: ``8 s``, ``2 min 05 s``, ``1 h 20 min``."""
     whole = max(0, round(seconds))

@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from controller.core.errors import WorkError
 from controller.core.storage import sha256_of, sync_folder
+from controller.core.text import well_formed
 from controller.run.state_machine import Change
 from controller.run.step_id import ShotId, StepId
 from hal.notices import Level
@@ -193,7 +194,7 @@ class Journal:
         """Write one event: a device error, a retry, a decision. ``text`` may contain a device's text."""
         self._write(
             "INSERT INTO events (run, at_s, level, code, text) VALUES (?, ?, ?, ?, ?)",
-            *(self._run, _now(), level.value, code, text),
+            *(self._run, _now(), level.value, code, well_formed(text)),
         )
 
     def record_change(self, change: Change) -> None:

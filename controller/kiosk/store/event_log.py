@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
+from controller.core.text import well_formed
 from controller.kiosk.interface import EventRow
 from controller.kiosk.store.log_file import MOST_DONE, Content, LogFile
 from hal.notices import Notice
@@ -57,7 +58,7 @@ class EventLog:
         """Add one line. A disk error is not raised."""
         with self._lock:
             self._number += 1
-            row = EventRow(self._number, self._wall(), notice.level.value, notice.text, notice.code)
+            row = EventRow(self._number, self._wall(), notice.level.value, well_formed(notice.text), notice.code)
             self._recent.append(row)
             self._waiting.append(row)
             self._flush()

@@ -31,12 +31,12 @@ def safe_name(name: str) -> str:
     plain = "".join(one if one.isprintable() and one != "%" else _escaped(one) for one in name)
     if len(plain.encode()) <= MOST_BYTES:
         return plain
-    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
+    digest = hashlib.sha256(name.encode(errors="surrogateescape")).hexdigest()[:16]
     return f"{plain.encode()[:150].decode(errors='ignore')}%~{digest}"
 
 
 def _escaped(one: str) -> str:
-    return "".join(f"%{byte:02X}" for byte in one.encode())
+    return "".join(f"%{byte:02X}" for byte in one.encode(errors="surrogateescape"))
 
 
 def stem(kind: str, name: str | None = None, *, part: int | None = None) -> str:
