@@ -38,7 +38,6 @@ from plugins.emulated.core.truth import (
     read_truth,
     write_truth,
 )
-from plugins.emulated.optics.bumps import bumps_of, write_bumps
 from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_engine, read_room, read_stands
 from plugins.emulated.optics.objects import default_object, load_object
 from plugins.emulated.optics.staging import (
@@ -142,10 +141,9 @@ class EmulatedBench:
         return device_tables(truth, shape)
 
     def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
-        """``changes``: tables of bench/bumps.toml (``plugins.emulated.optics.bumps``). Raises as ``read_bumps``."""
-        bumps = bumps_of(changes, read_truth(stage))
+        """``changes``: tables of bench/bumps.toml (``lab.emulated.bumps``, which raises DeviceError for wrong ones)."""
         with _explained(stage):
-            write_bumps(stage, *bumps.bump)
+            extension("bumps", asked_by="A disturbed stage").disturb(stage, changes)
 
     def serve(self, stage: Path, *, json_lines: bool, scenario: Path | None = None) -> int:
         """Serve the stage's devices until SIGINT or SIGTERM; returns 0, or 3 when a device can't be served.

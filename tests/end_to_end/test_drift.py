@@ -22,7 +22,7 @@ from controller.stage.services.calibrate import AppearanceOrder, calibrate, make
 from controller.stage.services.recalibrate import check_drift, recalibrate
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.session import OwnSession
-from plugins.emulated.optics.bumps import Bump, write_bumps
+from lab.emulated.bumps import Bump, write_bumps
 from tests.end_to_end.kiosk import with_ports_of_its_own
 from tests.end_to_end.program import REPOSITORY
 

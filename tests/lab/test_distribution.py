@@ -29,7 +29,7 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
     assert all(requirement.endswith(f"=={version}") for requirement in PROJECT["project"]["dependencies"])
 
 
-@pytest.mark.parametrize("part", ["boards", "dousers", "mitsuba", "scenario", "tape", "usb"])
+@pytest.mark.parametrize("part", ["boards", "bumps", "dousers", "mitsuba", "scenario", "tape", "usb"])
 def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert EntryPoint(part, PROJECT["project"]["entry-points"][extensions.GROUP][part], extensions.GROUP).load()
     monkeypatch.setattr(extensions, "entry_points", lambda group, name: ())

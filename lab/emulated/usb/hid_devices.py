@@ -122,12 +122,12 @@ class EmulatedLightSensor(EmulatedHidDevice):
     def follow(self, stage: str) -> float:
         """See the ambient light of an emulated stage, with its bumps, as it is now; the lux. Raises DeviceError."""
         # Here: the bench's geometry is slow to load, and few who have a bus have a bench.
-        from plugins.emulated.core.truth import read_truth
-        from plugins.emulated.optics.bumps import FILE, bumped, read_bumps
+        from lab.emulated.bumps import bumped, read_bumps
+        from plugins.emulated.core.truth import BUMPS_FILE, read_truth
 
         folder = Path(stage)
         set_up = read_truth(folder)
-        truth = bumped(set_up, read_bumps(folder / FILE, set_up))
+        truth = bumped(set_up, read_bumps(folder / BUMPS_FILE, set_up))
         self.lux = LUX_AT_WHITE * sum(truth.ambient) / len(truth.ambient)
         return self.lux
 

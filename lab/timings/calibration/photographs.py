@@ -28,11 +28,11 @@ from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
 from hal.errors import CodedError
+from lab.emulated.bumps import Bump, write_bumps
 from lab.timings import Row, at_least, at_most
 from lab.timings.tools.judge import map_errors, noise_free, random_errors
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
 from lab.timings.tools.truth import Truth
-from plugins.emulated.optics.bumps import Bump, write_bumps
 
 MISCONVERGED_PX: Final = 0.3
 SETS: Final = ("full", "few", "fewest")

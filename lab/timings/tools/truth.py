@@ -14,9 +14,9 @@ from embreex.mesh_construction import TriangleMesh
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.capture.raw import develop
+from lab.emulated.bumps import bumped, read_bumps
+from plugins.emulated.core.truth import BUMPS_FILE as BUMPS
 from plugins.emulated.core.truth import FOLDER, BenchTruth, read_truth
-from plugins.emulated.optics.bumps import FILE as BUMPS
-from plugins.emulated.optics.bumps import bumped, read_bumps
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject

@@ -64,6 +64,7 @@ Matrix: TypeAlias = tuple[Three, Three, Three]
 FILE_NAME: Final = "bench.toml"
 FOLDER: Final = "bench"
 DEFAULT_BOARD: Final = "optoma-later"
+BUMPS_FILE: Final = f"{FOLDER}/bumps.toml"
 USB_FILE: Final = f"{FOLDER}/usb.toml"
 ENGINES: Final = ("direct", "radiosity", "mitsuba")
 """Of light between surfaces."""

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
-from plugins.emulated.core.truth import FOLDER, BenchTruth, ObjectTruth
-from plugins.emulated.optics.bumps import FILE as BUMPS
-from plugins.emulated.optics.bumps import bumped, read_bumps
+from plugins.emulated.core.truth import BUMPS_FILE, FOLDER, BenchTruth, ObjectTruth
 from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
 from plugins.emulated.optics.effects import exposed_s, flickering, sensor_flaws
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
@@ -78,9 +77,9 @@ class World:
         """Look at the bumps of the stage; where they have changed, let them count, and return how many there are.
 
         Rays are cast again for that; until they are, pictures show the stage as it was.
-        Raises DeviceError as ``read_bumps``; the stage then stays as it is.
+        Raises DeviceError for a wrong file, or ``bench-part-missing``; the stage then stays as it is.
         """
-        path = self._stage / BUMPS
+        path = self._stage / BUMPS_FILE
         try:
             state = path.stat()
             seen: tuple[int, int] | None = (state.st_mtime_ns, state.st_size)
@@ -89,16 +88,17 @@ class World:
         if seen == self._bumps_seen:
             return None
         self._bumps_seen = seen
-        bumps = read_bumps(path, self._set_up)
-        truth = bumped(self._set_up, bumps)
+        truth, count = self._set_up, 0
+        if seen is not None:
+            truth, count = extension("bumps", asked_by=BUMPS_FILE).changed(path, self._set_up)
         if truth == self._truth:
-            return len(bumps.bump)
+            return count
         samples = self._samples
-        if bumps.bump:
+        if count:
             samples = samples_of(truth, object_of(self._stage, truth.object), None, lambda share: None)
-        transfer = self._indirect.transfer(truth, samples.pixels, lambda share: None, keep=not bumps.bump)
+        transfer = self._indirect.transfer(truth, samples.pixels, lambda share: None, keep=not count)
         self._truth, self._renderer = truth, Renderer(truth, samples, transfer)
-        return len(bumps.bump)
+        return count
 
     def expose(self, settings: ShotSettings) -> ShotFiles:
         """Take one picture of what is visible during the (scaled) exposure time; lasts ``picture_s`` at least."""

@@ -13,9 +13,9 @@ import pytest
 import trimesh
 
 from hal.errors import DeviceError
+from lab.emulated.bumps import bumped, read_bumps
 from plugins.emulated.bench import EmulatedBench
-from plugins.emulated.core.truth import BenchTruth
-from plugins.emulated.optics.bumps import FILE, bumped, read_bumps
+from plugins.emulated.core.truth import BUMPS_FILE, BenchTruth
 from plugins.emulated.optics.objects import StageObject, load_object
 from plugins.emulated.optics.rays import cast, directions
 from plugins.emulated.optics.render import Renderer
@@ -101,7 +101,7 @@ def test_a_bench_is_disturbed_and_mended(tmp_path: Path) -> None:
         {"what": "ambient", "indirect": 0.01},
     ]
     bench.disturb(tmp_path, changes)
-    now = bumped(truth, read_bumps(tmp_path / FILE, truth))
+    now = bumped(truth, read_bumps(tmp_path / BUMPS_FILE, truth))
     before, after = truth.projectors[0], now.projectors[0]
     assert after.light.gamma == pytest.approx([1.1 * value for value in before.light.gamma])
     assert after.focus.distance_m == pytest.approx(before.focus.distance_m + 0.03)
@@ -111,7 +111,7 @@ def test_a_bench_is_disturbed_and_mended(tmp_path: Path) -> None:
     assert now.camera.sensor.noise == 3.0
     assert (now.object.gloss, now.indirect) == (0.05, 0.01)
     bench.disturb(tmp_path, ())
-    assert bumped(truth, read_bumps(tmp_path / FILE, truth)) == truth
+    assert bumped(truth, read_bumps(tmp_path / BUMPS_FILE, truth)) == truth
 
 
 @pytest.mark.parametrize(
@@ -125,4 +125,4 @@ def test_a_change_that_the_bench_does_not_know_is_refused_and_changes_nothing(
     with pytest.raises(DeviceError) as refused:
         bench.disturb(tmp_path, [change])
     assert refused.value.code == "bumps-wrong"
-    assert not (tmp_path / FILE).exists()
+    assert not (tmp_path / BUMPS_FILE).exists()

@@ -36,7 +36,7 @@ from hal.errors import DeviceError
 from hal.runtime.files import read_text
 from plugins.emulated.core.tables import Between, dump, load
 from plugins.emulated.core.truth import (
-    FOLDER,
+    BUMPS_FILE,
     BenchTruth,
     Lens,
     Matrix,
@@ -46,12 +46,12 @@ from plugins.emulated.core.truth import (
     Three,
     Two,
     matrix_of,
+    read_truth,
     rotation_vector_of,
     three,
 )
 from plugins.emulated.optics.rays import directions
 
-FILE: Final = f"{FOLDER}/bumps.toml"
 KINDS: Final = ("projector", "camera", "object", "ambient")
 Floats = npt.NDArray[np.float64]
 
@@ -113,9 +113,9 @@ def bumps_of(changes: Sequence[Mapping[str, Any]], truth: BenchTruth) -> Bumps:
     try:
         bumps = Bumps(tuple(Bump(**change) for change in changes))
     except TypeError as error:
-        raise _wrong(Path(FILE), str(error)) from error
-    checked = load(dump(bumps), Bumps, file=FILE) if changes else bumps
-    _check(Path(FILE), checked, truth)
+        raise _wrong(Path(BUMPS_FILE), str(error)) from error
+    checked = load(dump(bumps), Bumps, file=BUMPS_FILE) if changes else bumps
+    _check(Path(BUMPS_FILE), checked, truth)
     return checked
 
 
@@ -132,7 +132,7 @@ def _check(path: Path, bumps: Bumps, truth: BenchTruth) -> None:
 
 def write_bumps(stage: Path, *bumps: Bump) -> None:
     """Bump the stage, in one step; without bumps: restore it."""
-    path = stage / FILE
+    path = stage / BUMPS_FILE
     if not bumps:
         path.unlink(missing_ok=True)
         return
@@ -143,6 +143,17 @@ def write_bumps(stage: Path, *bumps: Bump) -> None:
 
 def _wrong(path: Path, why: str) -> DeviceError:
     return DeviceError("bumps-wrong", what=f"{path}: {why}.", remedy="Correct the file, or remove it.")
+
+
+def changed(path: Path, truth: BenchTruth) -> tuple[BenchTruth, int]:
+    """A stage after the bumps of its file, and how many these are. Raises DeviceError as ``read_bumps``."""
+    bumps = read_bumps(path, truth)
+    return bumped(truth, bumps), len(bumps.bump)
+
+
+def disturb(stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
+    """Bump a stage by tables as its file has them. Raises DeviceError as ``read_bumps``."""
+    write_bumps(stage, *bumps_of(changes, read_truth(stage)).bump)
 
 
 def bumped(truth: BenchTruth, bumps: Bumps) -> BenchTruth:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hal.errors import DeviceError
-from plugins.emulated.core.truth import BenchTruth, Lens, ObjectTruth, Pose
-from plugins.emulated.optics.bumps import FILE, Bump, Bumps, bumped, read_bumps, write_bumps
+from lab.emulated.bumps import Bump, Bumps, bumped, read_bumps, write_bumps
+from plugins.emulated.core.truth import BUMPS_FILE, BenchTruth, Lens, ObjectTruth, Pose
 from plugins.emulated.optics.objects import default_object
 from plugins.emulated.optics.rays import project
 from plugins.emulated.optics.staging import random_truth
@@ -64,9 +64,9 @@ def test_bumps_are_read_as_they_were_written_and_their_absence_mends_all(tmp_pat
     (tmp_path / "bench").mkdir()
     bumps = (Bump("camera", shift_px=(1.0, 0.0)), Bump("ambient", factor=2.0))
     write_bumps(tmp_path, *bumps)
-    assert read_bumps(tmp_path / FILE, truth()).bump == bumps
+    assert read_bumps(tmp_path / BUMPS_FILE, truth()).bump == bumps
     write_bumps(tmp_path)
-    assert bumped(truth(), read_bumps(tmp_path / FILE, truth())) == truth()
+    assert bumped(truth(), read_bumps(tmp_path / BUMPS_FILE, truth())) == truth()
 
 
 @pytest.mark.parametrize(
