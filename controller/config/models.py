@@ -51,7 +51,9 @@ class BackupTable(ConfigTable):
         "/etc/ssh/ssh_host_ed25519_key.pub there; needed for ssh",
     )  # fmt: skip
     at: str = Field(
-        default="04:30", pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", description='the local time "HH:MM" of the backup'
+        default="04:30",
+        pattern=r"^(([01][0-9]|2[0-3]):[0-5][0-9]|24:00)$",
+        description='the local time "HH:MM" of the backup',
     )
     keep: int = Field(default=7, ge=1, le=366, description="how many backups stay in the folder, 1 to 366")
 

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Final, Protocol
@@ -87,8 +87,8 @@ class Server:
             archive.check_backup(back, source.parent)
         # What it says about the folder ends the command, so that nothing is renamed in a wrong one.
         listed = self._sftp(f'rename "{self._at(part)}" "{self._at(name)}"', f'ls -1 "{self._folder}"')
-        ours = sorted({word for line in listed if OURS.fullmatch(word := line.strip().rpartition("/")[2])})
-        if old := ours[:-keep]:
+        ours = {word for line in listed if OURS.fullmatch(word := line.strip().rpartition("/")[2])}
+        if old := _oldest(ours, name, keep):
             self._sftp(*(f'rm "{self._at(one)}"' for one in old))
         size_mb = source.stat().st_size / 1e6
         return Notice("backup-made", f"The backup {name} ({size_mb:.0f} MB) was sent to {self._host} and read back.")
@@ -161,6 +161,11 @@ class Place(Protocol):
         """
 
 
+def _oldest(names: Iterable[str], newest: str, keep: int) -> Sequence[str]:
+    """All but the newest ``keep``. Those of days after ``newest`` count as oldest: the clock was ahead then."""
+    return sorted(names, key=lambda name: (name <= newest, name))[:-keep]
+
+
 class Folder:
     """A folder. A missing one is never made: it is the mount point of a disk that is not there."""
 
@@ -176,9 +181,9 @@ class Folder:
             raise WorkError("backup-folder-missing", what=f"The folder for backups, {folder}, does not exist.",
                             remedy="Plug the disk in, mount it, or correct [backup] in stage.toml.")  # fmt: skip
         copy = copied(source, folder / NAME.format(day))
-        ours = sorted(path for path in folder.iterdir() if OURS.fullmatch(path.name))
-        for old in ours[:-keep]:
-            old.unlink()
+        ours = {path.name for path in folder.iterdir() if OURS.fullmatch(path.name)}
+        for old in _oldest(ours, copy.name, keep):
+            (folder / old).unlink()
         text = f"The backup {copy.name} ({copy.stat().st_size / 1e6:.0f} MB) was made and read back."
         if folder.stat().st_dev == self._stage.stat().st_dev:
             remedy = "It is on the same disk as the stage. Choose a folder on another disk."
@@ -297,12 +302,12 @@ class NightlyBackup:
         """Make the backup of this day where it is due. One place that fails holds up no other."""
         table, now_s = self._table(), self._wall()
         now = datetime.fromtimestamp(now_s, zone_of(self._zone()))
-        late_min = now.hour * 60 + now.minute - int(table.at[:2]) * 60 - int(table.at[3:])
+        late_min = now.hour * 60 + now.minute - int(table.at[:2]) % 24 * 60 - int(table.at[3:])
         if not 0 <= late_min < WINDOW_MIN or self._busy():
             return
         done, day = self._log.done(), now.date().isoformat()
         due = {_key(place, day): place for place in self._places(self._stage, table)}
-        due = {key: one for key, one in due.items() if key not in done and now_s >= self._again_at_s.get(one.name, 0.0)}
+        due = {key: one for key, one in due.items() if key not in done and not self._pauses(one, now_s)}
         if not due:
             return
         lacks = archive.missing(self._stage)
@@ -327,6 +332,10 @@ class NightlyBackup:
                 self._log.add(stored)
         finally:
             source.unlink()
+
+    def _pauses(self, place: Place, now_s: float) -> bool:
+        """Whether a failure there was a short time ago; not if the clock was set back since."""
+        return 0.0 < self._again_at_s.get(place.name, 0.0) - now_s <= AGAIN_S
 
     def now(self) -> None:
         """Make a backup wherever stage.toml says, whatever the time. Minutes.

@@ -23,13 +23,13 @@ from controller.core.errors import UsageError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
 from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.kiosk.values import IN_TURN
+from controller.kiosk.values import IN_TURN, MIDNIGHT
 
 if TYPE_CHECKING:  # the models need pydantic, and `velatura --help` gets here
     from controller.config.models import ScheduleTable
 
 WEEKDAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
-_TIME: Final = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]")
+_TIME: Final = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]|24:00")
 MOST_ROWS: Final = 1000
 
 
@@ -75,7 +75,7 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
             )
         for text in (row.opens, row.closes):
             if text and not _TIME.fullmatch(text):
-                raise _wrong(f"A time of row {number}", text, '"HH:MM", from 00:00 to 23:59')
+                raise _wrong(f"A time of row {number}", text, '"HH:MM", from 00:00 to 24:00')
         if row.appearance not in ("", IN_TURN) and appearances is not None and row.appearance not in appearances:
             known = ", ".join(sorted(appearances))
             allowed = (
@@ -133,6 +133,8 @@ def _date(text: str) -> date | None:
 
 def moment(day: date, clock: str, zone: ZoneInfo) -> float:
     """Unix seconds of a local time. Skipped times shift with the clock; of repeated times, the first counts."""
+    if clock == MIDNIGHT:
+        day, clock = day + timedelta(days=1), "00:00"
     return datetime.combine(day, time_of_day.fromisoformat(clock), tzinfo=zone).timestamp()
 
 

@@ -137,18 +137,26 @@ class Comparison:
     pictures: Pictures = field(default_factory=dict)
 
 
+MIDNIGHT: Final = "24:00"
+"""The end of a day, as people write it."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScheduleRow:
     """Opening hours of one weekday ("mon".."sun") or of one date ("2026-12-24", which takes precedence over weekdays).
 
     ``opens`` and ``closes`` are local times "HH:MM"; both empty means closed. ``closes`` at or before ``opens`` is on
-    the next day. ``appearance`` empty: the last one.
+    the next day, and 24:00 becomes 00:00. ``appearance`` empty: the last one.
     """
 
     day: str
     opens: str
     closes: str
     appearance: str = ""
+
+    def __post_init__(self) -> None:
+        if self.closes == MIDNIGHT:
+            object.__setattr__(self, "closes", "00:00")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +166,10 @@ class Schedule:
     time_zone: str
     rows: tuple[ScheduleRow, ...] = ()
     drift_check: str = ""
+
+    def __post_init__(self) -> None:
+        if self.drift_check == MIDNIGHT:
+            object.__setattr__(self, "drift_check", "00:00")
 
 
 @dataclass(frozen=True, slots=True)

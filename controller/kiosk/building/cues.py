@@ -87,7 +87,10 @@ def _cue(line: int, cells: Sequence[str], before: Cue | None) -> Cue:
         raise _wrong(line, f"{cells[0][:30]!r} is not a time such as 18:30, 2026-12-24 18:30 or +90")
     try:
         day = None if match[1] is None else date.fromisoformat(match[1])
-        return Cue(line, day, time_of_day(int(match[2]), int(match[3]), int(match[4] or 0)), 0.0, verb, values)
+        hour, minute, second = (int(part or 0) for part in match.group(2, 3, 4))
+        if (hour, minute, second) == (24, 0, 0):
+            hour, day = 0, day and day + timedelta(days=1)
+        return Cue(line, day, time_of_day(hour, minute, second), 0.0, verb, values)
     except ValueError as error:
         raise _wrong(line, f"{cells[0][:30]!r} does not exist") from error
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Coroutine, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
 from pydantic import Field, field_validator
@@ -25,6 +26,8 @@ from hal.links import host_and_port
 
 ROOT: Final = "/velatura/"
 MOST_WAITING: Final = 50
+LONGEST_WAIT_S: Final = 3600.0
+"""A bundle of a later time is refused: the clock of its sender, or this one, is wrong."""
 EVERY_S: Final = 0.05
 """Between two messages of state, so that a fader does not flood a network."""
 _LOG: Final = logging.getLogger("velatura.building")
@@ -76,15 +79,18 @@ def message(name: str, *values: str | int | float) -> bytes:
     return builder.build().dgram
 
 
-def requests(datagram: bytes) -> Iterator[tuple[str, list[Any]]]:
-    """(verb, arguments) of each message to ``/velatura/`` in a datagram; nothing for what is not OSC."""
+def requests(datagram: bytes) -> Iterator[tuple[float, str, list[Any]]]:
+    """(Unix time to do it, verb, arguments) of each message to ``/velatura/`` in a datagram.
+
+    The time is that of its bundle, or now. Nothing for what is not OSC.
+    """
     try:
         messages = OscPacket(datagram).messages
     except (ParseError, ValueError, IndexError, OverflowError, RecursionError):
         return
     for timed in messages:
         if timed.message.address.startswith(ROOT):
-            yield timed.message.address.removeprefix(ROOT).strip("/"), list(timed.message.params)
+            yield timed.time, timed.message.address.removeprefix(ROOT).strip("/"), list(timed.message.params)
 
 
 def named(fields: Sequence[Value], arguments: Sequence[Any]) -> dict[str, Any] | None:
@@ -108,7 +114,7 @@ def named(fields: Sequence[Value], arguments: Sequence[Any]) -> dict[str, Any] |
     return values
 
 
-class _Listener(asyncio.DatagramProtocol):
+class Listener(asyncio.DatagramProtocol):
     def __init__(self, options: OscOptions) -> None:
         self.waiting: asyncio.Queue[tuple[bytes, Address]] = asyncio.Queue(MOST_WAITING)
         self._options = options
@@ -123,19 +129,40 @@ async def serve(options: OscOptions, verbs: Verbs) -> None:
     """Serve until cancelled. Raises OSError if it can't listen."""
     loop = asyncio.get_running_loop()
     channel, listener = await loop.create_datagram_endpoint(
-        lambda: _Listener(options), local_addr=(options.host, options.port)
+        lambda: Listener(options), local_addr=(options.host, options.port)
     )
     logging.getLogger().addFilter(_not_the_librarys)
+    later = set[asyncio.Task[None]]()
     try:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(_send_feedback(channel, options.listeners, verbs))
             while True:
                 datagram, source = await listener.waiting.get()
-                for verb, arguments in requests(datagram):
-                    await _answer(channel, verbs, verb, arguments, source)
+                for at_unix_s, verb, arguments in requests(datagram):
+                    wait_s = at_unix_s - time.time()
+                    if wait_s <= 0:
+                        await _answer(channel, verbs, verb, arguments, source)
+                    elif wait_s > LONGEST_WAIT_S or len(later) >= MOST_WAITING:
+                        channel.sendto(message("error", verb[:40], "too-late", _TOO_LATE), source)
+                    else:
+                        task = tasks.create_task(_later(wait_s, _answer(channel, verbs, verb, arguments, source)))
+                        later.add(task)
+                        task.add_done_callback(later.discard)
     finally:
         logging.getLogger().removeFilter(_not_the_librarys)
         channel.close()
+
+
+_TOO_LATE: Final = "Its time tag is more than an hour ahead, or too many bundles wait. Check both clocks."
+
+
+async def _later(wait_s: float, work: Coroutine[Any, Any, None]) -> None:
+    try:
+        await asyncio.sleep(wait_s)
+    except asyncio.CancelledError:
+        work.close()
+        raise
+    await work
 
 
 def _not_the_librarys(record: logging.LogRecord) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, Protocol
 
-from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, Plan, believed, plan
+from controller.kiosk.decide.planner import DOUBT_S, EARLIEST_S, HOLD_S, Plan, believed, plan
 from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
@@ -17,7 +17,11 @@ from hal.notices import Level, Notice
 _UNSYNCHRONISED: Final = 0x40
 _KEEP_EVERY_S: Final = 60.0
 _PROVE_S: Final = 3600.0
-"""A clock that jumped far ahead is trusted only after this time, so that a glitch leaves no trace."""
+"""A clock that jumped far ahead is trusted only after this time, so that a glitch leaves no trace. So is one that was
+set far back while this service ran.
+"""
+_DOUBT_AT_MOST_S: Final = 86_400.0
+"""A clock that begins far back, and then runs for so long, is trusted: it would be doubted for years."""
 _SET_S: Final = 30.0
 """A clock that jumps by more than this between two checks was set; NTP moves it by less."""
 
@@ -49,7 +53,12 @@ class TrustedClock:
         kept = log.value("latest")
         self._latest: float | None = None if kept is None else float(kept)
         self._kept = self._latest
+        before_leap = log.value("before-leap")
+        self._before_leap = float(before_leap) if before_leap else None
+        """The time before the clock was believed to be far ahead: a clock between both takes that back."""
         self._ahead_since_s: float | None = None
+        self._behind_since_s: float | None = None
+        self._set_here = False
         self._known: bool | None = None
         self._offset_s: float | None = None
 
@@ -57,11 +66,14 @@ class TrustedClock:
         """Unix seconds to plan with, or None while the time is unknown; logs when that changes."""
         wall_s = self._wall()
         self._check_jump(wall_s - self.monotonic())
-        now_s = believed(wall_s, self._latest, synchronised=self._synchronised())
+        now_s = believed(wall_s, self._latest, synchronised=self._synchronised() or self._corrected(wall_s))
         if (now_s is not None) is not self._known and (self._known is not None or now_s is None):
             self._log.add(_LOST if now_s is None else _FOUND)
         self._known = now_s is not None
         if now_s is not None and self._proven(now_s):
+            if self._latest is not None and abs(now_s - self._latest) > DOUBT_S:
+                self._before_leap = self._latest if now_s > self._latest else None
+                self._log.keep("before-leap", "" if self._before_leap is None else repr(self._before_leap))
             self._latest = now_s
             if self._kept is None or abs(now_s - self._kept) >= _KEEP_EVERY_S:
                 self._kept = now_s
@@ -75,12 +87,28 @@ class TrustedClock:
         if kept is None and self._latest is not None:
             kept = repr(self._latest)
             self._log.keep("since", kept)
+        if kept is not None and self._latest is not None and float(kept) > self._latest:
+            kept = repr(self._latest)  # the clock was ahead then: what is due each night would wait for years
+            self._log.keep("since", kept)
         return float("inf") if kept is None else float(kept)
+
+    def _corrected(self, wall_s: float) -> bool:
+        """Whether a clock that is far behind the latest time is right all the same: that time was wrong."""
+        if self._latest is None or self._latest - wall_s <= DOUBT_S or wall_s < EARLIEST_S:
+            self._behind_since_s, self._set_here = None, False
+            return False
+        if self._behind_since_s is None:
+            self._behind_since_s = self.monotonic()
+        lasted_s = self.monotonic() - self._behind_since_s
+        if lasted_s >= (_PROVE_S if self._set_here else _DOUBT_AT_MOST_S):
+            return True
+        return self._before_leap is not None and wall_s >= self._before_leap
 
     def _check_jump(self, offset_s: float) -> None:
         before_s, self._offset_s = self._offset_s, offset_s
         if before_s is not None and abs(offset_s - before_s) > _SET_S:
             self._log.add(_set(offset_s - before_s))
+            self._set_here |= offset_s < before_s
 
     def _proven(self, now_s: float) -> bool:
         if self._latest is None or now_s - self._latest <= DOUBT_S or self._synchronised():

@@ -14,7 +14,7 @@ from controller.kiosk.values import Fit
 
 MOST_EVENTS: Final = 2000
 MOST_NUMBER: Final = 10**12
-_TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9])?$"
+_TIME: Final = r"^(([01][0-9]|2[0-3]):[0-5][0-9]|24:00)?$"
 _PROJECTOR: Final = r"^[^\u0000-\u001f\u007f/\\]+$"
 _PROJECTORS: Final = CommandLine(completes="projector")
 

@@ -11,6 +11,7 @@ from datetime import UTC, date, datetime, time, timedelta
 from typing import Final
 
 from controller.kiosk.interface import EventRow, Lamp, LampDay, Schedule, ScheduleRow
+from controller.kiosk.values import MIDNIGHT
 
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 SHOWN: Final = 14
@@ -58,7 +59,7 @@ def _day(schedule: Schedule, day: date) -> CalendarDay:
 
 def _minute(clock: str) -> int | None:
     try:
-        at = time.fromisoformat(clock)
+        at = time.fromisoformat(clock.replace(MIDNIGHT, "00:00"))
     except ValueError:
         return None
     return at.hour * 60 + at.minute

@@ -78,8 +78,17 @@ def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
             if finished or not outcomes or outcomes[-1] != "done":
                 return folder
             break
-    stamp = time.strftime("%Y%m%d-%H%M%S")
+    stamp = time.strftime(_STAMP)
+    with contextlib.suppress(ValueError):
+        # Runs are told apart by age: one that was made while the clock was ahead must not stay the newest for years.
+        newest = max(folder.name[:15] for folder in runs.glob("[0-9]*-[0-9]*-*"))
+        if newest >= stamp:
+            after = time.localtime(time.mktime(time.strptime(newest, _STAMP)) + 1)
+            stamp = time.strftime(_STAMP, after)
     return runs / f"{stamp}-{name}"
+
+
+_STAMP: Final = "%Y%m%d-%H%M%S"
 
 
 VARIABLE: Final = "VELATURA_TAPE"

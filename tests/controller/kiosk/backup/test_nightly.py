@@ -83,6 +83,22 @@ def test_a_missing_disk_is_a_failure_that_stays_in_sight_until_somebody_has_seen
     nights.log.close()
 
 
+def test_backups_of_a_clock_that_was_years_ahead_go_first_and_its_pause_is_no_trap(tmp_path: Path) -> None:
+    nights = Nights(tmp_path)
+    nights.at(365 * DAY_S)  # there is no folder yet: it fails
+    nights.to.mkdir()
+    assert nights.at(365 * DAY_S + AGAIN_S) == ["velatura-20270504.tar.gz"]
+    nights.at(366 * DAY_S)
+    nights.to.rename(tmp_path / "away")
+    nights.at(367 * DAY_S)
+    (tmp_path / "away").rename(nights.to)
+    assert nights.at(0) == ["velatura-20260504.tar.gz", "velatura-20270505.tar.gz"], "the clock was corrected"
+    assert nights.at(DAY_S) == ["velatura-20260504.tar.gz", "velatura-20260505.tar.gz"]
+    nights.table = BackupTable(folder=str(nights.to), keep=2, at="24:00")
+    assert nights.at(2 * DAY_S - 4 * 3600) == ["velatura-20260505.tar.gz", "velatura-20260506.tar.gz"]
+    nights.log.close()
+
+
 class Elsewhere:
     """A place that works, or does not."""
 

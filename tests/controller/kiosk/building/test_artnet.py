@@ -159,6 +159,7 @@ def test_only_whole_packets_of_its_universe_count() -> None:
     for damaged in (WHOLE[:-1], WHOLE[:17], b"art-net" + WHOLE[7:], WHOLE[:10] + b"\0\x0d" + WHOLE[12:]):
         assert artnet.read(damaged) is None
     assert artnet.read(WHOLE[:8] + b"\x00\x52" + WHOLE[10:]) is None, "ArtSync"
+    assert artnet.read(WHOLE[:15] + bytes((0x12 | 0x80,)) + WHOLE[16:]) is None, "the net has seven bits"
 
 
 def test_a_poll_may_ask_for_some_universes() -> None:

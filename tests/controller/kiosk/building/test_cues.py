@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from datetime import datetime, timedelta
+from datetime import date, datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -129,3 +129,11 @@ def test_a_list_that_is_wrong_at_the_start_is_told_once(kiosk: MemoryKiosk, tmp_
         wait_for(lambda: kiosk.recorded)
     assert kiosk.recorded[0][0] == "building-failed"
     assert "none.csv" in kiosk.recorded[0][1]
+
+
+def test_24_00_is_midnight_at_the_end_of_its_day() -> None:
+    daily, dated = parse("time,verb,values\n24:00,close\n2026-12-24 24:00,close\n", lambda verb, values: None)
+    assert (daily.day, daily.at.isoformat()) == (None, "00:00:00")
+    assert (dated.day, dated.at.isoformat()) == (date(2026, 12, 25), "00:00:00")
+    with pytest.raises(UsageError):
+        parse("time,verb,values\n24:01,close\n", lambda verb, values: None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import socket
+import struct
 import subprocess
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pythonosc.osc_packet import OscPacket
 
-from controller.kiosk.building.osc import OscOptions, message, named, requests, state_of
+from controller.kiosk.building.osc import Listener, OscOptions, message, named, requests, state_of
 from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.building.verbs import Rate, Verbs
 from controller.kiosk.operations.table import brightness, next_appearance
@@ -126,7 +127,7 @@ def _sent(asker: socket.socket, datagram: bytes) -> bool:
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=200) | st.binary(max_size=120).map(lambda tail: message("play", "marble", 1.5)[:24] + tail))
 def test_no_datagram_raises(datagram: bytes) -> None:
-    for verb, arguments in requests(datagram):
+    for _, verb, arguments in requests(datagram):
         assert isinstance(verb, str)
         named((PERCENT, FADE), arguments)
 
@@ -134,7 +135,7 @@ def test_no_datagram_raises(datagram: bytes) -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=40), st.floats(0, 100, width=32))
 def test_what_was_sent_is_read(name: str, percent: float) -> None:
-    assert list(requests(message("play", name, percent))) == [("play", [name, percent])]
+    assert [one[1:] for one in requests(message("play", name, percent))] == [("play", [name, percent])]
 
 
 def test_more_arguments_than_values_are_refused_by_name() -> None:
@@ -161,3 +162,48 @@ def test_the_example_layout_sends_only_what_the_stage_understands(kiosk: MemoryK
         assert values is not None
         if verb not in ("open", "close"):
             verbs.do(verb, values)
+
+
+def bundle(at_unix_s: float, *datagrams: bytes) -> bytes:
+    """As the specification of OSC 1.0 has it: seconds since 1900, in units of 2**-32."""
+    tag = round((at_unix_s + 2_208_988_800) * 2**32)
+    return b"#bundle\0" + struct.pack(">Q", tag) + b"".join(struct.pack(">I", len(one)) + one for one in datagrams)
+
+
+def test_a_bundle_of_the_future_waits_for_its_time_and_one_of_the_past_does_not(
+    kiosk: MemoryKiosk, tmp_path: Path, port: int
+) -> None:
+    (tmp_path / "building.toml").write_text(f"[osc]\nport = {port}\n")
+    with serving(kiosk, read(tmp_path)), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        asker.settimeout(10)
+
+        def ask(data: bytes) -> None:
+            asker.sendto(data, ("127.0.0.1", port))
+
+        def answered() -> list[str]:
+            return [str(word) for word in OscPacket(asker.recv(2000)).messages[0].message.params]
+
+        wait_for(lambda: _listens(port))
+        begun_s = time.time()
+        ask(bundle(begun_s + 0.6, message("brightness", 40.0)))
+        ask(bundle(begun_s - 5.0, message("brightness", 70.0)))
+        wait_for(lambda: kiosk.snapshot().brightness == 70)
+        assert time.time() < begun_s + 0.6
+        wait_for(lambda: kiosk.snapshot().brightness == 40)
+        assert time.time() >= begun_s + 0.6
+        ask(bundle(begun_s + 7200.0, message("brightness", 10.0)))
+        assert answered()[1] == "too-late"
+        ask(bundle(begun_s + 3000.0, message("brightness", 20.0)))
+    assert kiosk.snapshot().brightness == 40, "what waits ends with the service"
+
+
+def _listens(port: int) -> bool:
+    return f":{port:04X} " in Path("/proc/net/udp").read_text()
+
+
+def test_only_the_networks_that_are_named_are_heard() -> None:
+    listener = Listener(OscOptions(host="0.0.0.0", allow=("192.0.2.0/28",)))
+    for host in ("192.0.2.17", "198.51.100.1", "::ffff:198.51.100.1", "192.0.2.15", "127.0.0.1"):
+        listener.datagram_received(message("next"), (host, 9000))
+    heard = [listener.waiting.get_nowait()[1][0] for _ in range(listener.waiting.qsize())]
+    assert heard == ["192.0.2.15", "127.0.0.1"]

@@ -107,8 +107,51 @@ def test_a_leap_far_ahead_is_remembered_only_after_it_has_lasted(clocks: Clocks)
     clocks.wait(1.0)
     clocks.wait(HOUR_S)
     clocks.reboot()
-    clocks.wall_s -= 30 * DAY_S
+    clocks.wall_s -= 31 * DAY_S
     assert clocks.wait(1.0) is None, "what stayed is believed over a boot"
+
+
+YEARS_S = 4 * 365 * DAY_S
+
+
+@pytest.mark.parametrize("reboots", [False, True])
+def test_a_clock_that_was_years_ahead_and_was_corrected_is_right_at_once(clocks: Clocks, reboots: bool) -> None:
+    clocks.wait(60.0)
+    clocks.wall_s += YEARS_S
+    clocks.wait(1.0)
+    clocks.wait(2 * HOUR_S)
+    if reboots:
+        clocks.reboot()
+    clocks.wall_s -= YEARS_S
+    right_s = clocks.wall_s + 1.0
+    assert clocks.wait(1.0) == right_s
+    assert clocks.wait(DAY_S) == right_s + DAY_S
+    clocks.reboot()
+    assert clocks.wait(1.0) == right_s + DAY_S + 1.0
+
+
+@pytest.mark.parametrize(("reboots", "after_s"), [(False, HOUR_S), (True, DAY_S)])
+def test_a_stage_that_began_years_ahead_is_not_trapped_for_years(clocks: Clocks, reboots: bool, after_s: float) -> None:
+    clocks.wall_s += YEARS_S
+    clocks.wait(2 * HOUR_S)
+    assert clocks.trusted.since_s > MAY + YEARS_S
+    if reboots:
+        clocks.reboot()
+    clocks.wall_s -= YEARS_S
+    assert clocks.wait(1.0) is None
+    assert clocks.wait(after_s - 60.0) is None
+    assert clocks.wait(120.0) == clocks.wall_s
+    assert clocks.trusted.since_s == clocks.wall_s, "what is due each night is not due in years alone"
+    assert len(clocks.told("clock-known")) == 1
+
+
+def test_a_clock_that_jumps_while_it_is_doubted_begins_its_hour_again_only_if_it_is_right(clocks: Clocks) -> None:
+    clocks.wait(60.0)
+    clocks.reboot()
+    clocks.wall_s -= 100 * DAY_S
+    assert clocks.wait(2 * HOUR_S) is None, "nobody set it here: it may be a clock without a battery"
+    clocks.wall_s += 100 * DAY_S
+    assert clocks.wait(1.0) == clocks.wall_s
 
 
 def test_what_was_believed_outlives_a_boot_into_a_clock_without_battery(clocks: Clocks) -> None:

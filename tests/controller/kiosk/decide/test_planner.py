@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.config.models import HoursTable, ScheduleTable
 from controller.core.errors import UsageError
-from controller.kiosk.decide.planner import DOUBT_S, HOLD_S, WINDOW_S, Plan, believed, plan
+from controller.kiosk.decide.planner import DOUBT_S, WINDOW_S, Plan, believed, plan
 from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.kiosk.schedule import check_schedule, openings
+from controller.kiosk.schedule import check_overlaps, check_schedule, expanded, of_table, openings
 
 VIENNA = ZoneInfo("Europe/Vienna")
 WEEK = tuple(ScheduleRow(day, "10:00", "18:00") for day in ("mon", "tue", "wed", "thu", "fri", "sat", "sun"))
@@ -91,10 +92,17 @@ def test_the_believed_time_never_runs_back_by_less_than_it_is_held(
         assert latest_s is not None
         assert latest_s - now_s > DOUBT_S
         assert not synchronised
-    elif latest_s is not None and abs(latest_s - now_s) <= HOLD_S:
+    elif latest_s is not None and abs(latest_s - now_s) <= 7200.0:
         assert found == max(now_s, latest_s)
     else:
         assert found == now_s
+
+
+@pytest.mark.parametrize("back_h", [2.01, 3.0, 4.0, 30.0])
+def test_a_clock_set_back_by_more_than_two_hours_counts_at_once(back_h: float) -> None:
+    latest_s = at("2026-05-04T10:00:00")
+    assert believed(latest_s - back_h * 3600.0, latest_s, synchronised=False) == latest_s - back_h * 3600.0
+    assert believed(latest_s - 7200.0, latest_s, synchronised=False) == latest_s
 
 
 def test_a_clock_that_was_never_set_tells_nothing() -> None:
@@ -171,3 +179,25 @@ def test_whatever_the_clock_does_each_night_is_done_or_left_out_once(
 def test_wrong_schedules_are_refused(schedule: Schedule) -> None:
     with pytest.raises(UsageError, match=r"Allowed|time zone"):
         check_schedule(schedule, ["shine"])
+
+
+def test_24_00_is_the_end_of_a_day_wherever_a_time_is_taken() -> None:
+    rows = (ScheduleRow("daily", "18:00", "24:00"),)
+    schedule = of_table(ScheduleTable(time_zone="Europe/Vienna", drift_check="24:00", hours=(
+        HoursTable(day="daily", opens="18:00", closes="24:00"),)))  # fmt: skip
+    check_schedule(schedule)
+    check_overlaps(schedule)
+    assert schedule.rows == expanded(rows)
+    assert [planned(f"2026-05-04T{at_}:00", schedule).open for at_ in ("17:59", "18:00", "23:59")] == [
+        False,
+        True,
+        True,
+    ]
+    assert planned("2026-05-05T00:00:00", schedule).open is False
+    assert planned("2026-05-04T00:00:00", schedule).due, "the check at midnight"
+    whole = Schedule("Europe/Vienna", (ScheduleRow("mon", "00:00", "24:00"), ScheduleRow("tue", "24:00", "02:00")))
+    check_schedule(whole)
+    times = ("04T00:00:00", "04T23:59:00", "05T00:00:00", "05T23:59:00", "06T01:59:00", "06T02:00:00")
+    assert [planned(f"2026-05-{text}", whole).open for text in times] == [True, True, False, False, True, False]
+    with pytest.raises(UsageError):
+        check_schedule(Schedule("UTC", (ScheduleRow("mon", "10:00", "24:01"),)))

@@ -85,8 +85,7 @@ def test_a_stage_whose_lamps_somebody_switched_off_says_that_they_are_switched_o
     kiosk.run_until(State.PLAYING)
     for lamp in kiosk.lamps.values():
         lamp.go_dark()
-    kiosk.run(2)
-    assert kiosk.state is State.POWERING
+    kiosk.run_until(State.POWERING, within_s=20)
     kiosk.run_until(State.PLAYING)
 
 
@@ -228,6 +227,20 @@ def test_a_lamp_that_can_not_be_switched_off_is_a_fault(kiosk: Kiosk) -> None:
     assert kiosk.lit == ["right"]
     kiosk.lamps["right"].trouble = ""
     kiosk.run_until(State.OFF)
+
+
+def test_a_job_that_needs_light_is_given_up_in_a_fault_and_does_not_wait_for_its_end(kiosk: Kiosk) -> None:
+    for lamp in kiosk.lamps.values():
+        lamp.reports = ProjectorStatus(Power.FAULT, ("lamp-failed",))
+    kiosk.run_until(State.FAULT)
+    kiosk.reconciler.submit(Request("quick", light=True))
+    kiosk.run(5)
+    assert "work-impossible" in kiosk.codes
+    for lamp in kiosk.lamps.values():
+        lamp.reports = None
+    kiosk.run_until(State.PLAYING, within_s=1200)
+    kiosk.run(60)
+    assert kiosk.jobs.done == []
 
 
 def test_without_a_camera_playback_goes_on_and_recalibration_says_why_it_cannot(kiosk: Kiosk) -> None:

@@ -211,7 +211,8 @@ def test_a_damaged_ledger_keeps_a_lamp_hot_of_which_nothing_was_written_before_a
     assert LampFile(tmp_path / LampFile.NAME).read("right") == ledger.read("right")
 
 
-def test_the_stage_can_make_the_rules_stricter_but_not_laxer() -> None:
-    lax = LampRules(0, 0, 0, 0)
-    guard = LampGuard("left", Lamp(World()), Shelf(), at_least=replace(lax, stable_s=900.0), clock=World())
-    assert guard.capabilities.lamp_rules == replace(RULES, stable_s=900.0)
+@pytest.mark.parametrize("rule", ["warm_up_s", "stable_s", "cool_down_s", "minimum_off_s"])
+def test_the_stage_can_make_each_rule_stricter_but_not_laxer(rule: str) -> None:
+    at_least = replace(LampRules(0, 0, 0, 0), **{rule: 900.0})
+    guard = LampGuard("left", Lamp(World()), Shelf(), at_least=at_least, clock=World())
+    assert guard.capabilities.lamp_rules == replace(RULES, **{rule: 900.0})

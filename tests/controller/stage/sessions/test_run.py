@@ -231,6 +231,11 @@ def test_a_run_that_failed_goes_on_in_its_folder_and_one_that_is_done_does_not(m
     assert unfinished_run(models.folder, "other").name.endswith("-other")
 
 
+def test_a_new_run_is_newer_than_one_of_a_clock_that_was_years_ahead(models: Models) -> None:
+    (models.folder / "runs" / "20990504-120000-calibrate").mkdir(parents=True)
+    assert unfinished_run(models.folder, "trial").name == "20990504-120001-trial"
+
+
 def test_the_same_step_is_not_done_twice_when_a_run_goes_on(models: Models) -> None:
     done: list[str] = []
 
