@@ -80,7 +80,7 @@ def unfinished_run(stage: Path, name: str, *, finished: bool = False) -> Path:
             break
     stamp = time.strftime(_STAMP)
     with contextlib.suppress(ValueError):
-        # Runs are told apart by age: one that was made while the clock was ahead must not stay the newest for years.
+        # The newest run counts: one that was made while the clock was ahead must not stay the newest for years.
         newest = max(folder.name[:15] for folder in runs.glob("[0-9]*-[0-9]*-*"))
         if newest >= stamp:
             after = time.localtime(time.mktime(time.strptime(newest, _STAMP)) + 1)
