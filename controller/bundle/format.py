@@ -225,6 +225,11 @@ def pack_header(header: Header) -> bytes:
     )
 
 
+def version_of(data: bytes) -> int | None:
+    """The format version of a file that begins with ``data``; None for a file that is not a bundle."""
+    return HEADER.unpack(data)[1] if len(data) == HEADER_BYTES and data[:8] == MAGIC else None
+
+
 def parse_header(data: bytes, *, file_size: int, trailer_bytes: int) -> Header:
     """Read the first 128 bytes of a file that has ``file_size`` bytes and ends with ``trailer_bytes`` after its index.
 

@@ -134,6 +134,8 @@ def parse_index(data: bytes, *, data_end: int, version: int = VERSION) -> Index:
     except (ValueError, RecursionError) as error:
         raise damaged("its index is not JSON") from error
     top = _fields(document, _LATER_KEYS[version])
+    if version < TILED_FROM and len(document) != len(top):
+        raise damaged("its index has keys of a later format")
     if top.get("codec", CODECS[0]) not in CODECS:
         raise damaged("its tiles are compressed in an unknown way")
     area = _Area(version, data_end)
@@ -168,9 +170,12 @@ def _no_constant(name: str) -> NoReturn:
 
 
 def _fields(value: Any, keys: set[str]) -> dict[str, Any]:
-    if not isinstance(value, dict) or value.keys() != keys:
-        raise damaged(f"a table of its index does not have exactly the keys {', '.join(sorted(keys))}")
-    return value
+    """A table with these keys. Others are of a later release, and a player can do without them: what it can't do
+    without raises the format version.
+    """
+    if not isinstance(value, dict) or not keys <= value.keys():
+        raise damaged(f"a table of its index does not have all keys {', '.join(sorted(keys))}")
+    return {key: value[key] for key in keys}
 
 
 def _list(value: Any, what: str, least: int, most: int) -> list[Any]:
@@ -212,6 +217,8 @@ def _appearance(value: Any, outputs: tuple[OutputLayout, ...], area: _Area) -> B
     key = "bands" if area.tiled else "stripes"
     table = _fields(value, {"name", key, "thumbnail", "metadata"})
     bands = _fields(table[key], {output.name for output in outputs})
+    if len(table[key]) != len(bands):
+        raise damaged("an appearance has images of an output that it does not list")
     if not isinstance(table["metadata"], dict):
         raise damaged("the metadata of an appearance is not a table")
     thumbnail = table["thumbnail"]

@@ -24,7 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from controller.bundle.format import Index
+from controller.bundle.format import HEADER_BYTES, READABLE, Index, version_of
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import ANY_SIGNER, Trust
 from controller.core.errors import BundleError, UsageError, VelaturaError
@@ -184,7 +184,26 @@ def _target(folder: Path, link: str) -> Path | None:
     except OSError:
         return None
     sound = _INSTALLED.fullmatch(name) and os.path.isfile(f"{folder}/{name}")  # noqa: PTH113
-    return _inside(folder, name) if sound else None
+    return _inside(folder, name) if sound and not _is_of_other_format(f"{folder}/{name}") else None
+
+
+def of_other_format(folder: Path) -> list[Path]:
+    """The bundles that another version of Velatura installed, in a format that this one does not read.
+
+    They count as not installed, so that the previous one plays; the next installation removes them.
+    """
+    names = (file for file in folder.glob("*.vel") if _INSTALLED.fullmatch(file.name))
+    return [file for file in names if _is_of_other_format(str(file))]
+
+
+@lru_cache(maxsize=64)
+def _is_of_other_format(file: str) -> bool:
+    # Files never change once they have this name.
+    try:
+        with open(file, "rb") as stream:  # noqa: PTH123
+            return version_of(stream.read(HEADER_BYTES)) not in (None, *READABLE)
+    except OSError:
+        return False
 
 
 @lru_cache(maxsize=16)
@@ -332,7 +351,8 @@ class CountedStart:
         starts = before if before.bundle == name else Starts(name, 0, before.given_up)
         failing = now is None or starts.failed >= MOST_FAILED_STARTS
         if failing and (earlier := before_it(folder, now, starts)) is not None:
-            why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else "The bundle is missing"
+            gone = "The bundle has another format" if of_other_format(folder) else "The bundle is missing"
+            why = f"The bundle {name} showed no picture in {starts.failed} starts" if name else gone
             tell(f"{why}; {earlier.name} plays again.")
             now, starts = earlier, Starts(earlier.name, 0, name or MISSING)
         self.file = folder / CURRENT if now is None else now

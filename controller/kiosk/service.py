@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from controller.bundle.install import of_other_format
 from controller.config.models import StageTables
 from controller.core import kiosk_places
 from controller.core.errors import SEND_DIAGNOSTICS, WorkError
@@ -159,6 +160,8 @@ class Service:
         if self.problem is not None:
             self.log.add(self.problem)
         self._go_on()
+        if of_other_format(self.stage / "bundles"):
+            self._make_bundle_again()
         self.reconciler.step()
         self._thread("player", self.player.step, STEP_S, sooner=self._decided)
         self._thread("bundles", self.bundle_watch.step, LOOK_S)
@@ -253,6 +256,14 @@ class Service:
             else:
                 remedy = "Start it again: it continues where it stopped."
                 self.log.add_failure(Notice("work-cut-off", what, remedy, Level.ERROR))
+
+    def _make_bundle_again(self) -> None:
+        """After the way back from a newer version: its bundle can't be read, but the solved frames can."""
+        text = "The installed bundle has the format of another version of Velatura, so it is made again."
+        self.log.add(Notice("bundle-other-format", text, level=Level.WARNING))
+        # The reason of a refusal is in the log.
+        with contextlib.suppress(WorkError):
+            self.submit(Request("publish"))
 
     def _tell(self, notice: Notice) -> None:
         """A device's event. That nothing can be written is one event, not one of each device."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from controller.bundle.install import CURRENT, CountedStart
+from controller.bundle.install import CURRENT, CountedStart, current, of_other_format, previous
 from controller.bundle.signing import Trust, load_public_key
 from controller.core.errors import UsageError, VelaturaError
 from controller.play.control.commands import SUFFIX, Commands, SavedRequest, Server
@@ -81,8 +81,8 @@ def _run(options: argparse.Namespace) -> int:
         stack.callback(inbox.close)
         output = _open_output(options, sizes)
         stack.callback(output.close)
-        if options.bundle is not None and options.bundle.name == CURRENT and not os.path.lexists(options.bundle):
-            options.bundle = None  # Nothing is installed yet: a kiosk starts all the same.
+        if options.bundle is not None and options.bundle.name == CURRENT and not _is_installed(options.bundle):
+            options.bundle = None  # Nothing is installed yet, for this version: a kiosk starts all the same.
         start = _counted_start(options.bundle)
         count: dict[str, Any] = {} if start is None else {"on_appearance": start.shown, "on_asked": start.asked}
         player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, **count)
@@ -102,6 +102,12 @@ def _run(options: argparse.Namespace) -> int:
         if start is not None and not broken.is_set() and not player.skipped:
             start.ended()
     return 1 if broken.is_set() else 0
+
+
+def _is_installed(link: Path) -> bool:
+    """Whether there is a bundle, or was one, that this version could play."""
+    folder = link.parent
+    return os.path.lexists(link) and not (of_other_format(folder) and current(folder) is None is previous(folder))
 
 
 def _counted_start(bundle: Path | None) -> CountedStart | None:

@@ -248,7 +248,7 @@ class StageKiosk(AttachedKiosk):
 
     def restore(self, backup: Path) -> None:
         with self._idle():
-            archive.restore(self.stage, backup, self._world.drivers)
+            archive.restore(self.stage, backup)
             service = self._service
             if service is not None:
                 after = check_stage(self.stage, drivers=self._world.drivers).stage.tables

@@ -103,8 +103,9 @@ def install(
     if restart or any(changed):
         # In this order the player stops only once the controller has, and starts at once, before the controller. In the
         # other order there is no player for as long as the controller takes to stop.
-        system.run("systemctl", "restart", *reversed(SERVICES[1:]))
-    system.run("systemctl", "start", TARGET)
+        # A service that does not start tells why; the package must not stay half installed for it.
+        system.run("systemctl", "restart", *reversed(SERVICES[1:]), may_fail=restart)
+    system.run("systemctl", "start", TARGET, may_fail=restart)
     if not system.dry:
         _first_login(system, say)
 

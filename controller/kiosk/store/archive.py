@@ -43,7 +43,6 @@ from controller.stage.artefacts.published import BUNDLE_FIGURES
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import PANELS_FILE
 from controller.stage.sessions.run import tapes
-from hal.registry import Drivers
 from hal.runtime.caches import kept
 from hal.secret_words import concealed, is_secret
 
@@ -160,7 +159,7 @@ def _add_file(archive: tarfile.TarFile, name: str, path: Path) -> None:
             archive.addfile(archive.gettarinfo(arcname=name, fileobj=content), content)
 
 
-def restore(stage: Path, file: Path, drivers: Drivers | None = None) -> None:
+def restore(stage: Path, file: Path) -> None:
     """Replace settings, calibration and appearances by those of a backup; the old ones are kept in kiosk/replaced.
 
     The backup is unpacked and checked first, also by the stage's own checks. Then its parts are moved; after a power
@@ -176,7 +175,7 @@ def restore(stage: Path, file: Path, drivers: Drivers | None = None) -> None:
     with tempfile.TemporaryDirectory(prefix=".restore-", dir=stage) as name:
         fresh = Path(name).absolute() / "work" / "fresh"
         fresh.mkdir(parents=True)
-        _unpack(file, fresh, drivers)
+        _unpack(file, fresh)
         _refuse_opened(fresh, stage)
         _name_runs(fresh / _RUNS, stage)
         write_json(fresh.parent / _PARTS, {"parts": _parts_of(fresh)})
@@ -193,17 +192,17 @@ def check_backup(file: Path, room: Path | None = None) -> None:
     Raises as ``restore``.
     """
     with tempfile.TemporaryDirectory(prefix=".restore-", dir=room) as folder:
-        _unpack(file, Path(folder).absolute(), None)
+        _unpack(file, Path(folder).absolute())
 
 
-def _unpack(file: Path, fresh: Path, drivers: Drivers | None) -> None:
+def _unpack(file: Path, fresh: Path) -> None:
     """Unpack a backup and check that it is whole, and that a stage made of it can start. Raises as ``restore``."""
     unpack(file, fresh, first=MARK)
     lacks = _lacks((fresh / MARK).read_bytes())
     for name in (*_FOLDERS, *_FILES, _RUNS):
         if os.path.lexists(fresh / name) and (name in _FILES) != (fresh / name).is_file():
             raise not_ours(f"{name} is of the wrong kind")
-    checked_settings(fresh, drivers)
+    checked_settings(fresh)
     found = [one for one in references(fresh) if one.holds is Holds.FILE]
     allowed = {fresh / name for name in (MARK, *_FILES)} | {one.place for one in found}
     for top in fresh.iterdir():

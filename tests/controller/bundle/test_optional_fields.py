@@ -1,4 +1,4 @@
-"""What a later release may add to the index without making a player of 0.2.0 refuse the bundle."""
+"""What a later release may add to the index: anywhere for players of today, in metadata for those of 0.2.0."""
 
 from __future__ import annotations
 
@@ -47,9 +47,22 @@ def test_a_reader_skips_a_field_of_metadata_that_it_does_not_know() -> None:
 
 
 @pytest.mark.parametrize("table", list(TABLES_0_2_0))
-def test_a_reader_refuses_a_key_that_it_does_not_know_elsewhere(table: str) -> None:
+def test_a_reader_skips_a_key_that_it_does_not_know_and_misses_each_that_it_does(table: str) -> None:
     index = json.loads(RECORDED)
-    (index if table == "index" else index[table][0])["later"] = 1
+    known = parse_index(RECORDED, data_end=8192)
+    at = index if table == "index" else index[table][0]
+    at["later"] = 1
+    assert parse_index(json.dumps(index).encode(), data_end=8192) == known
+    for key in TABLES_0_2_0[table]:
+        value = at.pop(key)
+        with pytest.raises(BundleError):
+            parse_index(json.dumps(index).encode(), data_end=8192)
+        at[key] = value
+
+
+def test_images_of_an_output_that_is_not_listed_are_refused() -> None:
+    index = json.loads(RECORDED)
+    index["appearances"][0]["bands"]["right"] = index["appearances"][0]["bands"]["left"]
     with pytest.raises(BundleError):
         parse_index(json.dumps(index).encode(), data_end=8192)
 

@@ -10,7 +10,17 @@ from typing import Any
 
 import pytest
 
-from controller.bundle.install import NAME, CountedStart, Starts, chosen, current, install, previous, rollback
+from controller.bundle.install import (
+    NAME,
+    CountedStart,
+    Starts,
+    chosen,
+    current,
+    install,
+    of_other_format,
+    previous,
+    rollback,
+)
 from controller.bundle.signing import Trust
 from controller.core.storage import runtime_folder
 from controller.kiosk.store.bundle_store import BundleStore
@@ -108,3 +118,37 @@ def test_a_picture_on_a_full_disk_ends_the_count_that_was_kept_before(
             CountedStart(folder, lambda _: None)
         assert chosen(folder) == current(folder)
         assert Starts.read(folder).failed == 2
+
+
+def newer(folder: Path, link: str = "current") -> Path:
+    """Make the bundle behind ``link`` one of a later format, as a newer release would have installed it."""
+    file = folder / (folder / link).readlink()
+    data = bytearray(file.read_bytes())
+    data[8:12] = (99).to_bytes(4, "little")
+    name = f"{'9' * 63}{len(link)}.vel"
+    (folder / name).write_bytes(data)
+    file.unlink()
+    (folder / link).unlink()
+    (folder / link).symlink_to(name)
+    return folder / name
+
+
+def test_after_the_way_back_from_a_newer_format_the_bundle_before_plays_at_the_first_start(folder: Path) -> None:
+    before, said = previous(folder), list[str]()
+    file = newer(folder)
+    assert of_other_format(folder) == [file]
+    assert current(folder) is None
+    start = CountedStart(folder, said.append)
+    assert start.file == before
+    assert "another format" in said[0]
+    start.shown()
+    start.ended()
+    install(made(folder.parent / "b.vel", 3, 3), folder, allow_unsigned=True)
+    assert of_other_format(folder) == []
+    assert previous(folder) == before
+
+
+def test_a_damaged_file_has_no_other_format(folder: Path) -> None:
+    for n, data in enumerate((b"", b"VELBUNDL", b"nothing" * 100)):
+        (folder / f"{'8' * 63}{n}.vel").write_bytes(data)
+    assert of_other_format(folder) == []

@@ -114,3 +114,16 @@ def test_where_nothing_is_installed_yet_the_player_starts_all_the_same(start: St
     player = start(bundle=tmp_path / "bundles" / "current")
     with Wire(player.socket) as wire:
         assert wire.ask("hello")["bundle"] is None
+
+
+def test_where_all_bundles_have_a_newer_format_the_player_starts_all_the_same(start: Start, tmp_path: Path) -> None:
+    """It would end at once otherwise, and with it the installation of an older package."""
+    folder = tmp_path / "bundles"
+    file = install(write_noise(tmp_path / "b.vel"), folder, allow_unsigned=True)
+    data = bytearray(file.read_bytes())
+    data[8:12] = (99).to_bytes(4, "little")
+    file.write_bytes(data)
+    player = start(bundle=folder / "current", allow_unsigned=True)
+    with Wire(player.socket) as wire:
+        assert wire.ask("hello")["bundle"] is None
+        assert wire.ask("load-bundle", path=str(write_noise(tmp_path / "c.vel")))["ok"]

@@ -253,3 +253,17 @@ def test_of_two_at_the_socket_of_a_kiosk_without_panel_neither_loses_an_account(
     monkeypatch.setattr(Accounts, "add", slowly)
     asked_for["add-account"]("vera", "viewer", "a good long one")
     assert [one.name for one in asked_for["accounts"]()] == ["otto", "vera"]
+
+
+def test_a_bundle_of_a_newer_format_is_made_again_at_the_start(
+    kiosk: StageKiosk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (kiosk.stage / "bundles").mkdir()
+    newer = b"VELBUNDL" + (99).to_bytes(4, "little") + bytes(200)
+    (kiosk.stage / "bundles" / f"{'0' * 64}.vel").write_bytes(newer)
+    asked: list[Request] = []
+    monkeypatch.setattr(Service, "_thread", lambda *_, **__: None)
+    monkeypatch.setattr(Service, "submit", lambda self, *requests: asked.extend(requests))
+    kiosk.service.start()
+    assert [request.kind for request in asked] == ["publish"]
+    assert "bundle-other-format" in [row.code for row in kiosk.events()]
