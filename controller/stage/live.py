@@ -6,6 +6,7 @@ Streams come at their own pace. A thread reads them, and the newest picture coun
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import threading
@@ -55,7 +56,7 @@ class LiveSource(Protocol):
 
 
 class VideoSource:
-    """A video file, at its own rate; frames whose time has passed are skipped, and counted."""
+    """A video file, each frame at its own time; frames whose time has passed are skipped, and counted."""
 
     def __init__(self, path: Path, *, loop: bool) -> None:
         """Raises UsageError("live-source-unreadable")."""
@@ -73,42 +74,55 @@ class VideoSource:
         except UnfitFile as error:
             self._capture.release()
             raise unreadable(path, error.reason) from error
-        self.rate_hz = rate
-        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        # the last frame is shown however late it is; some files don't tell how many they have
-        self._last = count - 1 if count > 0 and not loop else None
-        self._at = -1
-        self._before = 0
+        self._frame_s = self._step_s = 1 / rate
+        self._begins_s = 0.0
+        """When this turn of the video began; with ``loop`` there are many."""
+        self._first_s: float | None = None
+        self._due_s: float | None = None
+        """When the frame is due that was read last; None: it has been shown."""
+        self._read_s = -self._frame_s
+        self._count = 0
         self._ended = False
 
     def next(self, at_s: float) -> LivePicture | None:
         """See ``LiveSource``."""
-        due = int(at_s * self.rate_hz)
-        if self._last is not None:
-            self._ended = self._ended or (due > self._last and self._at >= self._last)
-            due = min(due, self._last)
-        skipped = 0
         found: ByteImage | None = None
-        while self._at < due and not self._ended:
-            # only the frame that is due is decoded; those before it are passed over
-            if not self._capture.grab():
-                self._rewind()
-                continue
-            self._at += 1
-            if self._at == due:
-                got, image = self._capture.retrieve()
-                found = np.ascontiguousarray(image[..., ::-1]) if got else None
-            else:
-                skipped += 1
-        return None if found is None else LivePicture(found, self._at, skipped)
+        skipped = -1
+        while self._read() <= at_s:
+            got, image = self._capture.retrieve()
+            found = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8) if got else found
+            skipped += 1
+            self._due_s = None
+            self._count += 1
+        # the last frame is shown however late it is
+        self._ended = self._ended or (self._due_s == math.inf and found is None and at_s >= self._end_s())
+        return None if found is None else LivePicture(found, self._count - 1, skipped)
 
-    def _rewind(self) -> None:
-        if not self._loop or self._at + 1 == self._before:
-            self._ended = True
-            return
-        self._before = self._at + 1
-        self._capture.release()
-        self._capture = cv2.VideoCapture(str(self._path))
+    def _read(self) -> float:
+        """When the next frame is due, in seconds since the beginning; infinite after the last."""
+        if self._due_s is not None:
+            return self._due_s
+        if not self._capture.grab():
+            if not self._loop or self._first_s is None:
+                self._due_s = math.inf
+                return math.inf
+            self._begins_s = self._end_s()
+            self._first_s, self._read_s = None, self._begins_s - self._frame_s
+            self._capture.release()
+            self._capture = cv2.VideoCapture(str(self._path))
+            return self._read()
+        said_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+        self._first_s = said_s if self._first_s is None else self._first_s
+        due_s = self._begins_s + said_s - self._first_s
+        # Streams without a container give no times, or the same for all.
+        is_later = due_s > self._read_s
+        self._step_s = due_s - self._read_s if is_later else self._frame_s
+        self._read_s = self._due_s = self._read_s + self._step_s
+        return self._due_s
+
+    def _end_s(self) -> float:
+        """The last frame stays as long as the one before it; what files tell of their length is often wrong."""
+        return self._read_s + self._step_s
 
     @property
     def ended(self) -> bool:
@@ -118,6 +132,34 @@ class VideoSource:
     def close(self) -> None:
         """Close the file."""
         self._capture.release()
+
+
+LAST_PICTURE_S: Final = 30.0
+"""The last picture of a source that is gone stays for so long; then it is black until the source is back."""
+
+
+class _Absence:
+    """What is shown while a source is gone."""
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None
+        self.is_black = False
+
+    def back(self) -> None:
+        """The source is there."""
+        self._since_s, self.is_black = None, False
+
+    def picture(self, what: str, remedy: str, at_s: float) -> LivePicture | None:
+        """Black, once, after LAST_PICTURE_S. Raises UsageError("live-source-gone") when called first."""
+        if self._since_s is None:
+            self._since_s = at_s
+            raise UsageError(
+                "live-source-gone", what=f"{what} The last picture stays for {LAST_PICTURE_S:g} s.", remedy=remedy
+            )
+        if self.is_black or at_s - self._since_s < LAST_PICTURE_S:
+            return None
+        self.is_black = True
+        return LivePicture(np.zeros((2, 2, 3), np.uint8), -1, 0)
 
 
 class FolderSource:
@@ -131,18 +173,28 @@ class FolderSource:
         self._last: tuple[str, int] | None = None
         self._shown = -1
         self._known = 0
+        self._absence = _Absence()
 
     def next(self, at_s: float) -> LivePicture | None:
         """See ``LiveSource``. Once it is surely whole, a damaged picture raises UsageError, but only once.
 
-        "target-unreadable", or "target-not-finite" where it has NaN or infinite pixels.
+        "target-unreadable", or "target-not-finite" where it has NaN or infinite pixels. "live-source-gone" once for
+        each time that the folder is gone: a stick that was pulled out, a server that does not answer.
         """
-        names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
-        if not names:
-            return None
-        # The program that fills the folder may clear it, too.
-        with contextlib.suppress(FileNotFoundError):
-            return self._of(names, at_s)
+        try:
+            names = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in PICTURES)
+            if self._absence.is_black:
+                self._last, self._shown = None, -1
+            self._absence.back()
+            # The program that fills the folder may clear it, too.
+            with contextlib.suppress(FileNotFoundError):
+                return self._of(names, at_s) if names else None
+        except OSError as error:
+            return self._absence.picture(
+                f"The folder {self._folder} can't be read ({error.strerror}).",
+                "Connect its disk or share again; it is shown again by itself.",
+                at_s,
+            )
         return None
 
     def _of(self, names: Sequence[Path], at_s: float) -> LivePicture | None:
@@ -225,9 +277,9 @@ FIRST_S: Final = 15.0
 """A stream must have shown a picture by then, or it is refused."""
 CLOSE_S: Final = 2.0
 """A reader that hangs in a library is left behind after that; it ends by itself."""
-_SCHEME: Final = re.compile(r"(?:rtsp|rtsps|udp|ndi)://\S.*", re.IGNORECASE)
+_SCHEME: Final = re.compile(r"(?:rtsps?|rtmps?|rtp|udp|tcp|srt|https?|ndi)://\S.*", re.IGNORECASE)
 _CAMERA: Final = re.compile(r"/dev/video\d+")
-_PASSWORD: Final = re.compile(r"^((?:rtsps?|udp)://)[^/@]*@", re.IGNORECASE)
+_PASSWORD: Final = re.compile(r"^((?!ndi:)[a-z]+://)[^/@]*@", re.IGNORECASE)
 
 
 class Lost(Exception):
@@ -256,7 +308,7 @@ def without_password(source: str) -> str:
 class StreamSource:
     """``LiveSource`` of a stream. It never waits, and never ends: a lost stream is opened again every ``RETRY_S``.
 
-    Meanwhile no picture comes, so the last one stays.
+    Meanwhile the last picture stays for LAST_PICTURE_S, then it is black.
     """
 
     def __init__(self, name: str, open_it: Callable[[], Reader], *, retry_s: float = RETRY_S) -> None:
@@ -266,8 +318,8 @@ class StreamSource:
         self._stopped = threading.Event()
         self._newest: ByteImage | None = None
         self._count = self._given = 0
-        self._lost: str | None = None
         self._there = False
+        self._absence = _Absence()
         self._why = "nothing was received"
         # A daemon, so that a library that hangs does not keep the program from ending.
         self._thread = threading.Thread(target=self._run, name="live stream", daemon=True)
@@ -287,20 +339,20 @@ class StreamSource:
 
     def next(self, at_s: float) -> LivePicture | None:
         """See ``LiveSource``. Raises UsageError("live-source-gone") once for each time that the stream was lost."""
-        del at_s  # the stream has a clock of its own
         with self._changed:
             if self._count != self._given and self._newest is not None:
                 skipped = self._count - self._given - 1 if self._given else 0
                 self._given = self._count
+                self._absence.back()
                 return LivePicture(self._newest, self._count - 1, skipped)
-            why, self._lost = self._lost, None
-        if why is not None:
-            raise UsageError(
-                "live-source-gone",
-                what=f"The stream {self._name} was lost ({why}). The last picture stays.",
-                remedy="Restart the program or camera that sends it; it is shown again by itself.",
-            )
-        return None
+            if self._there or not self._count:
+                return None
+            why = self._why
+        return self._absence.picture(
+            f"The stream {self._name} was lost ({why}).",
+            "Restart the program or camera that sends it; it is shown again by itself.",
+            at_s,
+        )
 
     @property
     def ended(self) -> bool:
@@ -320,14 +372,12 @@ class StreamSource:
                         self._take(reader.read())
             except Lost as lost:
                 with self._changed:
-                    # Reported once: a stream that stays away is no further bad picture at each attempt.
-                    self._lost = str(lost) if self._there else self._lost
                     self._there, self._why = False, str(lost)
                 self._stopped.wait(self._retry_s)
 
     def _take(self, picture: ByteImage) -> None:
         with self._changed:
-            self._newest, self._lost, self._there = picture, None, True
+            self._newest, self._there = picture, True
             self._count += 1
             self._changed.notify_all()
 
@@ -352,8 +402,15 @@ def open_stream(source: str, *, silent_s: float = SILENT_S, retry_s: float = RET
     return StreamSource(shown, partial(OpenCvReader, source, shown, silent_s), retry_s=retry_s)
 
 
+_WITHOUT_LIMIT: Final = "fifo_size=50000&overrun_nonfatal=1"
+"""Of UDP: FFmpeg would end a stream whose packets wait too long for a busy computer; now some are lost."""
+
+
 class OpenCvReader:
-    """An RTSP or UDP stream by FFmpeg, or a camera of this computer by V4L2."""
+    """A stream of a network by FFmpeg, or a camera of this computer by V4L2.
+
+    A file that a server sends as fast as it can is shown at its own pace, and again from its beginning.
+    """
 
     def __init__(self, source: str, shown: str, silent_s: float) -> None:
         """Raises Lost."""
@@ -365,6 +422,8 @@ class OpenCvReader:
             self._capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
         else:
             wait_ms = int(1000 * silent_s)
+            if source.lower().startswith("udp:") and "overrun_nonfatal" not in source:
+                source += ("&" if "?" in source else "?") + _WITHOUT_LIMIT
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, wait_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait_ms]
             self._capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
         if not self._capture.isOpened():
@@ -375,13 +434,19 @@ class OpenCvReader:
         except UnfitFile as error:
             self._capture.release()
             raise Lost(error.reason) from error
+        # A live stream has its sender's pace, and no length.
+        self._is_file = float(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
+        self._began_s = time.monotonic()
 
     def read(self) -> ByteImage:
         """See ``Reader``."""
         got, image = self._capture.read()
         if not got or image is None or image.ndim != 3:
             raise Lost("it ended or sent nothing")
-        return np.ascontiguousarray(image[..., ::-1], np.uint8)
+        if self._is_file:
+            ahead_s = self._began_s + float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000 - time.monotonic()
+            time.sleep(min(max(ahead_s, 0.0), 1.0))
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
     def close(self) -> None:
         """Disconnect."""

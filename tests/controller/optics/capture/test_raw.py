@@ -122,7 +122,9 @@ def test_the_reason_for_a_refusal_is_in_words(scene: Float64, tmp_path: Path) ->
 def test_a_sensor_without_colours_is_refused(scene: Float64, tmp_path: Path) -> None:
     tags = [(50706, "B", 4, bytes([1, 4, 0, 0]), True), (50708, "s", 0, "Test Camera", True)]
     values = mosaic_of(scene, RGGB)
-    tifffile.imwrite(tmp_path / "mono.dng", values, photometric=34892, extratags=tags, metadata=None)
+    tifffile.imwrite(tmp_path / "mono.dng", values, photometric="minisblack", extratags=tags, metadata=None)
+    with tifffile.TiffFile(tmp_path / "mono.dng", mode="r+b") as file:
+        file.pages[0].tags[262].overwrite(34892)
     with pytest.raises(UsageError) as refused:
         read_photograph(tmp_path / "mono.dng")
     assert refused.value.code == "raw-not-bayer"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -48,6 +50,86 @@ def test_a_video_gives_the_frame_that_is_due_and_counts_those_it_passed_over(tmp
     assert source.next(0.95) is None
     assert source.ended
     source.close()
+
+
+def seconds_of(path: Path, parts: list[tuple[int, int]], *options: str) -> Path:
+    """A video of one second for each of ``parts``: a grey value, and how many frames that second has."""
+    inputs = [
+        part for value, rate in parts
+        for part in ("-f", "lavfi", "-t", "1", "-i", f"color=c=0x{value:02x}{value:02x}{value:02x}:s=64x48:r={rate}")
+    ]  # fmt: skip
+    joined = "".join(f"[{n}:v]settb=1/1000[p{n}];" for n in range(len(parts)))
+    joined += "".join(f"[p{n}]" for n in range(len(parts))) + f"concat=n={len(parts)}:v=1"
+    subprocess.run(
+        [
+            "ffmpeg",
+            "-nostdin",
+            "-loglevel",
+            "error",
+            *inputs,
+            "-filter_complex",
+            joined,
+            "-fps_mode",
+            "vfr",
+            *options,
+            path,
+        ],
+        check=True,
+    )
+    return path
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg (a package of the test set-up)")
+@pytest.mark.parametrize("name", ["v.mp4", "v.mkv"])
+@pytest.mark.parametrize("rates", [(2, 30, 2, 30), (30, 2, 10, 5)])
+def test_a_video_of_changing_rate_shows_each_second_in_its_second(
+    tmp_path: Path, name: str, rates: tuple[int, ...]
+) -> None:
+    values = (40, 90, 140, 190)
+    path = seconds_of(tmp_path / name, list(zip(values, rates, strict=True)), "-c:v", "libx264", "-bf", "2")
+    for loop in (False, True):
+        source = VideoSource(path, loop=loop)
+        shown: list[tuple[float, int]] = []
+        value, number = 0, -1
+        for at_s in np.arange(0.0, 8.0 if loop else 4.0, 0.05):
+            picture = source.next(float(at_s))
+            if picture is not None:
+                value = int(picture.pixels.mean())
+                assert picture.number - picture.skipped == number + 1
+                number = picture.number
+            shown.append((float(at_s), value))
+        wrong = [at_s for at_s, value in shown if abs(value - values[int(at_s % 4)]) > 6 and 0.06 < at_s % 1 < 0.94]
+        assert not wrong
+        assert number >= (2 if loop else 1) * sum(rates) - 3
+        source.close()
+
+
+def test_a_folder_that_is_gone_is_told_of_once_then_black_and_comes_back(tmp_path: Path) -> None:
+    folder = tmp_path / "stick"
+    folder.mkdir()
+    write(folder, "a.png", 120)
+    for loop in (False, True):
+        source = FolderSource(folder, loop=loop, rate_hz=10)
+        first = source.next(0.0)
+        assert first is not None
+        folder.rename(tmp_path / "away")
+        with pytest.raises(UsageError, match="stays for 30 s") as gone:
+            source.next(1.0)
+        assert gone.value.code == "live-source-gone"
+        assert source.next(30.9) is None
+        black = source.next(31.0)
+        assert black is not None
+        assert not black.pixels.any()
+        assert source.next(40.0) is None
+        (tmp_path / "away").rename(folder)
+        again = source.next(50.0)
+        assert again is not None
+        np.testing.assert_array_equal(again.pixels, first.pixels)
+        folder.rename(tmp_path / "away")
+        with pytest.raises(UsageError, match="can't be read"):
+            source.next(51.0)
+        (tmp_path / "away").rename(folder)
+        assert not source.ended
 
 
 def test_a_looping_video_begins_again(tmp_path: Path) -> None:

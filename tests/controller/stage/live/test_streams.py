@@ -154,6 +154,77 @@ def test_a_stream_that_sends_nothing_is_refused_without_its_password() -> None:
     assert "secret" not in str(refused.value)
 
 
+@needs_ffmpeg
+@pytest.mark.parametrize("kind", ["tcp", "http"])
+def test_other_addresses_are_streams_too(tmp_path: Path, kind: str) -> None:
+    with kept_port() as port, contextlib.ExitStack() as open_for_now:
+        if kind == "tcp":
+            command = [*encoded("-re"), "-f", "mpegts", f"tcp://127.0.0.1:{port}?listen=1"]
+            address = f"tcp://127.0.0.1:{port}"
+        else:
+            subprocess.run([*encoded(), "-t", "1", str(tmp_path / "sent.mp4")], check=True)
+            command = [
+                sys.executable,
+                "-m",
+                "http.server",
+                str(port),
+                "--bind",
+                "127.0.0.1",
+                "--directory",
+                str(tmp_path),
+            ]
+            address = f"http://127.0.0.1:{port}/sent.mp4"
+        open_for_now.enter_context(running(command, cwd=tmp_path))
+        source = open_for_now.enter_context(contextlib.closing(open_stream(address, silent_s=3.0, retry_s=0.2)))
+        source.wait_for_picture(20)
+        # FFmpeg has the first pictures of a live stream at once: it looks at them before.
+        began_s, count = time.monotonic(), 0
+        while count < 40:
+            picture = newest(source)
+            if picture is not None:
+                assert is_sent(picture.pixels)
+                count = picture.number
+            time.sleep(0.005)
+        assert time.monotonic() - began_s > (0.2 if kind == "tcp" else 0.9), "at its own pace"
+
+
+def test_a_stream_that_stays_away_is_black_after_a_while() -> None:
+    class Once:
+        sent = False
+
+        def read(self) -> ByteImage:
+            if Once.sent:
+                raise Lost("it is away")
+            Once.sent = True
+            return np.full((4, 4, 3), 9, np.uint8)
+
+        def close(self) -> None:
+            """Nothing is open."""
+
+    source = StreamSource("a stream", Once, retry_s=0.01)
+    with contextlib.closing(source):
+        source.wait_for_picture()
+        assert source.next(0.0) is not None
+        told: list[str] = []
+
+        def gone() -> bool:
+            try:
+                source.next(1.0)
+            except UsageError as error:
+                told.append(error.code)
+            return bool(told)
+
+        wait_for(gone)
+        assert source.next(30.0) is None
+        black = source.next(31.5)
+        assert black is not None
+        assert not black.pixels.any()
+        assert source.next(32.0) is None
+        assert told == ["live-source-gone"]
+        Once.sent = False
+        wait_for(lambda: (one := source.next(33.0)) is not None and one.pixels.any())
+
+
 def test_a_camera_that_is_not_there_is_named() -> None:
     with contextlib.closing(open_stream("/dev/video97")) as source, pytest.raises(UsageError) as refused:
         source.wait_for_picture(0.5)
@@ -184,6 +255,8 @@ def test_a_reader_that_hangs_is_left_behind() -> None:
     ("text", "stream"),
     [("rtsp://host/x", True), ("RTSPS://host", True), ("udp://@:5000", True), ("ndi://PC (out 1)", True),
      ("/dev/video0", True), ("/dev/video", False), ("video.mp4", False), ("rtsp:/host", False), ("ftp://x/y", False),
+     ("http://host/video.mp4", True), ("HTTPS://host/live.m3u8", True), ("tcp://host:9000", True),
+     ("srt://host:9000?mode=caller", True), ("http:/host", False),
      ("rtsp://", False)],
 )  # fmt: skip
 def test_addresses_of_streams_are_told_from_files(text: str, *, stream: bool) -> None:
