@@ -121,7 +121,7 @@ class VideoSource:
         return self._due_s
 
     def _end_s(self) -> float:
-        """The last frame stays as long as the one before it; what files tell of their length is often wrong."""
+        """The last frame stays as long as the previous one. The length that a file states is often wrong."""
         return self._read_s + self._step_s
 
     @property
