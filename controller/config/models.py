@@ -357,7 +357,7 @@ class BundleTable(ConfigTable):
 
 class AppearanceTable(OpenConfigTable):
     name: str = Field(
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
+        pattern=r"^[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F_-]{0,63}$",
         description="a name of 1 to 64 letters, digits, - and _, different for every appearance",
     )
     kind: Name = Field(description='the kind of target, e.g. "photograph"')

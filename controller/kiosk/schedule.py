@@ -66,7 +66,8 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
         raise _wrong("The time of the drift check", schedule.drift_check, '"HH:MM", or empty')
     if len(schedule.rows) > MOST_ROWS:
         raise _wrong("The number of rows", str(len(schedule.rows)), f"at most {MOST_ROWS}")
-    for number, row in enumerate(schedule.rows, 1):
+    for place, row in enumerate(schedule.rows, 1):
+        number = row.number or place
         if row.day not in WEEKDAYS and _date(row.day) is None:
             raise _wrong(f"The day of row {number}", row.day, "mon to sun, or a date such as 2026-12-24")
         if bool(row.opens) != bool(row.closes):
@@ -106,10 +107,11 @@ def _check_day(today: Sequence[ScheduleRow], tomorrow: Sequence[ScheduleRow], na
     spans.sort(key=lambda span: span[:2])
     for (first, ends, one), (begins, _, other) in itertools.pairwise(spans):
         if begins < ends and first < 1440:
+            rows = f"row {one.number} or row {other.number}" if one.number and other.number else "one of the two rows"
             raise UsageError(
                 "schedule-overlap",
                 what=f"Hours overlap ({name}): {one.opens}-{one.closes} and {other.opens}-{other.closes}.",
-                remedy="Change one of the two rows, so that the first one closes before the other one opens.",
+                remedy=f"Change {rows}, so that the first one closes before the other one opens.",
             )
 
 
@@ -236,7 +238,7 @@ def expanded(rows: Sequence[ScheduleRow]) -> tuple[ScheduleRow, ...]:
         if not days:
             raise UsageError("schedule-wrong", what=f"The day of row {number} is {row.day[:64]!r}.",
                              remedy=f"Allowed: {ALLOWED_DAYS}.")  # fmt: skip
-        result += [ScheduleRow(day, row.opens, row.closes, row.appearance) for day in days]
+        result += [ScheduleRow(day, row.opens, row.closes, row.appearance, number=number) for day in days]
     return tuple(result)
 
 

@@ -1,4 +1,4 @@
-"""Uploaded pictures: decoded in a separate process; only the new encoding is stored and served."""
+"""Uploaded pictures: decoded in a separate process; only the new encoding is served. Files stay for another fit."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from controller.kiosk.store import targets
 from controller.kiosk.values import Fit
 from controller.panel import decoder
 
-WHOLE, OUTLINE = ".whole", ".json"
-"""Beside a target: what was uploaded, and the regions of it that are used."""
+WHOLE, OUTLINE, NAME = ".whole", ".json", ".name"
+"""Beside a target: it without an outline, the regions of it that are used, and a name for its appearance."""
+UPLOADED = "uploaded"
+"""The folder of the files that were uploaded, beside that of the targets."""
 
 LONGEST_REASON = 300
 
@@ -115,11 +117,37 @@ class Targets:
             file = self._folder / f"{key}.png"
             write_atomically(file, png, mode=0o600)
             write_atomically(file, self._fitted(file, fit), mode=0o600)
+            write_atomically(self._uploaded(key), uploaded.read_bytes(), mode=0o600)
             kept = sorted(self._folder.glob("*.png"), key=lambda file: file.stat().st_mtime, reverse=True)
             for old in kept[self._most :]:
-                for part in (old, old.with_suffix(WHOLE), old.with_suffix(OUTLINE)):
+                beside = (old.with_suffix(ending) for ending in (WHOLE, OUTLINE, NAME))
+                for part in (old, *beside, self._uploaded(old.stem)):
                     part.unlink(missing_ok=True)
         return key
+
+    def fit_again(self, key: str, fit: Fit) -> str:
+        """The key of a target made of the same upload with another fit. Raises UsageError("target-unknown")."""
+        self.path(key)
+        uploaded = self._uploaded(key)
+        if not uploaded.is_file():
+            raise UsageError("target-unknown", what="This picture no longer exists.", remedy="Upload it again.")
+        again = self.add(uploaded, fit)
+        self.propose(again, self.proposed(key))
+        return again
+
+    def _uploaded(self, key: str) -> Path:
+        return self._folder.with_name(UPLOADED) / key
+
+    def propose(self, key: str, name: str) -> None:
+        """Keep a name for the appearance that is made of this target."""
+        write_atomically(self.path(key).with_suffix(NAME), name.encode(), mode=0o600)
+
+    def proposed(self, key: str) -> str:
+        """That name; empty if there is none."""
+        try:
+            return self.path(key).with_suffix(NAME).read_text("utf-8")
+        except OSError:
+            return ""
 
     def restrict(self, key: str, text: str) -> None:
         """Use only the regions of an outline (JSON) of this target; with none, all of it again.

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, Field
 
-from controller.kiosk.operations.fields import INTEGER, NAME, NUMBER, TEXT, CommandLine, Flag, Sent
+from controller.kiosk.operations.fields import INTEGER, NAME, NEW_NAME, NUMBER, TEXT, CommandLine, Flag, Sent
 from controller.kiosk.schedule import ALLOWED_DAYS
 from controller.kiosk.state import EventLevel
 from controller.kiosk.values import Fit
@@ -22,7 +22,7 @@ AppearanceName = Annotated[str, Field(pattern=NAME, max_length=64, description=(
     "an appearance's name, 1 to 64 letters, digits, spaces, dots, dashes")), TEXT,
     CommandLine(completes="appearance")]  # fmt: skip
 # The same rule as in stage.toml.
-NewName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$", max_length=64, description=(
+NewName = Annotated[str, Field(pattern=NEW_NAME, max_length=64, description=(
     "a name of 1 to 64 letters, digits, - and _; the first is a letter or digit")), TEXT,
     CommandLine(completes="appearance")]  # fmt: skip
 OnlyAppearance = Annotated[str, Field(pattern=NAME, max_length=64, description="only this appearance"), TEXT,

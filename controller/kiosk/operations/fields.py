@@ -15,6 +15,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from controller.core.errors import UsageError
 
+NEW_NAME: Final = r"^[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F_-]{0,63}$"
 NAME: Final = r"^[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F ._-]{0,63}$"
 """Names that are used in URLs and file names."""
 LONGEST_PATH: Final = 4096
@@ -211,4 +212,8 @@ def _refusal(fields: Sequence[Field], error: ValidationError) -> UsageError:
     name = place[-1]
     if problem["type"] == "missing":
         return missing(name, allowed[name])
-    return UsageError("field-wrong", what=f"The value of '{name}' is not valid.", remedy=f"Allowed: {allowed[name]}.")
+    number = next((part + 1 for part in problem["loc"] if isinstance(part, int)), None)
+    row = "" if number is None else f" in row {number}"
+    return UsageError(
+        "field-wrong", what=f"The value of '{name}'{row} is not valid.", remedy=f"Allowed: {allowed[name]}."
+    )

@@ -90,6 +90,7 @@ class Targets(Protocol):
     """The uploaded targets of a panel; ``controller.panel.uploads`` has them."""
 
     def add(self, uploaded: Path, fit: Fit = "fit") -> str: ...
+    def fit_again(self, key: str, fit: Fit) -> str: ...
     def restrict(self, key: str, text: str) -> None: ...
     def path(self, key: str) -> Path: ...
 
@@ -277,6 +278,13 @@ def remove_appearance(kiosk: Kiosk, name: AppearanceName) -> None:
 def upload_target(targets: Targets, file: PictureFile, fit: FitName = "fit") -> NewTarget:
     """Upload a picture as a target."""
     return NewTarget(targets.add(file, fit))
+
+
+@operation("POST /targets/{target}/fit", OPERATOR, CHANGES, done="The picture is fitted anew.",
+           names=Names(name="fit-target", part_of="kiosk add"))  # fmt: skip
+def fit_target(targets: Targets, target: TargetKey, fit: FitName) -> NewTarget:
+    """Make another target of an uploaded picture, with another fit."""
+    return NewTarget(targets.fit_again(target, fit))
 
 
 @operation("GET /targets/{target}", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))

@@ -50,6 +50,8 @@ FIGURES: Final = "reach.json"
 FILES: Final = {"target": "target.jpg", "result": "result.jpg", "map": "map.png"}
 BRIGHT, DARK, COLOURFUL, UNLIT = (240, 179, 90), (90, 140, 255), (216, 96, 190), (58, 60, 66)
 """Colours of the map, as in the page's legend: too bright, too dark, too saturated, and not lit or not asked for."""
+ALIKE: Final = 2.0
+"""CIEDE2000 below which a result looks like its target; 1 can just be seen side by side."""
 _one_at_a_time = threading.Lock()
 
 
@@ -104,9 +106,9 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     aim = aim_at(stage_light, wanted.image, options_of(checked.stage.tables.solve))
     lit = light.transport.object_mask
     seen = visible_object(lit)
-    kinds = kinds_of(aim.asked_possible, lit & wanted.mask)
     folder.mkdir(parents=True, exist_ok=True)
-    grey = _drawn(folder, light, aim, seen)
+    grey, alike = _drawn(folder, light, aim, seen)
+    kinds = kinds_of(aim.asked_possible, lit & wanted.mask, alike)
     write_picture(folder / FILES["map"], map_of(kinds, grey), seen)
     area = max(1, int(seen.sum()))
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
@@ -147,30 +149,37 @@ def _shrunk(image: FloatImage, size_px: tuple[int, int]) -> FloatImage:
     return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def kinds_of(possible: Feasibility, asked: Mask) -> dict[str, Mask]:
-    """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture."""
+def kinds_of(possible: Feasibility, asked: Mask, alike: Mask) -> dict[str, Mask]:
+    """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture;
+    ``alike``: no one sees that it is not quite in reach, as where the room has a little more light than a dark channel.
+    """
     from controller.optics.solve.reach.feasibility import FORGIVEN_DRIVE
 
     bright, dark = (part.max(axis=2) > FORGIVEN_DRIVE for part in (possible.too_bright, possible.too_dark))
-    out = asked & ~possible.reachable
+    reached = possible.reachable | alike
+    out = asked & ~reached
     return {
-        "share": asked & possible.reachable,
+        "share": asked & reached,
         "too_bright": out & bright & ~dark,
         "too_dark": out & dark & ~bright,
         "too_colourful": out & (bright == dark),
     }
 
 
-def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> ByteImage:
-    """Write what was asked for and the expected result; returns the first one in grey, (rows, columns) uint8."""
+def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> tuple[ByteImage, Mask]:
+    """Write what was asked for and the expected result; returns the first one in grey, (rows, columns) uint8, and where
+    the two look alike.
+    """
+    from controller.optics.solve.result.metrics import colour_difference
     from controller.stage.report.pictures import to_screen
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
     made = light if of.indirect is None else light + of.indirect.forward(light)
+    difference = colour_difference(of.black + made, aim.asked, of.camera_to_xyz, aim.exposure, seen)
     asked, result = (to_screen(image, of.camera_to_xyz, white=aim.exposure) for image in (aim.asked, of.black + made))
     write_picture(folder / FILES["target"], asked, seen)
     write_picture(folder / FILES["result"], result, seen)
-    return np.asarray(asked.mean(axis=2), np.uint8)
+    return np.asarray(asked.mean(axis=2), np.uint8), seen & (difference < ALIKE)
 
 
 def map_of(kinds: dict[str, Mask], grey: ByteImage) -> ByteImage:

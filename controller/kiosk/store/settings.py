@@ -26,7 +26,7 @@ from hal.registry import Drivers
 from hal.toml_lines import KeyLines
 
 BEFORE: Final = "stage.toml.before"
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+_NAME: Final = re.compile(r"[A-Za-z0-9\u00C0-\u024F][A-Za-z0-9\u00C0-\u024F_-]{0,63}")
 
 
 def text(stage: Path) -> str:

@@ -11,6 +11,7 @@ from datetime import UTC, date, datetime, time, timedelta
 from typing import Final
 
 from controller.kiosk.interface import EventRow, Lamp, LampDay, Schedule, ScheduleRow
+from controller.kiosk.schedule import grouped
 from controller.kiosk.values import MIDNIGHT
 
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -35,6 +36,12 @@ def days(schedule: Schedule, first: date | None = None) -> list[CalendarDay]:
     """The next 14 days from ``first``, in the schedule's local time; default: today."""
     start = first or _today(schedule.time_zone)
     return [_day(schedule, start + timedelta(n)) for n in range(SHOWN)]
+
+
+def later(schedule: Schedule, first: date | None = None) -> list[ScheduleRow]:
+    """The special days after those of ``days``, in as few rows as possible."""
+    last = ((first or _today(schedule.time_zone)) + timedelta(SHOWN - 1)).isoformat()
+    return list(grouped([row for row in schedule.rows if row.day not in DAYS and row.day > last]))
 
 
 def _today(zone: str) -> date:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+import unicodedata
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final
 
 import anyio
@@ -41,6 +43,7 @@ LEADS_TO: Final = {
     **dict.fromkeys(("play", "rotate", "remove-appearance"), "/appearances"),
     **dict.fromkeys(("backup", "restore", "diagnostics", "test-alerts", "test-backup"), "/care"),
     "upload-target": "/appearances/new/{target}",
+    "fit-target": "/appearances/new/{target}",
     "outline-target": "/appearances/new/{target}",
     "set-schedule": "/schedule",
     "test-shots": "/aiming",
@@ -54,11 +57,18 @@ Handler = Callable[[Request, Visitor, "Sent"], Awaitable[Response]]
 
 @dataclass(slots=True)
 class Sent:
-    """The content of a form: text by name, all texts by name, and at most one file."""
+    """The content of a form: text by name, all texts by name, and at most one file with its name."""
 
     texts: dict[str, str] = field(default_factory=dict)
     many: dict[str, list[str]] = field(default_factory=dict)
     file: Path | None = None
+    filename: str = ""
+
+
+def name_of(filename: str) -> str:
+    """A name for an appearance, from that of its file; empty if there is none."""
+    stem = unicodedata.normalize("NFC", PurePath(filename.replace("\\", "/")).stem)
+    return re.sub(r"[^A-Za-z0-9\u00C0-\u024F]+", "-", stem).strip("-")[:64]
 
 
 class Forms:
@@ -93,7 +103,9 @@ class Forms:
                 result = await answers.run(self._panel, operation, values, visitor.name)
             except answers.FAILURES as error:
                 return await self._again(operation, visitor, sent, error)
-            if operation.name in ("upload-target", "outline-target"):
+            if operation.name == "upload-target":
+                self._panel.targets.propose(result.target, name_of(sent.filename))
+            if operation.name in ("upload-target", "fit-target", "outline-target"):
                 # It is calculated while the browser loads the page on which it is shown.
                 self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
@@ -208,6 +220,7 @@ def refused() -> HTTPException:
 async def _read(form: FormData, sent: Sent, folder: Path) -> None:
     for name, value in form.multi_items():
         if isinstance(value, UploadFile):
+            sent.filename = value.filename or ""
             sent.file = await anyio.to_thread.run_sync(answers.temporary, folder)
             async with await anyio.open_file(sent.file, "wb") as file:
                 while block := await value.read(1 << 20):
@@ -250,7 +263,9 @@ def _typed_rows(sent: Sent) -> list[dict[str, str]]:
     """The rows of a table as they were typed, also where a column was cut off."""
     columns = [sent.many.get(name, []) for name in _COLUMNS]
     rows = itertools.zip_longest(*columns, fillvalue="")
-    return [typed for row in rows if any((typed := dict(zip(_COLUMNS, row, strict=True))).values())]
+    kept = [typed for row in rows if any((typed := dict(zip(_COLUMNS, row, strict=True))).values())]
+    # Those that are ignored last: an error names a row by its number among the others.
+    return sorted(kept, key=lambda typed: not typed["day"].strip())
 
 
 def _then(operation: Operation, result: Any, values: Values) -> str:
@@ -265,9 +280,9 @@ def _back(operation: Operation, sent: Sent) -> str:
     if operation.name == "compute-scene":
         return "/appearances/new"
     target = sent.texts.get("target", "")
-    if operation.name in ("compute", "outline-target") and target.isascii() and target.isalnum():
+    if operation.name in ("compute", "fit-target", "outline-target") and target.isascii() and target.isalnum():
         return f"/appearances/new/{target}"
-    return "/appearances/new" if operation.name == "outline-target" else LEADS_TO[operation.name]
+    return "/appearances/new" if operation.name in ("fit-target", "outline-target") else LEADS_TO[operation.name]
 
 
 class Setup:

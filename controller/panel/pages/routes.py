@@ -262,7 +262,8 @@ class Pages:
     def _hours(self, rows: Sequence[Any]) -> dict[str, Any]:
         schedule = self._panel.kiosk.schedule()
         names = [appearance.name for appearance in self._panel.kiosk.appearances()]
-        return {"schedule": schedule, "rows": rows, "days": calendar.days(schedule), "names": names,
+        return {"schedule": schedule, "rows": rows, "days": calendar.days(schedule),
+                "later": calendar.later(schedule), "names": names,
                 "zones": calendar.zones(), "allowed": ALLOWED_DAYS}  # fmt: skip
 
     def _results(self, request: Request) -> dict[str, Any]:
@@ -343,7 +344,8 @@ class Pages:
 
     def _drawn_on(self, target: str) -> dict[str, Any]:
         outline, stamp = self._panel.targets.outline(target), self._panel.targets.path(target).stat().st_mtime_ns
-        return {"outline": outline, "stamp": stamp, "view": self._view_px()}
+        return {"outline": outline, "stamp": stamp, "view": self._view_px(),
+                "proposed": self._panel.targets.proposed(target)}  # fmt: skip
 
     def _reached(self, request: Request) -> dict[str, Any]:
         target = request.path_params["target"]

@@ -155,6 +155,7 @@ CASES: tuple[Case, ...] = (
     Case("compute", {"name": "wood", "target": "target.png", "fit": "crop"}, holds=a_job),
     Case("compute", {"name": "wood", "target": "target.png", "fit": "stretch"}, "field-wrong"),
     Case("compute", {"name": "wood", "target": "BACKUP"}, "target-unreadable"),
+    Case("compute", {"name": "Grün_Ötzi", "target": "target.png"}, holds=a_job),
     Case("compute", {"name": "two words", "target": "target.png"}, "field-wrong"),
     Case("compute", {"name": "wood", "target": "target.png"}, "busy", first=(FULL,)),
     Case("scenes", holds=lambda rows, _: every(Scene)(rows, _) and [row.name for row in rows][:4] == list(BUILTIN)),

@@ -21,7 +21,10 @@ def test_each_pixel_has_one_reason_and_one_colour() -> None:
     bright[0, 3, 0], dark[0, 3, 1] = 0.1, 0.2
     reachable = np.array([[True, False, False, False, True, False]])
     asked = np.array([[True, True, True, True, False, False]])
-    kinds = kinds_of(Feasibility((bright - dark).astype(np.float16), reachable, 0.0), asked)
+    none, possible = np.zeros((1, 6), np.bool_), Feasibility((bright - dark).astype(np.float16), reachable, 0.0)
+    alike = kinds_of(possible, asked, np.array([[False, False, True, False, False, True]]))
+    assert np.flatnonzero(alike["share"]).tolist() == [0, 2], "no one sees the difference"
+    kinds = kinds_of(possible, asked, none)
     assert [np.flatnonzero(kinds[name]).tolist() for name in ("share", "too_bright", "too_dark", "too_colourful")] == [
         [0], [1], [2], [3]
     ]  # fmt: skip

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 from PIL import Image
 
 from controller.kiosk.interface import Schedule, ScheduleRow
@@ -92,9 +94,47 @@ def test_hours_that_close_the_running_show_ask_first_and_no_leads_back_to_what_w
         again = {"csrf": form["csrf"], **{name: [v for n, v in kept if n == name] for name, _ in kept}}
         back = client.post("/do/set-schedule", data=again | {"sure": "no"})
         assert (back.status_code, kiosk.schedule()) == (200, KEPT)
-        assert all(f'value="{typed}"' in back.text for typed in ("tue", "2026-12-24", "04:00", "warm wood"))
+        assert all(f'value="{typed}"' in back.text for typed in ("tue", "2026-12-24", "04:00"))
+        assert "<option selected>warm wood</option>" in back.text
         assert client.post("/do/set-schedule", data=again | {"sure": "yes"}).status_code == 303
     assert [row.day for row in kiosk.schedule().rows] == ["tue", "2026-12-24"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"appearance": ["", "", "no such"]}, "row 2"),
+        ({"opens": ["10:00", "", "9"], "closes": ["18:00", "", "12:00"]}, "row 2"),
+        ({"opens": ["10:00", "", "09:00"], "closes": ["18:00", "", ""]}, "row 2"),
+        ({"day": ["mon-fri", "", "wed"], "opens": ["10:00", "", "9:00"], "closes": ["18:00", "", "12:00"]}, "row 2"),
+        ({"day": ["mon-fri", "", "wed"], "opens": ["10:00", "", "09:00"], "closes": ["18:00", "", "12:00"]}, "row 1"),
+    ],
+)  # fmt: skip
+def test_an_error_names_the_row_of_the_form(fresh: Served, changes: dict[str, Any], told: str) -> None:
+    with fresh.entered("otto") as client:
+        assert told in sent(client, FORM | {"day": ["mon-fri", "", "sat"], "appearance": ["", "", ""]} | changes)
+
+
+def test_special_days_after_two_weeks_are_in_sight(fresh: Served) -> None:
+    with fresh.entered("otto") as client:
+        page = sent(client, FORM | {"day": ["tue", "", "2099-12-24 to 2099-12-26"]})
+    assert "Special days after that" in page
+    assert "2099-12-24 – 2099-12-26: closed" in " ".join(page.split())
+
+
+def test_a_picture_is_fitted_anew_without_another_upload_and_its_file_proposes_a_name(fresh: Served) -> None:
+    Image.new("RGB", (60, 40), (200, 90, 30)).save(picture := io.BytesIO(), "PNG")
+    with fresh.entered("otto") as client:
+        form = {"csrf": csrf(client.get("/appearances/new").text), "fit": "fit"}
+        files = {"file": ("Grüne Wiese (2).png", picture.getvalue())}
+        there = client.post("/do/upload-target", data=form, files=files).headers["location"]
+        assert 'name="name" value="Grüne-Wiese-2"' in client.get(there).text
+        sent_on = form | {"fit": "crop", "target": there.rpartition("/")[2]}
+        again = client.post("/do/fit-target", data=sent_on).headers["location"]
+        assert again != there
+        assert 'name="name" value="Grüne-Wiese-2"' in client.get(again).text
+        seen = [client.get(f"/see/targets/{at.rpartition('/')[2]}").content for at in (there, again)]
+        assert seen[0] != seen[1]
 
 
 def test_a_wrong_name_stays_beside_its_target_and_the_rule_is_told_before(fresh: Served, tmp_path: Path) -> None:
