@@ -59,6 +59,23 @@ def _zone(name: str) -> ZoneInfo:
     return ZoneInfo(name)
 
 
+class _Day(str):  # noqa: SLOT000 - it has one more value
+    """A day of a row that a person wrote, with the number of that row, from 1."""
+
+    number: int = 0
+
+
+def _day(text: str, number: int) -> _Day:
+    day = _Day(text)
+    day.number = number
+    return day
+
+
+def number_of(row: ScheduleRow) -> int:
+    """Of the row that a person wrote; 0 where that is unknown."""
+    return row.day.number if isinstance(row.day, _Day) else 0
+
+
 def check_schedule(schedule: Schedule, appearances: Collection[str] | None = None) -> None:
     """Raises UsageError with the row's number. ``appearances``: the allowed names, None if they are not known."""
     zone_of(schedule.time_zone)
@@ -67,7 +84,7 @@ def check_schedule(schedule: Schedule, appearances: Collection[str] | None = Non
     if len(schedule.rows) > MOST_ROWS:
         raise _wrong("The number of rows", str(len(schedule.rows)), f"at most {MOST_ROWS}")
     for place, row in enumerate(schedule.rows, 1):
-        number = row.number or place
+        number = number_of(row) or place
         if row.day not in WEEKDAYS and _date(row.day) is None:
             raise _wrong(f"The day of row {number}", row.day, "mon to sun, or a date such as 2026-12-24")
         if bool(row.opens) != bool(row.closes):
@@ -107,7 +124,9 @@ def _check_day(today: Sequence[ScheduleRow], tomorrow: Sequence[ScheduleRow], na
     spans.sort(key=lambda span: span[:2])
     for (first, ends, one), (begins, _, other) in itertools.pairwise(spans):
         if begins < ends and first < 1440:
-            rows = f"row {one.number} or row {other.number}" if one.number and other.number else "one of the two rows"
+            rows = (
+                " or ".join(f"row {number_of(row)}" for row in (one, other) if number_of(row)) or "one of the two rows"
+            )
             raise UsageError(
                 "schedule-overlap",
                 what=f"Hours overlap ({name}): {one.opens}-{one.closes} and {other.opens}-{other.closes}.",
@@ -238,7 +257,7 @@ def expanded(rows: Sequence[ScheduleRow]) -> tuple[ScheduleRow, ...]:
         if not days:
             raise UsageError("schedule-wrong", what=f"The day of row {number} is {row.day[:64]!r}.",
                              remedy=f"Allowed: {ALLOWED_DAYS}.")  # fmt: skip
-        result += [ScheduleRow(day, row.opens, row.closes, row.appearance, number=number) for day in days]
+        result += [ScheduleRow(_day(day, number), row.opens, row.closes, row.appearance) for day in days]
     return tuple(result)
 
 

@@ -19,7 +19,6 @@ from controller.kiosk.api.control import call_kiosk, is_running, plain, user_nam
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import Accounts
-from controller.kiosk.operations.arguments import HoursRow
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
 from controller.kiosk.schedule import check_schedule, expanded
@@ -105,20 +104,19 @@ def changed_schedule(
     now: Mapping[str, Any], zone: str | None, hours: Sequence[str] | None, drift_check: str | None
 ) -> dict[str, Any]:
     """The schedule with the changes of a command line. Raises UsageError("schedule-wrong", "schedule-zone")."""
-    given = list(now["rows"])
+    rows = list(now["rows"])
     if hours is not None:
-        given = [asdict(row) for row in expanded([_row(text) for text in hours])]
-    rows = [{name: str(row[name]) for name in HoursRow.model_fields} for row in given]
+        rows = [asdict(row) for row in expanded([ScheduleRow(**_row(text)) for text in hours])]
     content: dict[str, Any] = {
         "time_zone": zone if zone is not None else now["time_zone"],
         "rows": rows,
         "drift_check": drift_check if drift_check is not None else now["drift_check"],
     }
-    check_schedule(Schedule(content["time_zone"], tuple(ScheduleRow(*row.values()) for row in rows), content["drift_check"]))
+    check_schedule(Schedule(content["time_zone"], tuple(ScheduleRow(**row) for row in rows), content["drift_check"]))
     return content
 
 
-def _row(text: str) -> ScheduleRow:
+def _row(text: str) -> dict[str, str]:
     day, equals, span = text.partition("=")
     opens, dash, closes = span.partition("-")
     if not equals or (span != "closed" and not dash):
@@ -126,7 +124,7 @@ def _row(text: str) -> ScheduleRow:
                          remedy="Write DAY=HH:MM-HH:MM or DAY=closed.")  # fmt: skip
     if span == "closed":
         opens = closes = ""
-    return ScheduleRow(day, opens, closes)
+    return {"day": day, "opens": opens, "closes": closes, "appearance": ""}
 
 
 def schedule_text(schedule: Mapping[str, Any]) -> str:
