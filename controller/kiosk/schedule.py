@@ -59,7 +59,7 @@ def _zone(name: str) -> ZoneInfo:
     return ZoneInfo(name)
 
 
-class _Day(str):  # noqa: SLOT000 - it has one more value
+class _Day(str):
     """A day of a row that a person wrote, with the number of that row, from 1."""
 
     number: int = 0
