@@ -280,7 +280,7 @@ def upload_target(targets: Targets, file: PictureFile, fit: FitName = "fit") -> 
     return NewTarget(targets.add(file, fit))
 
 
-@operation("POST /targets/{target}/fit", OPERATOR, CHANGES, done="The picture is fitted anew.",
+@operation("POST /targets/{target}/fit", OPERATOR, CHANGES, done="The picture is fitted again.",
            names=Names(name="fit-target", part_of="kiosk add"))  # fmt: skip
 def fit_target(targets: Targets, target: TargetKey, fit: FitName) -> NewTarget:
     """Make another target of an uploaded picture, with another fit."""
