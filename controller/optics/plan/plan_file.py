@@ -76,34 +76,6 @@ class ShellTable(ConfigTable):
     step_m: Positive = Field(default=0.25, description="metres between distances, above 0")
 
 
-class GoalTable(ConfigTable):
-    lux: Positive = Field(
-        default=400.0, description="required light on the surface from all projectors, in lux, above 0"
-    )
-    detail_mm: Positive = Field(
-        default=1.0, description="width of the smallest required detail in millimetres, above 0"
-    )
-    overlap: int = Field(
-        default=2, ge=1, le=16, description="required number of projectors at each point, from 1 to 16"
-    )
-    steepest_degrees: float = Field(
-        default=75.0,
-        ge=10,
-        le=89,
-        description="the smallest angle between light and surface that counts, in degrees, 10 to 89",
-    )
-    fill: float = Field(
-        default=0.9, gt=0, le=1, description="the share of a picture that the object should fill, above 0, at most 1"
-    )
-    body_m: float = Field(default=0.25, ge=0, le=10, description="a projector's radius in metres, 0 to 10")
-    apart_m: float = Field(
-        default=0.5, ge=0, le=100, description="the smallest distance between lenses in metres, 0 to 100"
-    )
-    points: int = Field(
-        default=4000, ge=100, le=200_000, description="number of sample points on the surface, 100 to 200000"
-    )
-
-
 class PlanTables(ConfigTable):
     object: TargetObjectTable = Field(description="the table [object] with mesh")
     audience: AudienceTable = Field(description="the table [audience] with positions_m")
@@ -114,7 +86,7 @@ class PlanTables(ConfigTable):
         default=(), description="a list of [[places]] tables with name and position_m"
     )
     shell: ShellTable | None = Field(default=None, description="the table [shell]; optional")
-    goal: GoalTable = Field(default=GoalTable(), description="the table [goal]; optional")
+    goal: PlanGoal = Field(default=PlanGoal(), description="the table [goal]; optional")
 
     def models(self) -> list[ProjectorModel]:
         """One for each projector that there is, the brightest model first."""
@@ -132,12 +104,6 @@ class PlanTables(ConfigTable):
         """Every place, those of the shell named by their angles and distance."""
         named = [MountingPoint(table.name, table.position_m) for table in self.places]
         return named + ([] if self.shell is None else _on_shell(self.shell))
-
-    def plan_goal(self) -> PlanGoal:
-        table = self.goal
-        return PlanGoal(
-            table.lux, table.detail_mm, table.overlap, table.steepest_degrees, table.fill, table.body_m, table.apart_m
-        )
 
 
 def read_plan(file: Path) -> PlanTables:

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
+from controller.config.table import ConfigTable, Positive
 from controller.core.arrays import Float64, Mask
 
 
@@ -111,18 +113,35 @@ class Illumination:
         return self.reached & near
 
 
-@dataclass(frozen=True, slots=True)
-class PlanGoal:
-    """What the plan is for: ``lux`` in all and ``detail_mm`` wanted, light from ``overlap`` projectors at each point.
+class PlanGoal(ConfigTable):
+    """What the plan is for: [goal] of plan.toml.
 
     Light that meets the surface farther from the normal than ``steepest_degrees`` counts for nothing: metapixels are
     too long there to be of use, and small errors of shape move them far.
     """
 
-    lux: float
-    detail_mm: float
-    overlap: int
-    steepest_degrees: float
-    fill: float
-    body_m: float
-    apart_m: float
+    lux: Positive = Field(
+        default=400.0, description="required light on the surface from all projectors, in lux, above 0"
+    )
+    detail_mm: Positive = Field(
+        default=1.0, description="width of the smallest required detail in millimetres, above 0"
+    )
+    overlap: int = Field(
+        default=2, ge=1, le=16, description="required number of projectors at each point, from 1 to 16"
+    )
+    steepest_degrees: float = Field(
+        default=75.0,
+        ge=10,
+        le=89,
+        description="the smallest angle between light and surface that counts, in degrees, 10 to 89",
+    )
+    fill: float = Field(
+        default=0.9, gt=0, le=1, description="the share of a picture that the object should fill, above 0, at most 1"
+    )
+    body_m: float = Field(default=0.25, ge=0, le=10, description="a projector's radius in metres, 0 to 10")
+    apart_m: float = Field(
+        default=0.5, ge=0, le=100, description="the smallest distance between lenses in metres, 0 to 100"
+    )
+    points: int = Field(
+        default=4000, ge=100, le=200_000, description="number of sample points on the surface, 100 to 200000"
+    )

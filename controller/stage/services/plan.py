@@ -54,7 +54,7 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
         file.parent / table.mesh, height_m=table.height_m, up=table.up, front=table.front
     )
     audience = np.asarray(tables.audience.positions_m, np.float64)
-    goal = tables.plan_goal()
+    goal = tables.goal
     surface = sampled(target_object, tables.goal.points, audience, SEED)
     tracker.end()
     tracker.begin(1)
@@ -84,7 +84,7 @@ def _page(
     audience: Float64,
     figures: Mapping[str, Any],
 ) -> Page:
-    goal = tables.plan_goal()
+    goal = tables.goal
     placements = [candidate.placement for candidate in best.candidates]
     room = ReportPicture("The room", layout(placements, surface, audience), "metres from the centre of the object")
     galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]

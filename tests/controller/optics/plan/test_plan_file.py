@@ -25,7 +25,7 @@ def test_the_example_is_a_plan_of_three_projectors_in_places_named_and_all_round
     assert len({point.name for point in points}) == len(points) == 1 + 3 * 5 * 13
     away = np.linalg.norm([point.position_m for point in points[1:]], axis=1)
     np.testing.assert_allclose(np.unique(away.round(9)), (1.0, 1.25, 1.5))
-    assert tables.plan_goal().overlap == 2
+    assert tables.goal.overlap == 2
 
 
 @pytest.mark.parametrize(

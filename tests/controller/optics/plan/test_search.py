@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +15,11 @@ from controller.optics.plan.target_object import TargetObject, sampled
 from controller.optics.plan.values import MountingPoint, PlanGoal, ProjectorModel, Surface
 from tests.controller.optics.plan.conftest import EYE
 
-GOAL = PlanGoal(4000.0, 0.8, 2, 75.0, 0.9, 0.1, 0.3)
+GOAL = PlanGoal(lux=4000.0, detail_mm=0.8, overlap=2, steepest_degrees=75.0, fill=0.9, body_m=0.1, apart_m=0.3)
+
+
+def goal_with(**changes: Any) -> PlanGoal:
+    return GOAL.model_copy(update=changes)
 
 
 def on_ring(count: int, distance_m: float = 1.3) -> list[MountingPoint]:
@@ -38,7 +42,7 @@ def tried(
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-@pytest.mark.parametrize("goal", [GOAL, replace(GOAL, lux=12000.0, overlap=3), replace(GOAL, detail_mm=0.3, overlap=1)])
+@pytest.mark.parametrize("goal", [GOAL, goal_with(lux=12000.0, overlap=3), goal_with(detail_mm=0.3, overlap=1)])
 def test_the_best_set_of_all_is_found(
     target_object: TargetObject, surface: Surface, model: ProjectorModel, goal: PlanGoal, count: int
 ) -> None:
@@ -61,7 +65,7 @@ def test_more_projectors_are_never_worse_and_more_light_wanted_never_better(
         choose_placements(tried(target_object, surface, model, GOAL, count=n), surface, GOAL).quality for n in (1, 2, 3)
     ]
     assert by_count == sorted(by_count)
-    demanding = replace(GOAL, lux=40000.0)
+    demanding = goal_with(lux=40000.0)
     assert (
         choose_placements(tried(target_object, surface, model, demanding, count=2), surface, demanding).quality
         < by_count[1]
@@ -90,7 +94,7 @@ def test_two_can_not_stand_in_one_place(target_object: TargetObject, surface: Su
 def test_light_that_is_too_flat_counts_for_nothing(
     target_object: TargetObject, surface: Surface, model: ProjectorModel
 ) -> None:
-    strict = replace(GOAL, steepest_degrees=30.0)
+    strict = goal_with(steepest_degrees=30.0)
     (wide,), (narrow,) = (
         candidates_of([model], on_ring(1), PlanScene(surface, target_object, EYE), goal) for goal in (GOAL, strict)
     )
