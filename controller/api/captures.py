@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from controller.core import channels
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask, as_light
 from controller.core.colour import Unsuitable
 from controller.core.errors import UsageError, WorkError
@@ -30,7 +31,7 @@ class Developed:
     """One photograph in linear light.
 
     ``image`` (rows, columns, 3) float32 camera RGB: 0 at the black level, 1 at full scale; noise may go below 0; NaN
-    where the photograph is saturated
+    where the photograph is saturated: in that colour alone if it is not RAW
     ``saturated`` (rows, columns) bool: a sample that this pixel is made of was saturated
     ``noise``: variance of a sample of value v is ``noise.shot`` v + ``noise.read`` squared; None if it is unknown
     ``camera_to_xyz`` (3, 3) float64: linear camera RGB to CIE XYZ (D65); None if the file does not contain it
@@ -67,11 +68,20 @@ def develop(path: Path | str, *, camera: CameraProfile | None = None) -> Develop
             image, saturated = linear_files.read_linear(path, bits=(8, 16))
         except Unsuitable as error:
             raise _unreadable(path, error) from error
-        image[saturated] = np.nan
-        return Developed(image, saturated, None, None, None)
+        return Developed(_measured(image, saturated), saturated, None, None, None)
     photograph = raw.read_photograph(path, profile=camera)
     noise = None if camera is None else camera.noise
-    return Developed(photograph.measured(), photograph.saturated, noise, photograph.camera_to_xyz, photograph.colours)
+    # a RAW sample spreads over its neighbours, of which not all are measured then
+    several = photograph.colours is not None
+    image = photograph.measured() if several else _measured(photograph.image, photograph.saturated)
+    return Developed(image, photograph.saturated, noise, photograph.camera_to_xyz, photograph.colours)
+
+
+def _measured(image: FloatImage, saturated: Mask) -> FloatImage:
+    """NaN in the colours that are saturated, and in all colours of a pixel that does not show in which."""
+    clipped = ~np.isfinite(image) | (image >= 1)
+    clipped |= ~channels.some(clipped)[..., None]
+    return np.where(saturated[..., None] & clipped, np.float32(np.nan), image)
 
 
 def _unreadable(path: Path, reason: object) -> WorkError:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from controller.api.captures import DESCRIPTION, description_of, develop, unfit
-from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.correspondence.any_code import Bits, Sinusoid, decode_any
@@ -30,6 +29,8 @@ def decode_folder(folder: Path | str, *, camera: CameraProfile | None = None) ->
         cell_px = 1                     # projector pixels of the finest cell; 1 if left out
         x = [["01.png", "02.png"], ["03.png", "04.png"]]    # each bit, coarsest first, and its opposite
         y = [["05.png", "06.png"], ["07.png", "08.png"]]
+        offset_px = [0, 0]              # of the code's first cell; [64, 128] where 1024 pixels show 896 x 768 of it
+        mirrored = false                # true where a mirror or a screen lit from behind turns the picture
 
         [phase]                         # optional, for x, y or both
         x = { period_px = 16, files = ["09.png", "10.png", "11.png"] }
@@ -47,7 +48,8 @@ def decode_folder(folder: Path | str, *, camera: CameraProfile | None = None) ->
     -------
     ``Correspondence`` without ``as_seen_px``; not smoothed
 
-    Errors: ``captures-description-wrong``, ``capture-file-missing``, ``capture-shape-wrong``; those of ``develop``.
+    Errors: ``captures-description-wrong``, ``capture-file-missing``, ``capture-shape-wrong``; those of ``develop``;
+    ``captures-inconsistent``, which says what is wrong with the pictures, their order or the projector's size.
     """
     folder = Path(folder)
     said = _description(folder)
@@ -57,13 +59,13 @@ def decode_folder(folder: Path | str, *, camera: CameraProfile | None = None) ->
     reader = _Reader(folder, camera)
     named = said.get("pictures", {})
     width, height = said["projector_px"]
-    bits = (_bits(reader, gray, "x", named), _bits(reader, gray, "y", named))
+    bits = (_bits(reader, gray, 0, named, width), _bits(reader, gray, 1, named, height))
     waves = (_wave(reader, phase, "x"), _wave(reader, phase, "y"))
     for axis in range(2):
         wave = waves[axis]
         if wave is not None and wave.period_px < 2 * bits[axis].cell_px:
             raise unfit(folder, "a period is shorter than two cells", "Use a finer Gray code, or a longer period.")
-    return decode_any(bits, waves, (width, height))
+    return decode_any(bits, waves, (width, height), mirrored=gray.get("mirrored", False) is True)
 
 
 def _description(folder: Path) -> dict[str, Any]:
@@ -74,13 +76,13 @@ def _description(folder: Path) -> dict[str, Any]:
         raise unfit(
             folder, "it has no table [gray] or no projector_px", "Write both in captures.toml, as the reference shows."
         )
-    if set(gray) - {"cell_px", "x", "y"} or set(phase) - {"x", "y"}:
-        raise unfit(folder, "[gray] or [phase] has an unknown key", "Use x, y and cell_px.")
+    if set(gray) - {"cell_px", "x", "y", "offset_px", "mirrored"} or set(phase) - {"x", "y"}:
+        raise unfit(folder, "[gray] or [phase] has an unknown key", "Use x, y, cell_px, offset_px and mirrored.")
     return said
 
 
 class _Reader:
-    """Photographs as grey linear light, all of one size."""
+    """Photographs as linear light, all of one size, NaN where clipped."""
 
     def __init__(self, folder: Path, camera: CameraProfile | None) -> None:
         self.folder, self._camera = folder, camera
@@ -94,8 +96,7 @@ class _Reader:
                 what=f"The file {path} does not exist.",
                 remedy="Correct its name in captures.toml, or copy the file into the folder.",
             )
-        image = np.asarray(channels.mean(develop(path, camera=self._camera).image), np.float32)
-        image = np.where(np.isfinite(image), image, np.float32(1))  # saturated: as bright as can be measured
+        image = develop(path, camera=self._camera).image
         if self._shape is not None and image.shape != self._shape:
             raise CalibrationError(
                 "capture-shape-wrong",
@@ -106,23 +107,32 @@ class _Reader:
         return image
 
 
-def _bits(reader: _Reader, gray: Mapping[str, Any], axis: str, named: Any) -> Bits:
-    rows, cell_px = gray.get(axis), gray.get("cell_px", 1)
+def _bits(reader: _Reader, gray: Mapping[str, Any], axis: int, named: Any, size_px: int) -> Bits:
+    name, cell_px, offset_px = "xy"[axis], gray.get("cell_px", 1), gray.get("offset_px", [0, 0])
+    rows = gray.get(name)
     if not isinstance(rows, list) or not rows or not isinstance(cell_px, int) or cell_px < 1:
         raise unfit(
-            reader.folder, f"[gray] has no list {axis}, or cell_px is no whole number", "Name the picture of each bit."
+            reader.folder, f"[gray] has no list {name}, or cell_px is no whole number", "Name the picture of each bit."
+        )
+    if not (isinstance(offset_px, list) and len(offset_px) == 2 and all(type(one) is int for one in offset_px)):
+        raise unfit(reader.folder, "offset_px is not two whole numbers", "Write it as [19, 0].")
+    if 2 ** len(rows) * cell_px < size_px + offset_px[axis]:
+        raise unfit(
+            reader.folder,
+            f"{len(rows)} bits of {name} are {2 ** len(rows)} cells of {cell_px} px, but the projector has {size_px}",
+            "Give all bits, the coarsest one first, or correct cell_px or projector_px.",
         )
     if all(_are_names(row, 2) and len(row) == 2 for row in rows):
-        return Bits([(reader.read(picture), reader.read(opposite)) for picture, opposite in rows], cell_px)
+        return Bits(((reader.read(one), reader.read(other)) for one, other in rows), cell_px, offset_px[axis])
     ends: list[Any] = [named.get("black"), named.get("white")] if isinstance(named, dict) else []
     if not _are_names(rows, 1) or not _are_names(ends, 2):
         raise unfit(
             reader.folder,
-            f"the bits of {axis} are not pairs of files",
+            f"the bits of {name} are not pairs of files",
             "Give each bit with its opposite, or name black and white in [pictures].",
         )
     threshold = np.asarray((reader.read(ends[0]) + reader.read(ends[1])) / 2, np.float32)
-    return Bits([(reader.read(name), threshold) for name in rows], cell_px)
+    return Bits(((reader.read(one), threshold) for one in rows), cell_px, offset_px[axis], opposites=False)
 
 
 def _wave(reader: _Reader, phase: Mapping[str, Any], axis: str) -> Sinusoid | None:
@@ -141,7 +151,7 @@ def _wave(reader: _Reader, phase: Mapping[str, Any], axis: str) -> Sinusoid | No
     numbers = isinstance(degrees, list) and all(isinstance(one, int | float) for one in degrees)
     if not numbers or len(degrees) != len(files) or len({round(one % 360, 6) for one in degrees}) < 3:
         raise unfit(reader.folder, "phases_deg are not three different angles", "Give one for each file.")
-    return Sinusoid([reader.read(name) for name in files], np.deg2rad(degrees).tolist(), float(said["period_px"]))
+    return Sinusoid((reader.read(name) for name in files), np.deg2rad(degrees).tolist(), float(said["period_px"]))
 
 
 def _are_names(value: Any, least: int) -> bool:

@@ -143,7 +143,8 @@ SIZED = "projector_px = [64, 48]\n"
     [
         (SIZED, "captures-description-wrong"),
         ("[gray]\nx = [['a', 'b']]\ny = [['a', 'b']]", "captures-description-wrong"),
-        (SIZED + "[gray]\nx = [['a', 'b']]\ny = [['a', 'b']]", "capture-file-missing"),
+        ("projector_px = [2, 2]\n[gray]\nx = [['a', 'b']]\ny = [['a', 'b']]", "capture-file-missing"),
+        (SIZED + "[gray]\nx = [['a', 'b']]\ny = [['a', 'b']]", "captures-description-wrong"),
         (SIZED + "[gray]\nx = []\ny = []", "captures-description-wrong"),
         (SIZED + "[gray]\nx = [['a', 'b', 'c']]\ny = []", "captures-description-wrong"),
         (SIZED + "[gray]\nx = ['a']\ny = ['b']", "captures-description-wrong"),
@@ -179,3 +180,177 @@ def test_pictures_of_different_sizes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(api.VelaturaError) as refused:
         api.decode_folder(tmp_path)
     assert refused.value.code == "capture-shape-wrong"
+
+
+WIDE = (120, 90)
+BITS = 7
+"""Of each axis of ``WIDE``."""
+Files = list[list[str]]
+
+
+def looked_at() -> Image:
+    x, y = np.meshgrid(np.arange(CAMERA[0]), np.arange(CAMERA[1]))
+    return np.stack([0.48 * x + 0.03 * y - 2.3 + 3 * np.sin(x / 20), -0.03 * x + 0.5 * y + 0.4], axis=2)
+
+
+def seen(shown: npt.NDArray[Any], number: int, *, moved_px: float = 0.0, bright: float = 1.0) -> Image:
+    """Photograph ``number`` on a painted, chequered wall, with noise of its own."""
+    at = looked_at().astype(np.float32)
+    light = cv2.remap(shown.astype(np.float32) / 255, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0)
+    rows, columns = np.indices(light.shape)
+    light = 0.04 + bright * (0.2 + 0.5 * ((rows // 25 + columns // 25) % 2)) * light
+    if moved_px:
+        shift = np.array([[1, 0, moved_px], [0, 1, 0]], np.float64)
+        light = cv2.warpAffine(light, shift, CAMERA, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(light + np.random.default_rng(number).normal(0, 0.002, light.shape))
+
+
+def wide_code(size: tuple[int, int] = WIDE) -> list[npt.NDArray[np.uint8]]:
+    return [np.asarray(one, np.uint8) for one in cv2.structured_light.GrayCodePattern.create(*size).generate()[1]]
+
+
+def folder_of(folder: Path, photographs: list[Image], x: Any = None, y: Any = None, more: str = "") -> Path:
+    """``x`` and ``y`` change the lists of the files."""
+    pairs: Files = []
+    for number, light in enumerate(photographs):
+        write_cv(folder / f"{number}.png", np.clip(light, 0, 1), 65535)
+        pairs.append([f"{number - 1}.png", f"{number}.png"])
+    lists = pairs[1 : 2 * BITS : 2], pairs[2 * BITS + 1 :: 2]
+    x, y = (change(*lists) if change else own for change, own in zip((x, y), lists, strict=True))
+    (folder / "captures.toml").write_text(f"projector_px = {list(WIDE)}\n[gray]\nx = {x}\ny = {y}\n{more}")
+    return folder
+
+
+def turned(files: Files, *bits: int) -> Files:
+    return [row[::-1] if number in bits else row for number, row in enumerate(files)]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "words"),
+    [
+        *[(lambda x, y, k=k: turned(x, k), None, f"opposite of bit {k + 1} are exchanged") for k in range(1, BITS)],
+        (lambda x, y: turned(x, 0), None, "mirrored"),
+        (None, lambda x, y: turned(y, 0), "mirrored"),
+        (None, lambda x, y: turned(y, 3), "code of y jumps .* bit 4 are exchanged"),
+        (lambda x, y: turned(x, *range(BITS)), None, "all pictures and opposites are exchanged"),
+        (lambda x, y: x[::-1], lambda x, y: y[::-1], "begin with the finest"),
+        (lambda x, y: [x[1], x[0], *x[2:]], None, "bits 1 and 2 are exchanged"),
+        (lambda x, y: y, lambda x, y: x, "x and y seem to be exchanged"),
+        (lambda x, y: x[1:], None, "6 bits of x are 64 cells"),
+        (lambda x, y: [*x[:2], [x[2][0], x[2][0]], *x[3:]], None, "bit 3 of x and its opposite show the same"),
+    ],
+)
+def test_a_wrong_order_of_the_pictures_of_a_code_is_named(tmp_path: Path, x: Any, y: Any, words: str) -> None:
+    folder = folder_of(tmp_path, [seen(one, number) for number, one in enumerate(wide_code())], x, y)
+    with pytest.raises(api.VelaturaError, match=words):
+        api.decode_folder(folder)
+
+
+@pytest.mark.parametrize(
+    ("late_from", "moved_px", "change", "words"),
+    [
+        (5, 0.0, 1.0, "camera was late"),
+        (4, 0.0, 1.0, "do not add up to the same light"),
+        (99, 1.0, 1.0, "moved by 1.0 px between"),
+        (99, 3.0, 1.0, "moved by 3.0 px between"),
+        (99, 0.0, 0.6, "do not add up to the same light"),
+    ],
+)
+def test_a_camera_that_was_late_moved_or_changed_its_exposure_is_named(
+    tmp_path: Path, late_from: int, moved_px: float, change: float, words: str
+) -> None:
+    code, photographs = wide_code(), []
+    for number in range(len(code)):
+        later = number >= 2 * BITS
+        shown = code[number - (number >= late_from)]
+        bright = change if number % 4 > 1 else 1.0
+        photographs.append(seen(shown, number, moved_px=moved_px * later, bright=bright))
+    with pytest.raises(api.VelaturaError, match=words) as refused:
+        api.decode_folder(folder_of(tmp_path, photographs))
+    assert refused.value.code == "captures-inconsistent"
+
+
+def test_a_code_centred_in_its_power_of_two_is_noticed_and_decoded_by_its_offset(tmp_path: Path) -> None:
+    code = [one[19 : 19 + WIDE[1], 4 : 4 + WIDE[0]] for one in wide_code((128, 128))]
+    folder = folder_of(tmp_path, [seen(one, number) for number, one in enumerate(code)])
+    with pytest.raises(api.VelaturaError) as refused:
+        api.decode_folder(folder)
+    assert "offset_px" in refused.value.remedy
+    with (folder / "captures.toml").open("a") as file:
+        file.write("offset_px = [4, 19]\n")
+    found = api.decode_folder(folder)
+    assert found.valid.mean() > 0.9
+    assert np.abs(found.projector_px - looked_at())[found.valid].max() < 1.2
+
+
+def test_a_picture_in_a_mirror_is_decoded_where_the_description_says_so(tmp_path: Path) -> None:
+    photographs = [seen(one, number)[:, ::-1] for number, one in enumerate(wide_code())]
+    found = api.decode_folder(folder_of(tmp_path, photographs, more="mirrored = true\n"))
+    assert found.valid.mean() > 0.9
+
+
+def test_noise_alone_is_nowhere_valid(tmp_path: Path) -> None:
+    random = np.random.default_rng(4)
+    dark = [random.normal(0.02, 0.003, CAMERA[::-1]) for _ in range(4 * BITS)]
+    assert not api.decode_folder(folder_of(tmp_path, dark)).valid.any()
+
+
+def test_a_clipped_colour_drops_only_itself(tmp_path: Path) -> None:
+    """Light in the room clips red in half of the picture. The other colours of the pixels still tell the code."""
+    photographs = [seen(one, number) for number, one in enumerate(wide_code())]
+    folder = folder_of(tmp_path, photographs)
+    for number, light in enumerate(photographs):
+        colours = np.rint(np.clip(as_colours(light), 0, 1) * 65535).astype(np.uint16)
+        colours[:, : CAMERA[0] // 2, 2] = 65535
+        cv2.imwrite(str(folder / f"{number}.png"), colours)
+    found = api.decode_folder(folder)
+    assert found.valid.mean() > 0.9
+    assert np.abs(found.projector_px - looked_at())[found.valid].max() < 1.2
+
+
+def test_clipped_sinusoids_are_not_measured(tmp_path: Path) -> None:
+    """Where white would be clipped, a phase from clipped steps is a third of a pixel off."""
+    code = [seen(one, number, bright=0.8) for number, one in enumerate(wide_code())]
+    text, photographs = "[phase]\n", list[Image]()
+    for axis, name in enumerate("xy"):
+        place = np.indices(WIDE[::-1])[1 - axis]
+        files = [f"{len(code) + len(photographs) + shift}.png" for shift in range(4)]
+        for shift in range(4):
+            shown = 127.5 + 127.5 * np.cos(2 * np.pi * place / 16 + shift * np.pi / 2)
+            photographs.append(seen(shown, shift, bright=1.8))
+        text += f"{name} = {{ period_px = 16, files = {files} }}\n"
+    folder = folder_of(tmp_path, code, more=text)
+    for number, light in enumerate(photographs, len(code)):
+        write_cv(folder / f"{number}.png", np.clip(light, 0, 1), 65535)
+    found = api.decode_folder(folder)
+    off = np.abs(found.projector_px - looked_at())[found.valid & (looked_at() > 2).all(axis=2)]
+    assert found.valid.mean() > 0.4
+    assert np.percentile(off, 99.9) < 0.25
+
+
+def test_noisy_pictures_of_8_bits_give_what_opencv_finds_and_more_that_agrees_with_it(tmp_path: Path) -> None:
+    """Dark paint beside bright paint. What is taken beside OpenCV's pixels fits to the pixels around it."""
+    taken = []
+    for number, one in enumerate(wide_code()):
+        light = 0.02 + 0.6 * (seen(cv2.GaussianBlur(one, (0, 0), 0.5), number) - 0.04)
+        light[:, 150:] *= 0.15
+        taken.append(np.clip(light + np.random.default_rng(99 + number).normal(0, 0.004, light.shape), 0, 1))
+    folder = folder_of(tmp_path, [])
+    folder_of(folder, taken)
+    for number, light in enumerate(taken):
+        write_cv(folder / f"{number}.png", light, 255)
+    found = api.decode_folder(folder)
+    pattern = cv2.structured_light.GrayCodePattern.create(*WIDE)
+    pattern.setWhiteThreshold(5)
+    whole, theirs = [np.rint(255 * one).astype(np.uint8) for one in taken], np.full((*CAMERA[::-1], 2), np.nan)
+    for y in range(20, 150, 3):
+        for x in range(20, 220, 3):
+            refused, place = pattern.getProjPixel(whole, x, y)
+            if not refused:
+                theirs[y, x] = place
+    both = np.isfinite(theirs).all(axis=2)
+    assert both.sum() > 1000
+    assert found.valid[both].mean() >= 0.98
+    assert (found.projector_px[both & found.valid] == theirs[both & found.valid]).all()
+    assert found.valid[20:150, 160:].mean() > 0.5
+    assert np.mean(np.abs(found.projector_px - looked_at())[found.valid].max(axis=1) > 2) < 0.01
