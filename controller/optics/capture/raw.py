@@ -154,6 +154,12 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
     except (rawpy.LibRawError, OSError) as error:
         raise _unreadable(path, error) from error
     clip = black + SATURATED_SHARE * (white - black)
+    steps = _black_steps(path)
+    if steps is not None:
+        row, column = (np.arange(side) % 2 for side in mosaic.shape)
+        clipped = mosaic >= clip[row[:, None], column]
+        mosaic = np.where(clipped, mosaic, np.clip(np.rint(mosaic - steps), 0, 65535)).astype(np.uint16)
+        white = white - steps.max()  # full scale is counted from the highest black (DNG, chapter 5)
     if profile is not None:
         mosaic = fill_bad(mosaic, profile.bad_px)
         black = black + profile.black_offset
@@ -199,6 +205,30 @@ def _colour_of_sites(raw: Any, sites: npt.NDArray[np.int64], path: Path) -> npt.
             remedy="Use a camera with a Bayer sensor, or JPEG.",
         )
     return np.array([["RGB".index(letters[index]) for index in row] for row in sites[:2, :2]], np.int64)
+
+
+_DELTA_ACROSS, _DELTA_DOWN, _MOSAIC = 50715, 50716, 32803
+
+
+def _black_steps(path: Path) -> Float64 | None:
+    """(rows, columns): what a DNG adds to the black level by row and column (1.7, BlackLevelDeltaV and H).
+
+    None where it adds nothing. LibRaw counts their rounded means alone.
+    """
+    if path.suffix.lower() != ".dng":
+        return None
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        pages: list[Any] = [one for page in file.pages for one in (page, *(getattr(page, "pages", None) or ()))]
+        tags: Any = next((page.tags for page in pages if page.photometric == _MOSAIC), {})
+        values = [tags[code].value if code in tags else (0, 1) for code in (_DELTA_DOWN, _DELTA_ACROSS)]
+    pairs = [np.reshape(value, (-1, 2)).astype(np.float64) for value in values]
+    down, across = (pair[:, 0] / pair[:, 1] for pair in pairs)
+    if not down.any() and not across.any():
+        return None
+    counted = sum(np.floor(one.mean() + 0.5) for one in (down, across))
+    return np.asarray(down[:, None] + across - counted)
 
 
 def _levels(raw: Any, sites: npt.NDArray[np.int64]) -> tuple[Float64, Float64]:

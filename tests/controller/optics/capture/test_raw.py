@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +32,9 @@ def developed(mosaic: npt.NDArray[np.uint16], colours: npt.NDArray[np.int64] = R
     return develop(mosaic, colours, np.full((2, 2), float(BLACK)), np.full((2, 2), float(WHITE))).image
 
 
-def write_dng(path: Path, mosaic: npt.NDArray[np.uint16], pattern: bytes = bytes([0, 1, 1, 2])) -> None:
+def write_dng(
+    path: Path, mosaic: npt.NDArray[np.uint16], pattern: bytes = bytes([0, 1, 1, 2]), more: Sequence[Any] = ()
+) -> None:
     """The smallest DNG that LibRaw takes (DNG specification 1.4)."""
     matrix = [(int(v * 10000), 10000) for v in (0.8, -0.2, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6)]
     tags = [
@@ -42,6 +46,7 @@ def write_dng(path: Path, mosaic: npt.NDArray[np.uint16], pattern: bytes = bytes
         (50717, "H", 1, WHITE, True),
         (50721, "2i", 9, tuple(n for pair in matrix for n in pair), True),
         (50778, "H", 1, 21, True),
+        *more,
     ]
     tifffile.imwrite(path, mosaic, photometric=32803, extratags=tags, metadata=None)
 
@@ -117,6 +122,21 @@ def test_the_reason_for_a_refusal_is_in_words(scene: Float64, tmp_path: Path) ->
             read_photograph(tmp_path / name)
         assert "b'" not in str(refused.value)
     assert "JPEG" in refused.value.remedy
+
+
+@pytest.mark.parametrize("axes", ["rows", "columns", "both"])
+def test_a_black_level_by_row_and_column_is_taken_off(scene: Float64, tmp_path: Path, axes: str) -> None:
+    down = np.where(np.arange(64) % 3, 40, -40) * (axes != "columns")
+    across = np.linspace(-30, 30, 96).astype(int) * (axes != "rows")
+    mosaic = mosaic_of(scene, RGGB)
+    pairs = {code: [int(n) for step in steps for n in (step, 1)] for code, steps in ((50716, down), (50715, across))}
+    more = [(code, "2i", len(values) // 2, tuple(values), True) for code, values in pairs.items() if any(values[::2])]
+    write_dng(tmp_path / "plain.dng", mosaic)
+    write_dng(tmp_path / "steps.dng", (mosaic + down[:, None] + across).astype(np.uint16), more=more)
+    plain, stepped = (read_photograph(tmp_path / name).image for name in ("plain.dng", "steps.dng"))
+    # The standard's full scale is the white level less the highest black.
+    full = (WHITE - BLACK - (down[:, None] + across).max()) / (WHITE - BLACK)
+    assert np.abs(plain - full * stepped).max() < 5e-4
 
 
 def test_a_sensor_without_colours_is_refused(scene: Float64, tmp_path: Path) -> None:
