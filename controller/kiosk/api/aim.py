@@ -23,13 +23,15 @@ from hal.errors import DeviceError
 from hal.interfaces import LiveViewCamera
 
 if TYPE_CHECKING:
-    from controller.optics.calibrate.values import Geometry
+    from controller.optics.calibrate.values import Geometry, Metapixels
     from controller.stage.artefacts.calibrated import Calibrated
 
 GRAZING: Final = 0.25
 """Below this cosine of the angle to the surface normal, light is grazing."""
 LEAST_COVERAGE, SOFT_FOCUS, MUCH = 0.5, 0.4, 0.1
 DIM, BURNT = 0.25, 0.98
+CAMERA_SPREAD_PX: Final = 0.5
+"""Standard deviation of a point of light in the camera's picture: its samples, its colour filters, a good lens."""
 DARK, CLIPPED = 0.1, 0.02
 """Below this share of the object's median light, a place is too dark."""
 FOLDER, FIGURES, PICTURE = "kiosk/aiming", "aiming.json", "overview.png"
@@ -102,7 +104,7 @@ def _of_shots(folder: Path) -> Aiming | None:
 def _judged(folder: Path, figures: dict[str, Any]) -> Aiming:
     aims = tuple(ProjectorAim(**row) for row in figures["projectors"])
     exposure, camera = figures["exposure"], figures["camera_focus"]
-    hints = [*_hints(aims), *_shared_hints(figures["too_dark"], figures["too_soft"])]
+    hints = [*_hints(aims, min(1.0, camera)), *_shared_hints(figures["too_dark"], figures["too_soft"])]
     if exposure < DIM or exposure > BURNT:
         word = "dark" if exposure < DIM else "bright"
         hints.append(f"The camera's picture is too {word}: change the aperture, or the ISO in stage.toml.")
@@ -119,10 +121,11 @@ def _judged(folder: Path, figures: dict[str, Any]) -> Aiming:
     )  # fmt: skip
 
 
-def _hints(aims: Sequence[ProjectorAim]) -> list[str]:
+def _hints(aims: Sequence[ProjectorAim], camera: float = 1.0) -> list[str]:
+    """``camera``: the sharpest that it sees anywhere, 0..1; no projector can look sharper."""
     hints = [f"{aim.projector} lights {aim.coverage:.0%} of the object: turn it, or move it farther away."
              for aim in aims if aim.coverage < LEAST_COVERAGE]  # fmt: skip
-    return hints + [f"{aim.projector} is out of focus." for aim in aims if aim.focus < SOFT_FOCUS]
+    return hints + [f"{aim.projector} is out of focus." for aim in aims if aim.focus < SOFT_FOCUS * camera]
 
 
 def _shared_hints(dark: float, grazing: float) -> list[str]:
@@ -144,18 +147,30 @@ def _of_calibration(calibrated: Calibrated) -> Aiming:
     area = max(1, int(np.count_nonzero(mask)))
     aims = []
     for number, part in enumerate(calibration.projectors):
-        covariance = part.metapixels.covariance_px2[part.metapixels.valid]
-        size_px = float(np.sqrt(np.median(covariance[:, 0] + covariance[:, 2]) / 2)) if len(covariance) else np.inf
-        pitch_px = float(np.sqrt(max(1, int(lit[number].sum())) / max(1, len(covariance))))
-        # The light of a sharp pixel has a standard deviation of about a third of the pixel pitch.
-        focus = float(np.clip(pitch_px / max(3 * size_px, 1e-6), 0, 1))
-        aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus))
+        aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus_of(part.metapixels)))
     dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
     grazing = grazing_share(read_geometry_of(calibrated), lit, mask)
     return Aiming(
         tuple(aims), float((lit.sum(axis=0) >= 2).sum() / area), dark, grazing,
         None, None, (*_hints(aims), *_shared_hints(dark, grazing)), "calibration", began_s(calibrated.folder.name),
     )  # fmt: skip
+
+
+def focus_of(pixels: Metapixels) -> float:
+    """How sharp a projector's pixels are, 0..1: 1 where their light spreads no more than that of a sharp pixel does at
+    this distance and slant, seen by this camera.
+    """
+    centres = np.where(pixels.valid[..., None], pixels.centre_px, np.nan).astype(np.float64)
+    across, down = np.diff(centres, axis=1)[:-1], np.diff(centres, axis=0)[:, :-1]
+    area_px2 = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    xx, xy, yy = np.moveaxis(pixels.covariance_px2[:-1, :-1].astype(np.float64), -1, 0)
+    known = np.isfinite(area_px2) & np.isfinite(xx + xy + yy)
+    if not known.any():
+        return 0.0
+    spread_px2 = np.sqrt(np.maximum((xx * yy - xy**2)[known], 1e-12))
+    # A sharp pixel's light has a standard deviation of about a third of its side; the camera adds its own.
+    sharp_px2 = area_px2[known] / 9 + CAMERA_SPREAD_PX**2
+    return float(np.clip(np.median(np.sqrt(sharp_px2 / spread_px2)), 0, 1))
 
 
 def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) -> float:

@@ -16,7 +16,7 @@ from controller.core.errors import UsageError
 from controller.core.kiosk_places import PLAYER_OPTIONS, RUNTIME, STAGE, STATE, USER
 from controller.kiosk.install.system import System
 from controller.kiosk.outputs import Connected, Placed, connected, placed, player_outputs, x_configuration
-from controller.kiosk.panel_address import FIRST_LOGIN
+from controller.kiosk.panel_address import FIRST_LOGIN, addresses
 from controller.play.control.launch import PlayerSettings
 
 CONFIGURATION: Final = Path("/etc/velatura")
@@ -182,6 +182,8 @@ def _folders(system: System) -> None:
     system.folder(CONFIGURATION)
     system.folder(STATE, mode=0o750, owner=owner)
     system.folder(STAGE, mode=0o750, owner=owner)
+    # The example of docs/how-to/run-a-kiosk.md.
+    system.folder(STATE / "backups", mode=0o750, owner=owner)
     if not system.at(RUNTIME).is_dir():
         system.run("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/velatura.conf")
 
@@ -236,13 +238,16 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
 
 
 def _first_login(system: System, say: Callable[[str], None]) -> None:
-    """Tell the one-time password of a new kiosk, once."""
+    """Say where the panel is, and, once, the one-time password of a new kiosk."""
     until_s = time.monotonic() + READY_S
     while system.look("systemctl", "is-active", "--quiet", "velatura-controller") is None:
         if time.monotonic() > until_s:
             say("The controller is not ready yet. `systemctl status velatura-controller` tells why.")
             return
         time.sleep(0.5)
+    listens = re.search(r"--panel[= ](\S+)", system.read(CONTROLLER_OPTIONS) or "")
+    for address in addresses(f"https://{listens[1]}") if listens else ():
+        say(f"Panel: {address}")
     first_login = system.read(RUNTIME / FIRST_LOGIN)
     if first_login is not None:
         account, password = first_login.split()

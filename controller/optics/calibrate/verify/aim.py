@@ -35,7 +35,9 @@ EDGES: Final = ((255, 255, 255), (109, 179, 242), (127, 201, 139), (229, 143, 20
 
 @dataclass(frozen=True, slots=True)
 class AimedProjector:
-    """``coverage`` the share of the object that it lights; ``focus`` its usual sharpness there, both 0..1."""
+    """``coverage`` the share of the object that it lights; ``focus`` its sharpness there, of the sharper part, because
+    a wall behind the object is out of focus; both 0..1.
+    """
 
     coverage: float
     focus: float
@@ -90,7 +92,7 @@ def assess_aim(black: FloatImage, boards: Sequence[tuple[FloatImage, FloatImage]
     too_dark = thing & (total < DARK_SHARE * usual)
     soft = thing & (np.where(lit, sharp, 0).max(axis=0) < SOFT)
     projectors = tuple(
-        AimedProjector(float(np.count_nonzero(on) / area), float(np.median(value[on])) if on.any() else 0.0)
+        AimedProjector(float(np.count_nonzero(on) / area), float(np.percentile(value[on], 75)) if on.any() else 0.0)
         for on, value in zip(lit, sharp, strict=True)
     )
     seen = lit.sum(axis=0).astype(np.uint8)

@@ -6,7 +6,7 @@ import io
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from controller.kiosk.api.aim import FIGURES, FOLDER, aiming, camera_picture, grazing_share
+from controller.kiosk.api.aim import FIGURES, FOLDER, SOFT_FOCUS, aiming, camera_picture, focus_of, grazing_share
 from controller.kiosk.interface import Aiming, DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
-from controller.optics.calibrate.values import Geometry, Pinhole
+from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
@@ -58,6 +58,35 @@ def test_the_hints_say_what_to_turn_and_no_more(tmp_path: Path) -> None:
     (bright,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, exposure=0.99).hints
     (soft,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, camera_focus=0.39).hints
     assert ("too dark" in dark, "too bright" in bright, "focus the camera" in soft) == (True, True, True)
+
+
+def metapixels(pitch_px: float, spread_px: float, *, slant: float = 1.0) -> Metapixels:
+    """Pixels of a flat projector; ``spread_px``: standard deviation of a point of light in projector and camera."""
+    y, x = np.mgrid[:40, :60].astype(np.float32)
+    own = pitch_px**2 / 12
+    covariance = np.zeros((40, 60, 3), np.float32)
+    covariance[..., 0], covariance[..., 2] = own * slant**2 + spread_px**2, own + spread_px**2
+    valid = np.ones((40, 60), np.bool_)
+    valid[:, 50:] = False
+    return Metapixels(np.stack([slant * pitch_px * x, pitch_px * y], -1), covariance, valid)
+
+
+@pytest.mark.parametrize(("pitch_px", "slant"), [(0.6, 1.0), (1.0, 1.0), (1.0, 0.3), (3.0, 1.0), (8.0, 0.5)])
+def test_a_sharp_projector_is_sharp_whatever_the_camera_resolves_and_a_blurred_one_is_not(
+    pitch_px: float, slant: float
+) -> None:
+    assert focus_of(metapixels(pitch_px, 0.5, slant=slant)) > 0.85
+    assert focus_of(metapixels(pitch_px, max(2.0, 1.5 * pitch_px), slant=slant)) < SOFT_FOCUS
+    assert focus_of(replace(metapixels(pitch_px, 0.5), valid=np.zeros((40, 60), np.bool_))) == 0.0
+
+
+def test_a_projector_looks_no_sharper_than_its_camera(tmp_path: Path) -> None:
+    stage = vase(tmp_path)
+    shot(stage, json.dumps(SHOTS | {"camera_focus": 0.5, "projectors": [
+        {"projector": "left", "coverage": 0.9, "focus": 0.3}, {"projector": "right", "coverage": 0.9, "focus": 0.1},
+    ]}))  # fmt: skip
+    hints = aiming(check_stage(stage)).hints
+    assert [hint.split()[0] for hint in hints if "out of focus" in hint] == ["right"]
 
 
 DAMAGE = {

@@ -11,6 +11,7 @@ import pytest
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.kiosk_places import RUNTIME
+from controller.kiosk import panel_address
 from controller.kiosk.install import steps
 from controller.kiosk.install.system import System
 from controller.play.__main__ import _parser
@@ -58,8 +59,14 @@ def installed(
     return system
 
 
-def test_it_makes_user_packages_units_and_the_outputs_that_are_there(debian: Path) -> None:
-    ran = installed(debian, FRESH).ran
+def test_it_makes_user_packages_units_and_the_outputs_that_are_there(
+    debian: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(panel_address, "own_addresses", lambda: ("10.0.0.9",))
+    system = installed(debian, FRESH)
+    assert "Panel: https://10.0.0.9:8377" in system.told
+    assert (debian / "var/lib/velatura/backups").is_dir(), "the example of the documentation"
+    ran = system.ran
     assert any(line.startswith("useradd --system") for line in ran)
     (packages,) = (line for line in ran if line.startswith("apt-get install"))
     assert set(steps.PACKAGES) <= set(packages.split())
