@@ -269,7 +269,8 @@ class TcpLink(BufferedLink):
         return DeviceGone(
             "link-lost",
             what=f"{self.name} can't be reached: {reason}.",
-            remedy="Check the address, the network cable and that the device has power.",
+            remedy="Check the address, the network cable and that the device has power. Another program may be "
+            "connected to it: many take one at a time.",
         )
 
     def close(self) -> None:

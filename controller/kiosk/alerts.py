@@ -68,9 +68,9 @@ def webhook(stage: Path, name: str, table: AlertsTable, rows: Sequence[EventRow]
     # The settings allow http and https only.
     request = urllib.request.Request(address, body, headers, method="POST")  # noqa: S310
     handlers: list[urllib.request.BaseHandler] = [_NoRedirects()]
-    if address.startswith("https:"):
-        handlers.append(urllib.request.HTTPSHandler(context=_context(stage, table)))
     try:
+        if address.startswith("https:"):
+            handlers.append(urllib.request.HTTPSHandler(context=_context(stage, table)))
         with urllib.request.build_opener(*handlers).open(request, timeout=PATIENCE_S):
             return
     except (OSError, ValueError, http.client.HTTPException) as error:
@@ -86,7 +86,12 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 
 def _context(stage: Path, table: AlertsTable) -> ssl.SSLContext:
-    return ssl.create_default_context(cafile=None if table.certificates is None else str(stage / table.certificates))
+    """Raises OSError, which names a file of certificates that has none."""
+    file = None if table.certificates is None else str(stage / table.certificates)
+    try:
+        return ssl.create_default_context(cafile=file)
+    except ssl.SSLError as error:
+        raise OSError(f"{file} has no certificate in PEM format") from error
 
 
 def _not_sent(who: str, error: Exception, secrets: Sequence[str] = ()) -> WorkError:

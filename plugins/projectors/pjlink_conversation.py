@@ -81,7 +81,6 @@ class Habits(OptionalAnswers):
 
 T = TypeVar("T")
 _IDLE_S: Final = 2.0
-_ONE_CLIENT: Final = "Another program may be connected: most projectors take one at a time."
 _PADDED_LINE: Final = 8 * pjlink.LONGEST_LINE
 
 
@@ -292,13 +291,9 @@ class PjLinkConversation:
         if self._link is not None:
             return self._link
         self.check_open()
-        try:
-            self._link = link = self._connect(deadline)
-            self.check_open()  # it may have been closed meanwhile
-            line = link.read_until(pjlink.TERMINATOR, limit=_PADDED_LINE, deadline=deadline)
-        except DeviceGone as error:
-            self.check_open()
-            raise DeviceGone(error.code, what=error.what, remedy=f"{error.remedy} {_ONE_CLIENT}") from error
+        self._link = link = self._connect(deadline)
+        self.check_open()  # it may have been closed meanwhile
+        line = link.read_until(pjlink.TERMINATOR, limit=_PADDED_LINE, deadline=deadline)
         greeting = pjlink.parse_greeting(line)
         if greeting is None or (greeting.random is not None and self._password is None):
             raise self._wrong_password()

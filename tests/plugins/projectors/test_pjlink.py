@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import socket
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -113,6 +115,29 @@ def test_a_projector_that_left_the_network_is_gone_and_found_again(open_pjlink: 
     pair.emulator.stop()
     with pytest.raises(DeviceGone, match=address):
         pair.driver.status(deadline=in_seconds(SOON))
+
+
+def test_a_projector_that_takes_one_program_at_a_time_is_told_as_that(tmp_path: Path) -> None:
+    def hang_up() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                other.accept()[0].close()
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        threading.Thread(target=hang_up, daemon=True).start()
+        table = {"address": f"127.0.0.1:{other.getsockname()[1]}"}
+        with pytest.raises(DeviceGone) as caught:
+            open_pjlink_projector(table, OpenContext(tmp_path), in_seconds(SOON))
+        assert "Another program may be connected" in caught.value.remedy
+
+
+def test_one_connection_serves_all_calls_and_a_restarted_projector_gets_another(open_pjlink: Any) -> None:
+    pair = open_pjlink(password="secret", settings={"password": "secret"})
+    for _ in range(3):
+        pair.driver.status(deadline=in_seconds(SOON))
+    pair.driver.switch_on(deadline=in_seconds(SOON))
+    assert pair.emulator.connections == 1
+    assert pair.emulator.heard.count(b"%1LAMP ?") <= 2, "counters are not asked each time"
 
 
 def test_the_projector_may_close_idle_connections(open_pjlink: Any) -> None:

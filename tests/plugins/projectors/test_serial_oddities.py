@@ -98,6 +98,19 @@ def test_a_silent_lamp_question_is_noted_once_and_not_asked_again_and_again(open
     assert "lamp hours" in notice.what
 
 
+def test_lamp_hours_are_asked_once_and_not_with_each_status(open_serial: Any) -> None:
+    boards: list[OddBoard] = []
+
+    def board(lamp: EmulatedLamp) -> OddBoard:
+        boards.append(odd("panasonic", {LAMP_QUESTION["panasonic"]: b"\x0201200\x03"})(lamp))
+        return boards[0]
+
+    pair = open_serial(profile="panasonic", board=board, edit=quick)
+    pair.emulator.lamp.warm_now()
+    assert [status(pair).lamp_hours for _ in range(4)] == [1200] * 4
+    assert boards[0].heard.count(LAMP_QUESTION["panasonic"]) == 1
+
+
 @pytest.mark.parametrize("left_s", [0.5, 0.8, 1.2])
 def test_a_silent_lamp_question_never_costs_the_power_state(open_serial: Any, left_s: float) -> None:
     pair = open_serial(profile="panasonic", board=odd("panasonic", {LAMP_QUESTION["panasonic"]: None}), edit=quick)

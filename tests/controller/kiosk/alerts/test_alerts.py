@@ -153,6 +153,17 @@ def test_settings_that_could_send_nothing_or_a_password_in_clear_are_refused(ale
     assert key in f"{refused.value.what} {refused.value.remedy}"
 
 
+@pytest.mark.parametrize(
+    "table", [{"webhook": "https://127.0.0.1:9/"}, {**MAIL, "mail_security": "tls", "mail_port": 9}]
+)
+def test_a_file_of_certificates_that_has_none_is_named(tmp_path: Path, table: dict[str, Any]) -> None:
+    (tmp_path / "ca.pem").write_text("nothing")
+    one = Alerting(tmp_path, **table, certificates="ca.pem")
+    with pytest.raises(WorkError, match=r"ca\.pem has no certificate in PEM format"):
+        one.alerts.test()
+    one.log.close()
+
+
 def test_without_anybody_to_tell_a_test_says_so(tmp_path: Path) -> None:
     one = Alerting(tmp_path)
     with pytest.raises(UsageError, match="names no receiver"):
