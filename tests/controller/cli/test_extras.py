@@ -31,8 +31,6 @@ INDIRECT = {
 }  # fmt: skip
 """Modules that come with another distribution."""
 OWN_PROCESS = {"bpy", "mathutils", "scenes"}
-OWN_SENTENCE = {"drjit", "mitsuba"}
-"""Of the emulated stage's second renderer; where they are missing, it says itself how to install them."""
 BLOCKED = """
 import contextlib, io, json, sys
 blocked = set(sys.argv[1].split())
@@ -71,7 +69,7 @@ def imported() -> dict[str, set[str]]:
 
 def test_every_import_of_the_product_has_its_extra() -> None:
     needed = {name for name, files in imported().items() if not all("hal/conformance" in file for file in files)}
-    assert needed - OWN_PROCESS - OWN_SENTENCE <= set(EXTRA_OF)
+    assert needed - OWN_PROCESS <= set(EXTRA_OF)
     assert set(EXTRA_OF.values()) - {""} == set(EXTRAS)
 
 
