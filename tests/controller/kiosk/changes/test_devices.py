@@ -33,10 +33,10 @@ from plugins.emulated.projectors.lamp import EmulatedLamp, LampTiming
 from plugins.ptp.camera import open_camera
 from tests.controller.kiosk.install.test_outputs import LEFT, OFF, RIGHT
 from tests.controller.kiosk.vase import vase
-from tests.plugins.conftest import hasty, open_network, open_pjlink, open_serial, wait_for_power
+from tests.plugins.conftest import hasty, open_network, open_pjlink, open_serial, taped, wait_for_power
 from tests.plugins.ptp.ptp_rig import Studio
 
-__all__ = ["open_network", "open_pjlink", "open_serial"]
+__all__ = ["open_network", "open_pjlink", "open_serial", "taped"]
 SOON = 30.0
 LAMP = LampTiming(warm_up_s=0.2, cool_down_s=0.2)
 
