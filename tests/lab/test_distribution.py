@@ -32,10 +32,11 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
 @pytest.mark.parametrize("part", ["boards", "bumps", "dousers", "mitsuba", "scenario", "tape", "usb"])
 def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert EntryPoint(part, PROJECT["project"]["entry-points"][extensions.GROUP][part], extensions.GROUP).load()
-    monkeypatch.setattr(extensions, "entry_points", lambda group, name: ())
-    with pytest.raises(DeviceError, match="needs the distribution velatura-lab") as refused:
-        extensions.extension(part, asked_by="This stage")
-    assert refused.value.code == "bench-part-missing"
+    for found in ((), (EntryPoint(part, "no_such_module_at_all:Part", extensions.GROUP),)):
+        monkeypatch.setattr(extensions, "entry_points", lambda group, name, found=found: found)
+        with pytest.raises(DeviceError, match="needs the distribution velatura-lab") as refused:
+            extensions.extension(part, asked_by="This stage")
+        assert refused.value.code == "bench-part-missing"
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, commands: dict[str, str]) -> None:

@@ -8,6 +8,7 @@ a tape; ``usb``: what ``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevi
 
 from __future__ import annotations
 
+import contextlib
 from importlib.metadata import entry_points
 from typing import Any, Final
 
@@ -19,10 +20,11 @@ GROUP: Final = "velatura.bench"
 def extension(name: str, *, asked_by: str) -> Any:
     """What this entry point names; ``asked_by``: what in a stage needs it. Raises DeviceError("bench-part-missing")."""
     for entry in entry_points(group=GROUP, name=name):
-        return entry.load()
+        with contextlib.suppress(ImportError, AttributeError):
+            return entry.load()
     raise DeviceError(
         "bench-part-missing",
-        what=f"{asked_by} needs the distribution velatura-lab, which is not installed.",
+        what=f"{asked_by} needs the distribution velatura-lab of this version, which is not installed.",
         remedy="Run `pip install velatura-lab` in Velatura's environment, "
         "or `pip install --editable lab` in a copy of the source.",
     )
