@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -86,6 +86,30 @@ def response(operation: Operation, answer: Any, values: Values) -> Response:
     download = answer.name if kind is Answer.FILE else "-".join([operation.name, *map(str, values.values())]) + ".html"
     headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(download)}"}
     return FileResponse(answer, media_type=kind.media, headers=headers)
+
+
+SMALL_PX: Final = 480
+"""The longer side of a picture in a row of several; each leads to its whole one."""
+
+
+def small_picture(path: Path | None) -> Response:
+    """As ``response`` of a picture, as a JPEG of ``SMALL_PX``."""
+    _picture(path)
+    assert path is not None
+    return Response(_smaller(path, path.stat().st_mtime_ns), media_type="image/jpeg")
+
+
+@lru_cache(maxsize=64)
+def _smaller(path: Path, changed_ns: int) -> bytes:
+    import cv2
+
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise UsageError("picture-unknown", what="This picture can't be read.", remedy="Load the page again.")
+    scale = SMALL_PX / max(picture.shape[:2])
+    if scale < 1:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 82])[1])
 
 
 def _picture(path: Path | None) -> Response:

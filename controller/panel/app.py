@@ -36,7 +36,7 @@ from controller.panel.pages.drawing import Drawing
 from controller.panel.pages.forms import Forms, Setup
 from controller.panel.pages.routes import Pages
 from controller.panel.uploads import Targets
-from controller.panel.words.language import COOKIE, chosen, gettext, speaking
+from controller.panel.words.language import COOKIE, LOOK_COOKIE, chosen, gettext, speaking
 
 FONTS: Final = ("velatura-sans-400.woff", "velatura-sans-700.woff")
 STATIC: Final = ("style.css", "panel.js", "looks.js", "icon.svg", *FONTS)
@@ -160,7 +160,8 @@ class Speaking:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
-        with speaking(chosen(request.cookies.get(COOKIE, ""), request.headers.get("accept-language", ""))):
+        name = chosen(request.cookies.get(COOKIE, ""), request.headers.get("accept-language", ""))
+        with speaking(name, request.cookies.get(LOOK_COOKIE, "")):
             await self._app(scope, receive, send)
 
 

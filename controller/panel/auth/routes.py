@@ -20,7 +20,7 @@ from controller.panel.context import Panel
 from controller.panel.pages.drawing import Drawing
 from controller.panel.pages.forms import Sent, checked, refused
 from controller.panel.pages.routes import Pages
-from controller.panel.words.language import COOKIE, LANGUAGES, gettext, mark, ngettext
+from controller.panel.words.language import COOKIE, LANGUAGES, LOOK_COOKIE, LOOKS, gettext, mark, ngettext
 
 _WRONG = mark("Name or password is wrong.")
 
@@ -50,7 +50,7 @@ class Entrance:
         return self._form("", 200)
 
     async def _language(self, request: Request, _: Visitor) -> Response:
-        """Keep the visitor's language in a cookie, and go back to the page."""
+        """Keep the visitor's language, and the look of pages, in cookies, and go back to the page."""
         form = await request.form(max_files=0, max_fields=4, max_part_size=4096)
         name, back = str(form.get("language", "")), str(form.get("back", "/"))
         if name not in LANGUAGES or not same_origin(self._panel, request):
@@ -58,6 +58,8 @@ class Entrance:
         # Only a path of ours: it must not lead elsewhere.
         page = RedirectResponse(back if re.fullmatch(r"/[A-Za-z0-9._/-]*", back) and "//" not in back else "/", 303)
         self._set_cookie(page, COOKIE, name, 400 * 86400)
+        if (look := form.get("look")) in LOOKS:
+            self._set_cookie(page, LOOK_COOKIE, str(look), 400 * 86400)
         return page
 
     def _form(self, problem: str, status: int) -> Response:

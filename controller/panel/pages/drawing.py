@@ -18,7 +18,7 @@ from controller.kiosk.interface import EventRow, KioskState
 from controller.kiosk.state import troubles
 from controller.panel.pages import curves
 from controller.panel.words import days, figures, spoken
-from controller.panel.words.language import LANGUAGES, gettext, language, mark, ngettext
+from controller.panel.words.language import LANGUAGES, gettext, language, look, mark, ngettext
 
 STATES: Final = {
     "off": (mark("Closed"), "quiet"),
@@ -133,7 +133,7 @@ class Drawing:
         }
         environment.globals |= {
             "states": STATES, "flags": flags, "troubles": troubles, "holds": holds, "around": around,
-            "language": language, "languages": LANGUAGES, "curve": curves.curve, "bars": curves.bars,
+            "language": language, "look": look, "languages": LANGUAGES, "curve": curves.curve, "bars": curves.bars,
             "grade_errors": curves.grade_errors, "drift_moves": curves.drift_moves,
             "colour_differences": curves.colour_differences, "sharpness_of": curves.sharpness_of,
             "source_word": lambda kind: spoken.SOURCES.get(kind, ""), "nothing_yet": NOTHING_YET,

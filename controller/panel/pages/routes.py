@@ -191,11 +191,12 @@ class Pages:
     def _picture(self, operation: Operation) -> Callable[[Request, Visitor], Awaitable[Response]]:
         async def answer(request: Request, visitor: Visitor) -> Response:
             try:
-                # The query is ignored: pages add a number to it to reload a picture.
+                # Else the query is ignored: pages add a number to it to reload a picture.
                 values = parse(operation.fields, request.path_params, strings=True)
-                return answers.response(
-                    operation, await answers.run(self._panel, operation, values, visitor.name), values
-                )
+                found = await answers.run(self._panel, operation, values, visitor.name)
+                if "small" in request.query_params and operation.answer is Answer.PICTURE:
+                    return await self._panel.in_thread(lambda: answers.small_picture(found))
+                return answers.response(operation, found, values)
             except answers.FAILURES as error:
                 return answers.failure(error)
 

@@ -13,7 +13,11 @@ from typing import Final
 LANGUAGES: Final = {"en": "English", "de": "Deutsch", "es": "Español", "fr": "Français", "ja": "日本語"}
 """Each by its own name. English is what the code says."""
 COOKIE: Final = "velatura-language"
+LOOKS: Final = ("", "dark", "light")
+"""Of pages; empty: as the device asks."""
+LOOK_COOKIE: Final = "velatura-look"
 _spoken: ContextVar[str] = ContextVar("language", default="en")
+_look: ContextVar[str] = ContextVar("look", default="")
 
 
 def chosen(cookie: str, accepted: str) -> str:
@@ -38,14 +42,20 @@ def language() -> str:
     return _spoken.get()
 
 
+def look() -> str:
+    """The look of the present request's page."""
+    return _look.get()
+
+
 @contextlib.contextmanager
-def speaking(name: str) -> Iterator[None]:
-    """In this context, also in threads started with it, the panel speaks ``name``."""
-    before = _spoken.set(name)
+def speaking(name: str, looks: str = "") -> Iterator[None]:
+    """In this context, also in threads started with it, the panel speaks ``name``, and its pages look so."""
+    before, looked = _spoken.set(name), _look.set(looks if looks in LOOKS else "")
     try:
         yield
     finally:
         _spoken.reset(before)
+        _look.reset(looked)
 
 
 @functools.cache

@@ -57,6 +57,21 @@ def test_the_picture_is_made_darker_black_and_followed_by_the_next(fresh: Served
             expect(page.get_by_role("button", name=name, exact=True)).to_be_hidden()
 
 
+@pytest.mark.parametrize(("look", "word"), [("dark", "dark"), ("light", "light")])
+def test_a_switch_makes_pages_dark_or_light_whatever_the_device_asks(
+    fresh: Served, browser: Browser, look: str, word: str
+) -> None:
+    with tab(browser, fresh.address) as page:
+        page.emulate_media(color_scheme="light" if look == "dark" else "dark")
+        page.goto("/login")
+        page.locator("#look").select_option(look)
+        page.get_by_role("button", name="Use").click()
+        page.wait_for_load_state()
+        assert page.evaluate("getComputedStyle(document.documentElement).colorScheme") == word
+        enter(page, "otto")
+        assert page.evaluate("getComputedStyle(document.documentElement).colorScheme") == word
+
+
 def test_what_is_chosen_is_not_said_to_play_while_the_lamps_are_dark(fresh: Served) -> None:
     kiosk_of(fresh).change(state="powering", playing="")
     with fresh.entered("otto") as otto:

@@ -44,6 +44,22 @@ def test_without_a_picture_the_aiming_page_has_words_and_no_broken_image(tmp_pat
     assert "<meter" not in page
 
 
+def test_the_results_page_has_small_pictures_that_lead_to_the_whole_ones(fresh: Served) -> None:
+    run = fresh.kiosk.runs()[0]
+    file = fresh.kiosk.results(run).pictures["error"]
+    assert isinstance(file, Path)
+    Image.effect_noise((1600, 1200), 90).save(file)
+    with fresh.entered("vera") as client:
+        page, at = client.get("/results").text, f"/see/runs/{run}/pictures/error"
+        assert f'src="{at}?small"' in page
+        assert f'href="{at}"' in page
+        small, whole = client.get(f"{at}?small"), client.get(at)
+        assert client.get(f"/see/runs/{run}/pictures/none?small").status_code >= 400
+    assert Image.open(io.BytesIO(small.content)).size == (480, 360)
+    assert Image.open(io.BytesIO(whole.content)).size == (1600, 1200)
+    assert len(small.content) < len(whole.content) / 4
+
+
 def test_test_shots_are_begun_from_the_aiming_page(fresh: Served) -> None:
     with fresh.entered("tina") as client:
         page = client.get("/aiming").text
