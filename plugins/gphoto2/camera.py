@@ -1,7 +1,7 @@
 """The driver ``gphoto2``: the cameras that libgphoto2 knows, through the wheel of the same name (extra ``gphoto2``).
 
-For a camera with PTP use the driver ``ptp``: it survives a lost connection during a picture. This driver also
-never takes a picture twice, but reports that it was lost. The library runs in a process of its own (``worker``).
+For a standard camera or a Canon EOS use the driver ``ptp``: it survives a lost connection during a picture. This driver
+also never takes a picture twice, but reports that it was lost. The library runs in a process of its own (``worker``).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def open_camera(settings: Mapping[str, Any], context: OpenContext, deadline: Dea
 DRIVER: Final = Driver(
     kind="camera",
     name="gphoto2",
-    summary="Cameras of libgphoto2 without (good) PTP support (needs the extra gphoto2).",
+    summary="Cameras that libgphoto2 knows, such as those of Nikon and Sony (needs the extra gphoto2).",
     open=open_camera,
     settings={
         "address": "libgphoto2's port, such as usb:001,004 or ptpip:192.168.1.20 (default: the first camera on USB)",
