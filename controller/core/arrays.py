@@ -39,6 +39,8 @@ STRIP_ROWS: Final = 128
 ALIGNMENT: Final = 64
 MAPPED_FROM: Final = 32 * 1024 * 1024
 """Bytes from which a file is mapped instead of read, and an array worth a file."""
+LARGEST_UNPACKED: Final = 1 << 30
+"""Bytes of the packed members of a file, which may be a thousand times larger than it."""
 _LOCAL: Final = struct.Struct("<26xHH")
 """Of a member's local header: the lengths of its name and of what follows the name."""
 _ZIP64_EXTRA: Final = 20
@@ -48,7 +50,7 @@ _PADDING_ID: Final = 0xD935
 _BLOCK: Final = 1 << 24
 _DAMAGED: Final = (
     OSError, ValueError, KeyError, EOFError, RuntimeError, struct.error, zlib.error, tokenize.TokenError,
-    zipfile.BadZipFile,
+    zipfile.BadZipFile, MemoryError,
 )  # fmt: skip
 """What the libraries raise for a file that is not what it should be."""
 
@@ -89,6 +91,7 @@ def load_arrays(path: Path, *, mapped_from: int = MAPPED_FROM) -> dict[str, npt.
     may be written to: what changes then is memory of this process alone.
     """
     try:
+        _refuse_bomb(path)
         if path.stat().st_size >= mapped_from:
             return _mapped(path)
         with np.load(path, allow_pickle=False) as archive:
@@ -100,6 +103,14 @@ def load_arrays(path: Path, *, mapped_from: int = MAPPED_FROM) -> dict[str, npt.
             what=f"{path} is not a readable array file ({error}).",
             remedy="Delete it and run the command that made it again.",
         ) from error
+
+
+def _refuse_bomb(path: Path) -> None:
+    """Raises ValueError for a file whose packed members would fill the memory: ours are not packed at all."""
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(one.file_size for one in archive.infolist() if one.compress_type != zipfile.ZIP_STORED)
+    if unpacked > LARGEST_UNPACKED:
+        raise ValueError(f"it holds {unpacked / 1e9:.1f} GB, packed")
 
 
 def _mapped(path: Path) -> dict[str, npt.NDArray[Any]]:

@@ -37,6 +37,8 @@ from plugins.emulated.cameras.wire import NOT_SUPPORTED, Gone, PtpOutcome
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 
 LARGEST_PIECE: Final = 256 << 20
+MOST_UNPACKED: Final = 2 << 30
+"""Bytes of a whole tape, which may be packed into a thousand times fewer."""
 MOST_TRACKS: Final = 10_000
 _LINE: Final = re.compile(r"(?P<at>\d{1,12}\.\d{1,9}) (?P<mark>[+<>|{}]) (?P<track>\d{1,6}) (?P<text>[ -~]*)", re.ASCII)
 _WAYS: Final = {**{way.value: way for way in Direction}, **{mark: way for way, mark in PACKED.items()}}
@@ -92,7 +94,7 @@ def parse_tape(text: str) -> tuple[Track, ...]:
     lines = text.split("\n")
     if lines[0] != HEADER:
         raise _wrong(f"its first line is not {HEADER!r}")
-    tracks: list[Track] = []
+    tracks, left = list[Track](), MOST_UNPACKED
     for number, line in enumerate(lines[1:], start=2):
         # A program that was killed may leave half a line at the end.
         if not line or (number == len(lines) and not text.endswith("\n")):
@@ -101,23 +103,27 @@ def parse_tape(text: str) -> tuple[Track, ...]:
         if match is None:
             raise _wrong(f"line {number} is not one of a tape")
         try:
-            _take(tracks, match["mark"], int(match["track"]), float(match["at"]), match["text"])
+            left -= _take(tracks, match["mark"], int(match["track"]), float(match["at"]), match["text"])
         except (ProtocolError, ValueError, binascii.Error, zlib.error) as error:
             raise _wrong(f"line {number} can't be read") from error
+        if left < 0:
+            raise _wrong("it unpacks to more than a tape holds")
     return tuple(tracks)
 
 
-def _take(tracks: list[Track], mark: str, number: int, at_s: float, text: str) -> None:
+def _take(tracks: list[Track], mark: str, number: int, at_s: float, text: str) -> int:
+    """Add a line to its track; returns its bytes."""
     if mark == "+":
         kind, _, address = text.partition(" ")
         if number != len(tracks) + 1 or len(tracks) >= MOST_TRACKS:
             raise ValueError(number)
         tracks.append(Track(kind, unescaped(address).decode(errors="replace")))
-        return
+        return 0
     if not 1 <= number <= len(tracks):
         raise ValueError(number)
     data = _unpacked(text) if mark in PACKED.values() else unescaped(text)
     tracks[number - 1].entries.append(Entry(at_s, _WAYS[mark], data))
+    return len(data)
 
 
 def _unpacked(text: str) -> bytes:

@@ -13,7 +13,6 @@ from typing import IO, Any, Final, cast
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import require_regular
-from controller.core.storage import sync_folder
 from controller.core.text import printable
 
 MOST_FILES: Final = 100_000
@@ -35,7 +34,7 @@ def not_ours(why: str = "") -> UsageError:
 
 
 def unpack(file: Path, folder: Path, *, first: str) -> None:
-    """Unpack a backup whose first member is ``first`` into the empty ``folder``, and sync every file and folder.
+    """Unpack a backup whose first member is ``first`` into the empty ``folder``, and sync every file.
 
     It is read to its end and checked before anything is written. Raises UsageError("not-a-backup") and
     WorkError("no-space").
@@ -46,8 +45,6 @@ def unpack(file: Path, folder: Path, *, first: str) -> None:
             _unpack_one(member, content, folder / member.name)
     except DAMAGED as error:
         raise not_ours() from error
-    for path, _, _ in os.walk(folder, topdown=False):
-        sync_folder(Path(path))
 
 
 class _Forward:

@@ -157,6 +157,18 @@ def test_hostile_indexes_are_refused_fast_and_in_little_memory(tmp_path: Path, n
     assert min(seconds_to_refuse(path) for _ in range(3)) < 0.1
 
 
+def test_a_gap_as_large_as_a_part_is_refused_also_if_it_is_empty(tmp_path: Path) -> None:
+    for gap, fine in ((64, True), (4096 - 128, False)):
+        index = as_json(small_index([4096 + gap, *GOOD[1:]]))
+        path = sealed(tmp_path / f"{gap}.vel", index, bytes(gap) + PIXELS)
+        with Bundle.open(path, allow_unsigned=True) as bundle:
+            if fine:
+                bundle.verify()
+            else:
+                with pytest.raises(BundleError, match="bytes between"):
+                    bundle.verify()
+
+
 def seconds_to_refuse(path: Path) -> float:
     began = time.process_time()
     with pytest.raises(BundleError):

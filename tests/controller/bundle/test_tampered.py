@@ -69,6 +69,9 @@ def test_only_our_signature_passes(signed: Path, unsigned: Path, key: SigningKey
     assert refused(tmp_path / "forged.vel", forged, trusted=[other]).code == "bundle-signature-wrong"
     assert refused(tmp_path / "forged.vel", forged, allow_unsigned=True).code == "bundle-signature-wrong"
     Bundle.open(signed, trusted=[other, ours]).close()
+    # Where keys are listed, only what has no signature is allowed in addition, and no other signer.
+    assert refused(signed, signed.read_bytes(), trusted=[other], allow_unsigned=True).code == "bundle-untrusted"
+    Bundle.open(unsigned, trusted=[ours], allow_unsigned=True).close()
 
 
 def other_block(signed: Path, public: bytes) -> bytes:

@@ -63,6 +63,18 @@ def test_files_of_numpy_itself_are_read_packed_or_not(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found[key], values)
 
 
+@pytest.mark.parametrize("mapped_from", [0, 1 << 40])
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapped_from: int
+) -> None:
+    monkeypatch.setattr("controller.core.arrays.LARGEST_UNPACKED", 1 << 20)
+    np.savez_compressed(tmp_path / "a.npz", zeros=np.zeros(1 << 21, np.uint8))
+    with pytest.raises(UsageError, match="packed"):
+        load_arrays(tmp_path / "a.npz", mapped_from=mapped_from)
+    save_arrays(tmp_path / "b.npz", {"zeros": np.zeros(1 << 21, np.uint8)})
+    assert load_arrays(tmp_path / "b.npz", mapped_from=mapped_from)["zeros"].size == 1 << 21
+
+
 def test_numpy_reads_ours(tmp_path: Path) -> None:
     save_arrays(tmp_path / "a.npz", {"x": np.arange(3)})
     with np.load(tmp_path / "a.npz") as archive:

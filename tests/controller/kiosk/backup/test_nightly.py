@@ -68,6 +68,19 @@ def test_one_backup_a_night_the_oldest_go_and_another_machine_restores_it(tmp_pa
     nights.log.close()
 
 
+def test_a_file_that_the_settings_name_and_that_is_gone_is_told_once_a_night(tmp_path: Path) -> None:
+    nights = Nights(tmp_path)
+    nights.to.mkdir()
+    (nights.stage / "appearances/glass.png").unlink()
+    for seconds in (0, 60, 120):
+        assert nights.at(seconds) == ["velatura-20260504.tar.gz"]
+    assert nights.codes.count("backup-incomplete") == 1
+    nights.at(DAY_S)
+    assert nights.codes.count("backup-incomplete") == 2
+    assert "appearances/glass.png" in next(row.text for row in nights.log.after(0) if row.code == "backup-incomplete")
+    nights.log.close()
+
+
 def test_a_missing_disk_is_a_failure_that_stays_in_sight_until_somebody_has_seen_it(
     tmp_path: Path,
 ) -> None:

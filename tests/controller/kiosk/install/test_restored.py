@@ -158,6 +158,37 @@ def test_a_kiosk_with_a_stage_and_a_file_that_is_no_backup_are_refused(debian: P
         restored_on(debian, file, now)
 
 
+def test_secrets_that_are_in_no_backup_are_named_and_what_a_kill_left_is_gone(debian: Path, tmp_path: Path) -> None:
+    text = stage_text("A1", "B2", "C3") + '[alerts]\nmail_password_file = "keys/mail"\n'
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures/clouds.png").write_text("clouds")
+    text += f'[[appearances]]\nname = "c"\nkind = "picture"\nfile = "{tmp_path}/pictures/clouds.png"\n'
+    file = backup(tmp_path, text)
+    (tmp_path / "pictures/clouds.png").unlink()
+    place = debian / STAGE.relative_to("/")
+    for left in (place.parent / "restore-abc/fresh", place / "appearances"):
+        left.mkdir(parents=True)
+        (left / "old.png").write_text("half of another restore")
+    now = told_by_x(*((f"DP-{n}", edid(one, n)) for n, one in enumerate(("A1", "B2", "C3"), 1)))
+    system, _ = restored_on(debian, file, now)
+    assert [line for line in system.told if "keys/mail" in line] == [
+        "stage.toml names keys/mail, which is not a file. It holds a secret, so it is in no backup: copy it there."
+    ]
+    assert (place / "backup-files/clouds.png").read_text() == "clouds"
+    assert "backup-files/clouds.png" in (place / "stage.toml").read_text()
+    assert not (place / "appearances/old.png").exists()
+    assert not list(place.parent.glob("restore-*"))
+
+
+def test_a_backup_of_which_no_kiosk_could_start_is_refused_before_the_installation(
+    debian: Path, tmp_path: Path
+) -> None:
+    file = backup(tmp_path, stage_text("A1", "B2", "C3").replace('driver = "player"', 'driver = "gone"'))
+    with pytest.raises(UsageError, match="gone"):
+        restored_on(debian, file, "")
+    assert not (debian / "etc/systemd/system/velatura.target").exists()
+
+
 def test_the_last_one_left_needs_no_number() -> None:
     wanted = [Wanted("P0", "left", ("A1",)), Wanted("P1", "right", ("DP-2",))]
     there = [Connected("HDMI-1", []), Connected("HDMI-2", [], edid=edid("A1", 1))]

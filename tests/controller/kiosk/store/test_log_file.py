@@ -307,3 +307,21 @@ def test_a_new_file_that_was_written_in_part_does_not_take_the_place_of_a_sound_
     log.close()
     assert not path.with_suffix(".new").exists()
     assert not list(path.parent.glob("*.damaged-*"))
+
+
+def test_an_event_is_on_the_disk_when_it_is_logged(tmp_path: Path) -> None:
+    """With less than this, SQLite writes the newest events to the disk only later."""
+    levels: list[int] = []
+
+    class Watched(sqlite3.Connection):
+        def executescript(self, script: str, /) -> sqlite3.Cursor:
+            levels.append(self.execute("PRAGMA synchronous").fetchone()[0])
+            return super().executescript(script)
+
+    def connect(path: Any, **more: Any) -> sqlite3.Connection:
+        return sqlite3.connect(path, factory=Watched, **more)
+
+    for durable in (True, False):
+        EventLog(tmp_path / f"{durable}.sqlite", durable=durable, connect=connect).close()
+    full, off = 2, 0
+    assert levels == [full, off]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from argon2 import PasswordHasher
+from argon2 import PasswordHasher, extract_parameters
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.accounts import Account, Accounts, Role
@@ -42,15 +42,20 @@ def test_passwords_are_kept_as_argon2id_in_a_private_file(tmp_path: Path) -> Non
 
 def test_a_name_that_does_not_exist_costs_a_hash_too(tmp_path: Path) -> None:
     class Counting(PasswordHasher):
-        calls = 0
+        costs: list[object]
 
         def verify(self, hash: str | bytes, password: str | bytes) -> Literal[True]:  # noqa: A002
-            Counting.calls += 1
+            # An empty or damaged hash would be refused at once.
+            Counting.costs.append(extract_parameters(str(hash)))
             return QUICK_HASH.verify(hash, password)
 
+    Counting.costs = []
     accounts = Accounts(tmp_path / "a.json", hasher=Counting())
+    accounts.add("vera", Role.VIEWER, PASSWORD)
     assert accounts.verify("nobody", "whatever it is") is None
-    assert Counting.calls == 1
+    assert accounts.verify("vera", "whatever it is") is None
+    assert len(Counting.costs) == 2
+    assert Counting.costs[0] == Counting.costs[1]
 
 
 def test_the_one_time_password_ends_with_the_first_real_one(tmp_path: Path) -> None:
@@ -194,6 +199,18 @@ def test_a_log_in_begins_a_new_session_and_its_cookie_is_closed(fresh: Served) -
         assert "HttpOnly" in cookie
         assert "SameSite=strict" in cookie
         assert client.post("/login", data={"name": "vera", "password": PASSWORD}).status_code == 403
+
+
+def test_a_log_in_ends_the_session_that_the_browser_had(fresh: Served) -> None:
+    with fresh.entered("vera") as vera:
+        old = vera.cookies["velatura"]
+        page = vera.get("/login").text
+        vera.post("/login", data={"csrf": csrf(page), "name": "vera", "password": PASSWORD})
+        assert vera.cookies["velatura"] != old
+        assert vera.get("/").status_code == 200
+    with fresh.client() as thief:
+        thief.cookies.set("velatura", old)
+        assert thief.get("/").status_code != 200
 
 
 def test_a_removed_account_and_a_changed_password_end_their_sessions(fresh: Served) -> None:

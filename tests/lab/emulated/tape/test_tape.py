@@ -68,6 +68,15 @@ def test_a_piece_that_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyP
         parse_tape(f"{HEADER}\n0.1 + 1 ptp a\n0.2 {{ 1 {base64.b64encode(bomb).decode()}\n")
 
 
+def test_pieces_that_unpack_to_too_much_together_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tape_module, "MOST_UNPACKED", 5000)
+    packed = base64.b64encode(zlib.compress(bytes(2000))).decode()
+    text = f"{HEADER}\n0.000000 + 1 tcp a\n" + f"0.000000 {{ 1 {packed}\n" * 2
+    assert len(parse_tape(text)[0].entries) == 2
+    with pytest.raises(ProtocolError, match="more than a tape holds"):
+        parse_tape(text + f"0.000000 {{ 1 {packed}\n")
+
+
 def test_half_a_line_at_the_end_is_left_out() -> None:
     tracks = parse_tape(f"{HEADER}\n0.100000 + 1 serial a\n0.200000 > 1 on\\r\n0.300000 < 1 O")
     assert [entry.data for entry in tracks[0].entries] == [b"on\r"]
