@@ -167,6 +167,17 @@ def read_mosaic(path: Path, *, profile: CameraProfile | None = None) -> RawMosai
     return RawMosaic(mosaic, SensorLevels(colours, black, white, clip), camera_to_xyz)
 
 
+def raw_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a RAW file's picture. Raises WorkError("photograph-unreadable")."""
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            return int(raw.sizes.width), int(raw.sizes.height)
+    except (rawpy.LibRawError, OSError) as error:
+        raise _unreadable(path, error) from error
+
+
 def _unreadable(path: Path, reason: Exception) -> WorkError:
     words = reason.strerror if isinstance(reason, OSError) and reason.strerror else reason
     remedy = "Take it again; if this happens often, check the camera's card and cable."

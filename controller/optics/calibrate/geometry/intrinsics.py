@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import cv2
 import numpy as np
 
 from controller.core.arrays import Float64
@@ -91,7 +92,10 @@ covariance = [
 
 
 def read_intrinsics(path: Path) -> CameraIntrinsics:
-    """Read what ``write_intrinsics`` wrote, or a person did.
+    """Read what ``write_intrinsics`` wrote, or a person or another program did.
+
+    OpenCV's YAML, XML and JSON, ROS's YAML and COLMAP's cameras.txt are read. Such a lens is replaced by the focal
+    length, centre and k1 that come nearest to it over the picture, and what is left over widens their covariance.
 
     Raises UsageError("camera-intrinsics-missing", "camera-intrinsics-unreadable", "camera-intrinsics-invalid").
     """
@@ -106,8 +110,11 @@ def read_intrinsics(path: Path) -> CameraIntrinsics:
     except OSError as error:
         raise _unreadable(path, str(error.strerror)) from error
     try:
-        content = tomllib.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        text = data.decode("utf-8-sig")
+        if path.suffix.lower() in (".txt", ".yml", ".yaml", ".xml", ".json"):
+            return _simplified(path, *(_of_colmap(text) if path.suffix.lower() == ".txt" else _of_opencv(text)))
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError, SystemError, cv2.error) as error:
         raise _unreadable(path, str(error)) from error
     return _checked(path, content)
 
@@ -116,8 +123,109 @@ def _unreadable(path: Path, reason: str) -> UsageError:
     return UsageError(
         "camera-intrinsics-unreadable",
         what=f"{path.name} can't be read ({reason}).",
-        remedy="Make it again with `velatura camera calibrate`.",
+        remedy="Make it with `velatura camera calibrate`, or give a lens file of OpenCV, ROS or COLMAP as it is.",
     )
+
+
+def _of_opencv(text: str) -> tuple[tuple[int, int], Float64, Float64]:
+    """Size, (3, 3) matrix and (5,) distortion from OpenCV's or ROS's file. Raises ValueError or cv2.error."""
+    if not text.lstrip().startswith(("%YAML", "<", "{")):
+        text = "%YAML:1.0\n---\n" + text
+    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+
+    def node(*names: str) -> Any:
+        return next((file.getNode(name) for name in names if not file.getNode(name).empty()), None)
+
+    def numbers(where: Any) -> Float64:
+        data = None if where is None else where.getNode("data") if where.isMap() else where
+        if data is None or data.empty():
+            raise ValueError("it has no image_width, image_height, camera_matrix or distortion_coefficients")
+        return np.array([data.at(n).real() for n in range(data.size())], np.float64)
+
+    model = node("distortion_model")
+    if model is not None and model.string() != "plumb_bob":
+        raise ValueError(f"its lens model {model.string()} is not known here")
+    size = [node(name, name.title().replace("I", "i", 1)) for name in ("image_width", "image_height")]
+    matrix = numbers(node("camera_matrix", "cameraMatrix", "Camera_Matrix", "K"))
+    bent = numbers(node("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D"))
+    if matrix.size != 9 or bent.size not in (4, 5) or None in size:
+        raise ValueError("it needs image_width, image_height, a 3x3 camera_matrix and 4 or 5 distortion_coefficients")
+    width, height = (int(one.real()) for one in size)
+    return (width, height), matrix.reshape(3, 3), np.resize(np.append(bent, 0.0), 5)
+
+
+COLMAP: Final = {
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+}  # fmt: skip
+
+
+def _of_colmap(text: str) -> tuple[tuple[int, int], Float64, Float64]:
+    """As ``_of_opencv``, of the one camera in COLMAP's cameras.txt, where a pixel's middle is at a half."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if len(lines) != 1 or len(lines[0]) < 4 or lines[0][1] not in COLMAP:
+        raise ValueError(f"it is no list of one camera with a model of {', '.join(COLMAP)}")
+    names = COLMAP[lines[0][1]].split()
+    has = dict(zip(names, map(float, lines[0][4:]), strict=True))
+    fx, fy = has.get("fx", has.get("f", 0.0)), has.get("fy", has.get("f", 0.0))
+    matrix = np.array([[fx, 0, has["cx"] - 0.5], [0, fy, has["cy"] - 0.5], [0, 0, 1]])
+    bent = np.array([has.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    return (int(lines[0][2]), int(lines[0][3])), matrix, bent
+
+
+LARGEST_MISFIT_PX: Final = 2.0
+LEAST_SIGMAS: Final = (2e-3, 2.0, 2.0, 5e-3)
+"""Of ``PARAMETERS``, where another program does not say how sure it is."""
+
+
+def _simplified(path: Path, size_px: tuple[int, int], matrix: Float64, bent: Float64) -> CameraIntrinsics:
+    """The nearest lens of one focal length and k1, by linear least squares over the picture."""
+    width, height = size_px
+    seen = np.stack(np.meshgrid(np.linspace(0, width - 1, 17), np.linspace(0, height - 1, 13)), axis=2).reshape(-1, 2)
+    if min(width, height, matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite([*matrix.ravel(), *bent]).all():
+        raise ValueError("its size or focal length is not above zero")
+    rays = cv2.undistortPoints(seen[:, None], matrix, bent)[:, 0]
+    cubic = rays * np.sum(rays**2, axis=1, keepdims=True)
+    one, zero = np.ones(len(rays)), np.zeros(len(rays))
+    across = np.stack([rays[:, 0], cubic[:, 0], one, zero], axis=1)
+    down = np.stack([rays[:, 1], cubic[:, 1], zero, one], axis=1)
+    rows, wanted = np.concatenate([across, down]), seen.T.ravel()
+    focal, bend, cx, cy = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    misfit = float(np.sqrt(np.mean((rows @ [focal, bend, cx, cy] - wanted) ** 2)))
+    if not misfit < LARGEST_MISFIT_PX:
+        raise UsageError(
+            "camera-lens-unlike",
+            what=f"One focal length and one distortion term do not explain the lens in {path.name}: they are off by "
+            f"{misfit:.1f} px.",
+            remedy="Measure the lens with `velatura camera calibrate`, or write focal_length_px into stage.toml.",
+        )
+    spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * misfit * np.sqrt(len(rows))
+    spread[:2] /= focal
+    sigmas = np.hypot(spread[[0, 2, 3, 1]], LEAST_SIGMAS)
+    return _in_picture(
+        path,
+        CameraIntrinsics(
+            size_px, float(focal), (float(cx), float(cy)), float(bend / focal), np.diag(sigmas**2), "charuco"
+        ),
+    )
+
+
+def _in_picture(path: Path, lens: CameraIntrinsics) -> CameraIntrinsics:
+    x, y = lens.centre_px
+    width, height = lens.size_px
+    if -width / 2 < x < 1.5 * width and -height / 2 < y < 1.5 * height:
+        return lens
+    raise UsageError(
+        "camera-intrinsics-invalid",
+        what=f"{path.name}: the principal point lies far outside of the picture of {width}x{height} pixels.",
+        remedy="Correct it, or make the file again with `velatura camera calibrate`.",
+    )
+
+
+KEYS: Final = (
+    "method", "width_px", "height_px", "focal_length_px", "principal_point_px", "distortion_k1", "rms_px", "views",
+    "covariance",
+)  # fmt: skip
 
 
 def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
@@ -139,6 +247,9 @@ def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
             raise invalid(key, "a finite number" if low == -math.inf else f"a number above {low:g}")
         return float(value)
 
+    unknown = next(iter(set(content) - set(KEYS)), None)
+    if unknown is not None:
+        raise invalid(f"the key {unknown}", f"one of {', '.join(KEYS)}")
     width, height = (number(key, content.get(key), 0.0) for key in ("width_px", "height_px"))
     x, y = numbers("principal_point_px", 2, content.get("principal_point_px"))
     rows = content.get("covariance")
@@ -148,7 +259,7 @@ def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
     if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0:
         raise invalid("covariance", "symmetric and positive definite")
     method: Literal["charuco", "exif"] = "exif" if content.get("method") == "exif" else "charuco"
-    return CameraIntrinsics(
+    lens = CameraIntrinsics(
         size_px=(int(width), int(height)),
         focal_px=number("focal_length_px", content.get("focal_length_px"), 0.0),
         centre_px=(x, y),
@@ -158,3 +269,4 @@ def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
         rms_px=number("rms_px", content.get("rms_px", 0.0)),
         views=int(number("views", content.get("views", 0))),
     )
+    return _in_picture(path, lens)

@@ -25,6 +25,7 @@ from controller.core.errors import CalibrationError, WorkError
 from controller.core.files import require_regular
 from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics
 from controller.optics.calibrate.values import Pinhole
+from controller.optics.capture.raw import raw_size
 
 SQUARES: Final = (11, 8)
 MARKER_SHARE: Final = 0.75
@@ -35,6 +36,8 @@ LEAST_TILT_DEGREES: Final = 12.0
 """Between the two most different views; with less, focal length and distance can't be separated."""
 LARGEST_FOCAL_REL_SIGMA: Final = 0.01
 LARGEST_RMS_PX: Final = 2.0
+LARGEST_BEND_PX: Final = 0.3
+"""Rms of what is off alike in neighbouring corners: paper and detector stay below, another lens model explains it."""
 MOST_SIGMAS: Final = 4.0
 LEAST_SIGMAS: Final = np.array([3e-4, 0.3, 0.3, 1e-3])
 """What a printed board that is not quite flat leaves uncertain, however many corners there are (log f, cx, cy, k1)."""
@@ -74,8 +77,8 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
 
     ``size_px``: (width, height) of the photographs, which were taken with the zoom and focus of the stage
 
-    Raises CalibrationError("camera-too-few-views", "camera-views-parallel", or "camera-fit-poor": no lens explains the
-    corners).
+    Raises CalibrationError("camera-too-few-views", "camera-views-parallel", "camera-fit-poor": no lens explains the
+    corners, or "camera-lens-unlike": one focal length and k1 do not).
     """
     _require_enough(views)
     fit = _fit(views, size_px)
@@ -92,6 +95,8 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
             what=f"No lens model explains the corners of the board: they are off by {rms_px:.1f} px rms.",
             remedy="Do not change zoom and focus between photographs, and mount the board flat on something stiff.",
         )
+    factor, other = _require_alike(fit, size_px)
+    covariance = covariance * factor + np.diag((other - fit.lens()) ** 2)
     if _tilt_degrees(fit.turns) < LEAST_TILT_DEGREES or covariance[0, 0] > LARGEST_FOCAL_REL_SIGMA**2:
         raise CalibrationError(
             "camera-views-parallel",
@@ -122,6 +127,10 @@ class _LensFit:
     moves: list[Float64]
     off_px: list[Float64]
 
+    def lens(self) -> Float64:
+        """(4,) log f, cx, cy, k1."""
+        return np.array([np.log(self.matrix[0, 0]), self.matrix[0, 2], self.matrix[1, 2], self.distortion[0]])
+
     def covariance(self) -> Float64:
         """(4, 4) of log f, cx, cy, k1, the poses eliminated, with the corners' own scatter as their noise."""
         information = np.zeros((4, 4))
@@ -140,6 +149,45 @@ class _LensFit:
         return np.asarray(inverse * squares / max(free, 1))
 
 
+def _require_alike(fit: _LensFit, size_px: tuple[int, int]) -> tuple[float, Float64]:
+    """What corners that are off alike with their neighbours say: they are not independent, and the lens is another.
+
+    In each view, cubic functions of the board's coordinates hold such misfit. Returns the factor of the covariance, and
+    the lens with more terms. Raises CalibrationError("camera-lens-unlike").
+    """
+    alike, alone, whole, free = 0.0, 0.0, 0, 0
+    for view, off in zip(fit.views, fit.off_px, strict=True):
+        x, y = (view.board[:, axis] / SQUARES[axis] for axis in range(2))
+        basis, _ = np.linalg.qr(np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1))
+        part = float(np.sum((basis.T @ off) ** 2))
+        alike, alone = alike + part, alone + float(np.sum(off**2)) - part
+        whole, free = whole + off.size, free + off.size - CUBIC
+    noise = alone / max(free, 1)
+    own = (CUBIC - 6) * len(fit.views)
+    bend = max(alike - own * noise, 0.0) / whole
+    if bend > max(LARGEST_BEND_PX**2, noise):
+        other = _fit(fit.views, size_px, cv2.CALIB_FIX_K3).matrix
+        raise CalibrationError(
+            "camera-lens-unlike",
+            what=f"One focal length and one distortion term do not explain the corners: whole areas are off by "
+            f"{math.sqrt(bend):.1f} px. With more terms the focal lengths are {other[0, 0]:.0f} px across and "
+            f"{other[1, 1]:.0f} px down.",
+            remedy="Give all photographs as the camera took them, unturned and uncropped, with the stabiliser off and "
+            "the board flat. If the lens is very wide, use a longer one, or write focal_length_px and "
+            "focal_length_rel_sigma = 0.02 into stage.toml.",
+        )
+    factor = (noise + bend * whole / own) / max(noise + bend, 1e-12)
+    if bend < WEAKEST * noise:
+        return factor, fit.lens()
+    return factor, _fit(fit.views, size_px, cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO).lens()
+
+
+WEAKEST: Final = 0.05
+"""Of the noise's variance: less misfit shows no other lens."""
+CUBIC: Final = 20
+"""Cubic functions of two coordinates, of x and of y; six of their sums are the board's pose."""
+
+
 def _board() -> Any:
     dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARY)
     return cv2.aruco.CharucoBoard(SQUARES, 1.0, MARKER_SHARE, dictionary)
@@ -155,7 +203,7 @@ def _require_enough(views: Sequence[BoardView]) -> None:
         )
 
 
-def _fit(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
+def _fit(views: Sequence[BoardView], size_px: tuple[int, int], flags: int = FLAGS) -> _LensFit:
     try:
         _, matrix, distortion, turns, moves = cv2.calibrateCamera(
             [view.board for view in views],
@@ -163,7 +211,7 @@ def _fit(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
             size_px,
             np.eye(3),
             np.zeros(5),
-            flags=FLAGS,
+            flags=flags,
         )
     except cv2.error as error:
         raise CalibrationError(
@@ -200,11 +248,14 @@ def _tilt_degrees(turns: Sequence[Float64]) -> float:
 
 FOCAL_REL_SIGMA: Final = 0.03
 """Lenses report whole millimetres, and their focal length changes with focus."""
+CONTRADICTION, CONTRADICTED_SIGMA = 0.08, 0.15
+"""Two focal lengths of one photograph differ by this share; the standard deviation of the one that is taken."""
 CENTRE_SHARE: Final = 0.005
 K1_SIGMA: Final = 0.05
 FULL_FRAME_DIAGONAL_MM: Final = 43.267
-_EXIF, _FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003
+_EXIF, _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x8769, 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
+PICTURES: Final = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 _MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
@@ -220,23 +271,25 @@ def intrinsics_from_exif(path: Path) -> CameraIntrinsics:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             tags = dict(picture.getexif().get_ifd(_EXIF))
             size = picture.size
+        if path.suffix.lower() not in PICTURES:
+            size = raw_size(path)  # the first picture of a RAW file is often a thumbnail
     except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise WorkError(
             "photograph-unreadable",
             what=f"{path.name} has unreadable EXIF data.",
             remedy="Give a JPEG or RAW file as it came from the camera.",
         ) from error
-    width, height = _number(tags.get(_WIDTH)) or size[0], _number(tags.get(_HEIGHT)) or size[1]
-    focal_px = _focal_px(tags, math.hypot(width, height))
+    width, height = size
+    focal_px, focal_sigma = _focal_px(tags, size)
     if focal_px is None:
         raise CalibrationError(
             "camera-focal-length-unknown",
             what=f"{path.name} does not contain both the focal length and the sensor's size.",
             remedy="Photograph the board of `velatura camera board`, or give focal_length_px in stage.toml.",
         )
-    sigmas = np.array([FOCAL_REL_SIGMA, CENTRE_SHARE * width, CENTRE_SHARE * width, K1_SIGMA])
+    sigmas = np.array([focal_sigma, CENTRE_SHARE * width, CENTRE_SHARE * width, K1_SIGMA])
     return CameraIntrinsics(
-        size_px=(int(width), int(height)),
+        size_px=size,
         focal_px=focal_px,
         centre_px=((width - 1) / 2, (height - 1) / 2),
         k1=0.0,
@@ -246,13 +299,23 @@ def intrinsics_from_exif(path: Path) -> CameraIntrinsics:
     )
 
 
-def _focal_px(tags: dict[int, object], diagonal_px: float) -> float | None:
+def _focal_px(tags: dict[int, object], size: tuple[int, int]) -> tuple[float | None, float]:
+    """Of the whole picture, and its relative standard deviation.
+
+    The density of the sensor's pixels is often wrong: of another sensor, or of a picture that was made smaller. The
+    focal length as on 35 mm film has no pixels in it, so it counts where both are there and contradict each other.
+    """
     focal_mm, per_unit = _number(tags.get(_FOCAL_MM)), _number(tags.get(_PLANE_X))
     unit = _number(tags.get(_PLANE_UNIT)) or 2.0
-    if focal_mm and per_unit and unit in _MM_PER_UNIT:
-        return focal_mm * per_unit / _MM_PER_UNIT[int(unit)]
     focal_35mm = _number(tags.get(_FOCAL_35MM))
-    return None if focal_35mm is None else focal_35mm / FULL_FRAME_DIAGONAL_MM * diagonal_px
+    by_film = None if focal_35mm is None else focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(*size)
+    if not (focal_mm and per_unit and unit in _MM_PER_UNIT):
+        return by_film, FOCAL_REL_SIGMA
+    smaller = size[0] / (_number(tags.get(_WIDTH)) or size[0])
+    by_sensor = focal_mm * per_unit / _MM_PER_UNIT[int(unit)] * (smaller if smaller < 1 else 1)
+    if by_film is None or abs(by_sensor / by_film - 1) < CONTRADICTION:
+        return by_sensor, FOCAL_REL_SIGMA
+    return by_film, CONTRADICTED_SIGMA
 
 
 def _number(value: object) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from controller.optics.calibrate.geometry.lenses import (
     find_corners,
     intrinsics_from_exif,
 )
+from controller.optics.capture.raw import raw_size
+from tests.controller.optics.capture.test_raw import write_dng
 
 Grey = npt.NDArray[np.uint8]
 SIZE = (776, 520)
@@ -98,16 +101,24 @@ def test_the_lens_comes_back_from_its_file(found: CameraIntrinsics, tmp_path: Pa
     assert (prior.distance_m, prior.distortion_k1, prior.size_px) == (1.2, found.k1, SIZE)
 
 
-def corners(tilts: list[tuple[float, float]], seed: int = 1) -> list[BoardView]:
+def corners(
+    tilts: list[tuple[float, float]],
+    seed: int = 1,
+    *,
+    bent: tuple[float, ...] = (K1, 0, 0, 0),
+    aspect: float = 1.0,
+    stretched: float = 1.0,
+) -> list[BoardView]:
     """Views by OpenCV's own projection, with a tenth of a pixel of noise."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(np.arange(1, SQUARES[0]), np.arange(1, SQUARES[1])), axis=2).reshape(-1, 2)
     board = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1).astype(np.float32)
-    matrix = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
+    matrix = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL * aspect, CENTRE[1]], [0, 0, 1]])
+    printed = board * np.array([stretched, 1, 1], np.float32)
     views = []
     for tilt in tilts:
         move = np.array([-5.5, -4.0, 22.0]) + rng.normal(0, 0.5, 3)
-        px, _ = cv2.projectPoints(board, np.radians([*tilt, rng.uniform(-9, 9)]), move, matrix, np.array([K1, 0, 0, 0]))
+        px, _ = cv2.projectPoints(printed, np.radians([*tilt, rng.uniform(-9, 9)]), move, matrix, np.array(bent))
         views.append(BoardView(board, (px.reshape(-1, 2) + rng.normal(0, 0.1, (len(grid), 2))).astype(np.float32)))
     return views
 
@@ -150,6 +161,102 @@ def test_corners_that_no_lens_explains_are_refused() -> None:
     assert refused.value.code in ("camera-fit-poor", "camera-too-few-views")
 
 
+@pytest.mark.parametrize("much", [0.02, 0.1, 0.4, 1.0])
+@pytest.mark.parametrize("fault", ["k2", "tangential", "aspect", "stretched", "turned"])
+def test_a_lens_that_one_focal_length_and_k1_do_not_explain_is_refused_or_has_larger_sigmas(
+    fault: str, much: float
+) -> None:
+    kinds: dict[str, dict[str, Any]] = {
+        "k2": {"bent": (-0.3, 3.0 * much, 0, 0)},
+        "tangential": {"bent": (K1, 0, 0.02 * much, -0.02 * much)},
+        "aspect": {"aspect": 1 + 0.06 * much},
+        "stretched": {"stretched": 1 + 0.03 * much},
+    }
+    views = corners([*TILTS, *TILTS], **kinds.get(fault, {}))
+    if fault == "turned":
+        last = np.array(SIZE) - 1 + 30 * much
+        views[::2] = [BoardView(view.board, (last - view.seen_px).astype(np.float32)) for view in views[::2]]
+    refused = ""
+    try:
+        found = calibrate_views(views, SIZE)
+    except CalibrationError as error:
+        refused = error.code
+    if refused:
+        assert refused in ("camera-lens-unlike", "camera-fit-poor")
+        assert much > 0.02
+    else:
+        between = 0.03 * much * (fault in ("aspect", "stretched"))  # of two focal lengths, which of them is right
+        assert abs(np.log(found.focal_px / FOCAL)) < 4 * found.sigmas[0] + between
+
+
+LENS = (1300.0, 1305.0, 610.0, 390.0, -0.12, 0.03, 0.001, -0.0005)
+
+
+@pytest.mark.parametrize("name", ["cv.yml", "cv.xml", "cv.json", "ros.yaml", "cameras.txt"])
+def test_lens_files_of_other_programs_are_read(tmp_path: Path, name: str) -> None:
+    fx, fy, cx, cy, *bent = LENS
+    matrix, path = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tmp_path / name
+    if name.startswith("cv"):
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        file.write("image_width", 1200)
+        file.write("image_height", 800)
+        file.write("camera_matrix", matrix)
+        file.write("distortion_coefficients", np.array([[*bent, 0.0]]))
+        file.release()
+    elif name.startswith("ros"):
+        path.write_text(
+            "image_width: 1200\nimage_height: 800\ncamera_name: cam\n"
+            f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {matrix.ravel().tolist()}\n"
+            "distortion_model: plumb_bob\n"
+            f"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: {[*bent, 0]}\n"
+        )
+    else:
+        path.write_text(
+            f"# Camera list\n1 OPENCV 1200 800 {fx} {fy} {cx + 0.5} {cy + 0.5} {' '.join(map(str, bent))}\n"
+        )
+    found = read_intrinsics(path)
+    assert found.size_px == (1200, 800)
+    ours = np.array([[found.focal_px, 0, found.centre_px[0]], [0, found.focal_px, found.centre_px[1]], [0, 0, 1]])
+    rays = np.random.default_rng(3).uniform((-0.4, -0.25), (0.4, 0.25), (500, 2))
+    points = np.concatenate([rays, np.ones((500, 1))], axis=1)
+    theirs, nearest = (
+        cv2.projectPoints(points, np.zeros(3), np.zeros(3), one, np.array(bend))[0].reshape(-1, 2)
+        for one, bend in ((matrix, bent), (ours, [found.k1, 0.0, 0.0, 0.0]))
+    )
+    assert np.sqrt(np.mean(np.sum((theirs - nearest) ** 2, axis=1))) < 1.0
+    assert abs(np.log(found.focal_px / fx)) < 2 * found.sigmas[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "code"),
+    [
+        ("a.yml", "%YAML:1.0\n---\nimage_width: 3\n", "camera-intrinsics-unreadable"),
+        ("a.yaml", "image_width: [", "camera-intrinsics-unreadable"),
+        ("a.json", "{}", "camera-intrinsics-unreadable"),
+        ("a.txt", "1 FISHEYE 1200 800 1 2 3 4\n", "camera-intrinsics-unreadable"),
+        ("a.txt", "1 OPENCV 1200 800 1300\n", "camera-intrinsics-unreadable"),
+        ("a.txt", "1 PINHOLE 1200 800 1300 1380 600 400\n", "camera-lens-unlike"),
+        ("a.txt", "1 SIMPLE_PINHOLE 1200 800 1300 61000 400\n", "camera-intrinsics-invalid"),
+    ],
+)
+def test_lens_files_that_are_no_lens_here_are_refused(tmp_path: Path, name: str, text: str, code: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UsageError) as refused:
+        read_intrinsics(tmp_path / name)
+    assert refused.value.code == code
+
+
+@pytest.mark.parametrize(("wrong", "right"), [("distortion_k1", "distorsion_k1"), ("[391.5", "[61000.0")])
+def test_a_misspelt_key_and_a_centre_far_outside_are_refused(tmp_path: Path, wrong: str, right: str) -> None:
+    lens = CameraIntrinsics(SIZE, FOCAL, CENTRE, K1, np.diag([1e-6, 1.0, 1.0, 1e-4]), "charuco")
+    write_intrinsics(tmp_path / "lens.toml", lens)
+    text = (tmp_path / "lens.toml").read_text()
+    (tmp_path / "lens.toml").write_text(text.replace(wrong, right))
+    with pytest.raises(UsageError) as refused:
+        read_intrinsics(tmp_path / "lens.toml")
+    assert refused.value.code == "camera-intrinsics-invalid"
+
+
 def jpeg(path: Path, tags: Mapping[int, object]) -> Path:
     from PIL import Image
 
@@ -169,6 +276,24 @@ def test_exif_gives_the_focal_length_by_the_sensors_pitch_or_by_its_35_mm_equiva
     assert found.sigmas[0] == pytest.approx(0.03)
     found = intrinsics_from_exif(jpeg(tmp_path / "b.jpg", {0xA405: 50}))
     assert found.focal_px == pytest.approx(50 / 43.267 * np.hypot(388, 260))
+
+
+@pytest.mark.parametrize("per_inch", [3888000 / 877, 44330.0, 500.0])
+def test_a_density_that_contradicts_the_focal_length_on_35_mm_film_does_not_count(
+    tmp_path: Path, per_inch: float
+) -> None:
+    from PIL.TiffImagePlugin import IFDRational
+
+    by_film = 35 * 1.5 / 43.267 * np.hypot(388, 260)
+    tags = {0x920A: IFDRational(35), 0xA20E: IFDRational(per_inch), 0xA210: 2, 0xA405: 35 * 1.5}
+    found = intrinsics_from_exif(jpeg(tmp_path / "a.jpg", tags))
+    assert found.focal_px == pytest.approx(by_film, rel=0.001)
+    assert found.sigmas[0] == pytest.approx(0.15)
+
+
+def test_a_raw_file_has_the_size_of_what_libraw_develops(tmp_path: Path) -> None:
+    write_dng(tmp_path / "a.dng", np.full((400, 600), 500, np.uint16))
+    assert raw_size(tmp_path / "a.dng") == (600, 400)
 
 
 def test_a_photograph_that_tells_nothing_is_refused(tmp_path: Path) -> None:
