@@ -122,7 +122,8 @@ def serve(
                 before, reported = reported, f"{error.what} {error.remedy}"
                 kiosk.attach(None, "" if missing else reported)
                 if reported != before:  # it is tried again every few seconds
-                    reporter.say(reported, Level.ERROR)
+                    # A new kiosk without a stage is no error.
+                    reporter.say(reported, Level.INFO if missing else Level.ERROR)
                 if first:
                     first, entrance = False, open_to_others()
                 again_s = time.monotonic() + RETRY_S

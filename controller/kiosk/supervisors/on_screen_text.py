@@ -29,7 +29,7 @@ def outputs_of(hello: Mapping[str, Any]) -> tuple[OutputSize, ...]:
 
 
 def notice(outputs: Sequence[OutputSize], lines: Sequence[str], turn: int) -> FrameSet:
-    """The lines on output number ``turn``, in capitals, white on black, in the middle of the picture. If one is an
+    """The lines on output number ``turn``, white on black, in the middle of the picture. If one is an
     address that others reach, its QR code stands above them.
     """
     frames = FrameSet.black(outputs)

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
+from controller.core.plotting import font_file
 from controller.core.storage import runtime_folder
 from controller.kiosk.decide.interfaces import BLACK
 from controller.kiosk.store.accounts import Accounts
@@ -68,6 +70,17 @@ def test_every_line_has_its_place_and_fits() -> None:
         rows = np.flatnonzero(image.any(axis=(1, 2)))
         assert np.count_nonzero(np.diff(rows) > 1) == len(LINES) - 1, "one gap between two lines"
         assert not image[:, [0, -1]].any()
+
+
+def test_letters_are_those_of_the_typeface_that_ships_with_velatura() -> None:
+    font = ImageFont.truetype(str(font_file()), 80)
+    with np.load(font_file().with_name("letters.npz")) as kept:
+        pictures, advances = kept["pictures"], kept["advances"]
+    for place, character in enumerate(map(chr, range(ord(" "), ord("~") + 1))):
+        drawn = Image.new("L", (96, 96))
+        ImageDraw.Draw(drawn).text((0, 72), character, font=font, fill=255, anchor="ls")
+        assert np.abs(np.asarray(drawn, int)[:, : pictures.shape[2]] - pictures[place]).mean() < 1
+        assert advances[place] == round(font.getlength(character))
 
 
 def test_a_telephone_reads_the_address_that_others_reach() -> None:
