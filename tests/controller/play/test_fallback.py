@@ -19,8 +19,10 @@ from controller.bundle.signing import generate_key, load_signing_key
 from controller.bundle.writer import NewAppearance, NewBundle, sign_bundle, write_bundle
 from controller.core.errors import WorkError
 from controller.play.control.launch import PlayerProcess
+from tests.controller.bundle.older import write_older
 from tests.controller.play.conftest import OUTPUTS, write_noise
-from tests.controller.play.wire import Frames, Wire, noise
+from tests.controller.play.wire import Frames, Wire, noise, same
+from tests.waiting import wait_for
 
 Start = Callable[..., PlayerProcess]
 
@@ -127,3 +129,18 @@ def test_where_all_bundles_have_a_newer_format_the_player_starts_all_the_same(st
     with Wire(player.socket) as wire:
         assert wire.ask("hello")["bundle"] is None
         assert wire.ask("load-bundle", path=str(write_noise(tmp_path / "c.vel")))["ok"]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_first_start_after_an_upgrade_shows_the_picture_that_was_lit(
+    start: Start, tmp_path: Path, version: int
+) -> None:
+    """The older version left its bundle, and what it played. Nothing is published again."""
+    frames = {name: noise(OUTPUTS, int(name)) for name in ("3", "4")}
+    folder = tmp_path / "bundles"
+    install(write_older(tmp_path / "old.vel", version, frames, 8), folder, allow_unsigned=True)
+    (tmp_path / "player.sock.playing").write_text('{"id": 1, "op": "play", "appearance": "4"}')
+    start(bundle=folder / "current", allow_unsigned=True, resume=True)
+    shown = Frames(tmp_path / "out.frame")
+    wait_for(lambda: same(shown.read(), noise(OUTPUTS, 4)))
+    wait_for(lambda: starts(folder / "current")["failed"] == 0)
