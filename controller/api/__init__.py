@@ -36,7 +36,13 @@ from controller.api.solving import (
     solve,
     solve_base,
 )
-from controller.api.transport import build_transport, indirect_light, transport_from_matrices
+from controller.api.transport import (
+    PairTransport,
+    build_transport,
+    indirect_light,
+    transport_from_matrices,
+    transport_from_pairs,
+)
 from controller.core.errors import VelaturaError
 from controller.optics.calibrate.metapixels.from_phase import FittedPixels
 from controller.optics.calibrate.values import (
@@ -56,6 +62,7 @@ from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.result.metrics import Comparison
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.stage.exchange.pairs import Pairs, read_pairs
 
 __all__ = [
     "Base",
@@ -73,6 +80,8 @@ __all__ = [
     "LightTransport",
     "MergedBracket",
     "Metapixels",
+    "PairTransport",
+    "Pairs",
     "PhaseMap",
     "Pinhole",
     "ProjectorCalibration",
@@ -96,9 +105,11 @@ __all__ = [
     "merge_brackets",
     "reachable_target",
     "read_captures",
+    "read_pairs",
     "read_run",
     "scale",
     "solve",
     "solve_base",
     "transport_from_matrices",
+    "transport_from_pairs",
 ]

@@ -219,7 +219,7 @@ class CalibratedRun:
 
 
 def read_run(folder: Path | str, projectors: Sequence[str] | None = None) -> CalibratedRun:
-    """Open the folder of a finished calibration, ``STAGE/runs/...-calibrate``.
+    """Open the folder of a finished calibration, ``STAGE/runs/...``.
 
     Parameters
     ----------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,14 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, as_light
+from controller.core.arrays import Float64, FloatImage, as_light
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Calibration, Geometry, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import LightTransport, factory
 from controller.optics.transport.gaussians.patches import patches_of_weights
 from controller.optics.transport.indirect.fit import fit_indirect
 from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.stage.exchange.pairs import fitted
 
 LINEAR = Radiometry(np.tile(np.linspace(0, 1, 256), (3, 1)), np.eye(3))
 
@@ -110,6 +112,51 @@ def transport_from_matrices(
     calibration = Calibration(parts, np.zeros((*shape, 3), np.float32), mask, np.eye(3))
     patches = patches_of_weights([_largest_one(matrix) for matrix in rows], shape)
     return factory.build_transport(calibration, patches=patches)
+
+
+@dataclass(frozen=True, slots=True)
+class PairTransport:
+    """``transport_from_pairs``: ``transport``; ``black`` (camera rows, columns, 3) float32, light without projectors.
+
+    ``explained`` (camera rows, columns): share of the changes of light in pairs that were left out, at most 1; pixels
+    below 0.5 have no light of projectors. ``error``: rms of the others in these pairs, by their light
+    """
+
+    transport: LightTransport
+    black: FloatImage
+    explained: Float64
+    error: float
+
+
+def transport_from_pairs(projected: Sequence[npt.ArrayLike], photographs: npt.ArrayLike) -> PairTransport:
+    """A light transport from N pairs of any pictures that were shown and photographed, without a code.
+
+    Each camera pixel gets a window of 5 x 5 pixels of each projector, found from coarse to fine, and bounded
+    least-squares weights in it. On an emulated stage (see Use the solver on your own data) 200 pairs of one projector
+    predict a new picture to 2 %, 250 pairs of two projectors to 7 %. Indirect light is not modelled.
+
+    Parameters
+    ----------
+    projected : for each projector (N, rows, columns, 3) linear light, 0 to 1, of all pairs
+    photographs : (N, camera rows, columns, 3) linear light, NaN where saturated
+
+    Returns
+    -------
+    ``PairTransport``
+
+    Errors: ``pairs-too-few``, ``pairs-undetermined``.
+    """
+    shown, seen = [as_light(one) for one in projected], as_light(photographs)
+    fit = fitted(shown, seen)
+    shape = seen.shape[1:]
+    transport = transport_from_matrices(
+        fit.shares,
+        (shape[1], shape[0]),
+        [(one.shape[2], one.shape[1]) for one in shown],
+        whites=[white.reshape(shape) for white in fit.whites],
+        mixing=fit.mixing,
+    )
+    return PairTransport(transport, fit.black.reshape(shape), fit.explained.reshape(shape[:2]), fit.error)
 
 
 def _matrix(matrix: Any, camera: tuple[int, int], projector_px: tuple[int, int]) -> sp.csr_matrix[np.float64]:

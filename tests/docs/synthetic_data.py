@@ -81,7 +81,9 @@ def _pinhole(right_m: float) -> dict[str, object]:
 
 def write_all(folder: Path) -> None:
     """Everything, at the places that the scripts name."""
-    write_run(folder / "demo" / "first" / "stage" / "runs" / "20260101-000000-calibrate")
+    stage = folder / "demo" / "first" / "stage"
+    run = stage / "runs" / "20260101-000000-recalibrate"
+    write_run(run)
     write_captures(folder / "photographs")
     write_full_run(folder / "packed" / "run")
     export(run=folder / "packed" / "run", kind="dataset", out=folder / "dataset", step=None)

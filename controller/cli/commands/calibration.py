@@ -102,7 +102,13 @@ def report(
 
 
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished calibration: STAGE/runs/...")],
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN",
+            help="Folder of a finished calibration (STAGE/runs/...), or for transport a folder of pairs of pictures.",
+        ),
+    ],
     kind: Annotated[
         FormatName,
         typer.Option("--format", help="; ".join(f"{one.name}: {one.what}" for one in FORMATS) + "."),

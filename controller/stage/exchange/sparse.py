@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from controller.core.arrays import save_arrays
+from controller.core.arrays import FloatImage, save_arrays
 from controller.core.errors import UsageError
 from controller.core.storage import stream_atomically, write_atomically
 from controller.optics.transport import LightTransport
@@ -36,27 +36,41 @@ def write_transport(content: Content, folder: Path) -> dict[str, int]:
     """
     transport = content.transport()
     box = checked_crop(content.crop, transport.camera_shape)
-    files, entries = {}, 0
-    for n, name in enumerate(content.names):
-        matrix = projector_matrix(transport, n, box)
+    matrices = ((name, projector_matrix(transport, n, box)) for n, name in enumerate(content.names))
+    sizes, black = transport.sizes, content.black()[box.window]
+    return {"entries": write_matrices(folder, matrices, sizes, black, transport.camera_shape, box)}
+
+
+def write_matrices(
+    folder: Path,
+    matrices: Iterable[tuple[str, sp.csr_array[np.float32]]],
+    sizes: Sequence[tuple[int, int]],
+    black: FloatImage,
+    camera: tuple[int, int],
+    box: CameraBox,
+) -> int:
+    """The files of ``write_transport``: each projector's name and matrix, and its (rows, columns); the entries of all.
+
+    ``black``: of the crop ``box`` of the camera's picture of ``camera`` (rows, columns)
+    """
+    projectors, entries = [], 0
+    for (name, matrix), (rows, columns) in zip(matrices, sizes, strict=True):
         entries += matrix.nnz
-        files[name] = f"{safe_name(name)}.npz"
-        stream_atomically(folder / files[name], lambda file, whole=matrix: sp.save_npz(file, whole, compressed=False))  # type: ignore[misc]
-    save_arrays(folder / "black.npz", {"black": content.black()[box.window]})
+        file_name = f"{safe_name(name)}.npz"
+        stream_atomically(folder / file_name, lambda file, whole=matrix: sp.save_npz(file, whole, compressed=False))  # type: ignore[misc]
+        projectors.append({"name": name, "file": file_name, "projector_px": [columns, rows]})
+    save_arrays(folder / "black.npz", {"black": black})
     described = {
-        "camera_px": [transport.camera_shape[1], transport.camera_shape[0]],
+        "camera_px": [camera[1], camera[0]],
         "crop": {"x": box.left, "y": box.top, "width": box.right - box.left, "height": box.bottom - box.top},
-        "projectors": [
-            {"name": name, "file": files[name], "projector_px": [columns, rows]}
-            for name, (rows, columns) in zip(content.names, transport.sizes, strict=True)
-        ],
+        "projectors": projectors,
         "rows": "channel, row, column of the crop",
         "columns": "channel, row, column of the projector's picture",
         "black": "black.npz, array black: (rows, columns, channel) of the crop",
         "light": "linear; a projector's channel at full light is 1; the camera in full scales per second",
     }
     write_atomically(folder / "transport.json", (json.dumps(described, indent=1) + "\n").encode())
-    return {"entries": entries}
+    return entries
 
 
 def checked_crop(crop: CameraBox | None, camera_shape: tuple[int, int]) -> CameraBox:

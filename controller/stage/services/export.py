@@ -17,6 +17,7 @@ from controller.stage.artefacts.geometry import has_geometry, projectors_of, rea
 from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.formats import format_of
+from controller.stage.exchange.pairs import is_pairs, write_pairs_transport
 
 MOST_VERTICES: Final = 1_000_000
 
@@ -25,12 +26,16 @@ def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: st
     """Write a finished calibration run in the format ``kind`` to ``out``, a file or a folder.
 
     ``step``: every n-th camera pixel becomes a vertex; None: at most ``MOST_VERTICES`` vertices
+    ``run``: for a transport also a folder of pairs (``read_pairs``)
     ``crop``: "X,Y,WIDTH,HEIGHT" in camera pixels, for a transport
 
     Raises UsageError("export-format-unknown", "not-calibrated", "crop-wrong"), and as the writers.
     """
     chosen = format_of(kind)
     box = None if crop is None else _box(crop)
+    if kind == "transport" and is_pairs(run):
+        target = out or run / chosen.place
+        return {"written": target, **write_pairs_transport(run, target, box)}
     if not has_geometry(run):
         raise UsageError(
             "not-calibrated",
