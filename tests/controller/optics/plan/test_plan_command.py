@@ -49,6 +49,7 @@ def test_a_sheet_that_one_place_of_the_audience_sees_edge_on_is_planned_and_that
     write_example(file)
     text = re.sub(r"positions_m = .*", "positions_m = [[0.0, 0.0, -1.5], [0.5, -0.2, -1.4]]", file.read_text())
     one_shelf = re.sub(r"(?s)\[shell\].*(?=\[goal\])", "", text.replace("count = 3", "count = 1"))
+    one_shelf = re.sub(r"position_m = .*", "position_m = [0.6, -1.0, -1.2]", one_shelf)  # beside the sheet's plane
     file.write_text(one_shelf + "points = 100\n")
     result = plan(file=file, out=tmp_path, reporter=Listening(), cancel=threading.Event())
     page = Path(result["plan"]).read_text()
