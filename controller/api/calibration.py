@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from controller.api.captures import CaptureSet
 from controller.core.errors import CalibrationError, UsageError
+from controller.optics.calibrate.correspondence import any_code
 from controller.optics.calibrate.correspondence import decode as correspondence_decode
 from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces, colour_shifts, colours_apart
 from controller.optics.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
@@ -25,7 +26,7 @@ from controller.optics.calibrate.photometry.radiometry import (
 from controller.optics.calibrate.photometry.separation import sinusoid_contrast
 from controller.optics.calibrate.photometry.waveform import coarse_waves
 from controller.optics.calibrate.values import Calibration, Correspondence, Geometry, ProjectorCalibration, Radiometry
-from controller.optics.capture.patterns import plan_patterns
+from controller.optics.capture.patterns import PatternPlan, plan_patterns
 from controller.optics.capture.profile import CameraProfile, load_profile
 from controller.optics.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
 from controller.optics.transport import LightTransport
@@ -52,15 +53,57 @@ def decode(captures: CaptureSet) -> Correspondence:
     ``Correspondence``: ``projector_px`` (camera rows, columns, 2) float32, x and y in projector pixels, NaN where not
     valid; ``modulation`` (rows, columns) float32, contrast of the sinusoids, 0 to 1; ``valid`` (rows, columns) bool
 
-    Errors: ``capture-missing``, ``capture-shape-wrong``, ``captures-inconsistent`` (photographs in the wrong order).
+    Errors: ``capture-missing``, ``capture-shape-wrong``, ``captures-inconsistent`` (photographs in the wrong order,
+    a camera that moved, exchanged colours), ``projector-size-wrong``.
     """
     return _decoded(captures, None)
 
 
-def _decoded(captures: CaptureSet, colours: ColourPlaces | None) -> Correspondence:
+def _plan(captures: CaptureSet) -> PatternPlan:
     plan = plan_patterns(captures.projector_px)
+    own = {pattern.name for axis in range(2) for pattern in plan.gray(axis)}
+    other = sorted(name for name in captures.pictures if name.startswith("gray-") and name not in own)
+    if other:
+        width, height = captures.projector_px
+        raise CalibrationError(
+            "projector-size-wrong",
+            what=f"A projector of {width}x{height} has no pattern {other[0]}, and there is a photograph of it.",
+            remedy="Correct the projector's size: width first, then height, as its own picture has them.",
+        )
+    return plan
+
+
+def _decoded(captures: CaptureSet, colours: ColourPlaces | None) -> Correspondence:
+    plan = _plan(captures)
+    _check_same_camera(captures, [pattern.name for pattern in plan.sinusoids("phase-x")])
     blur_px = float(np.mean(np.square(CAMERA_BLUR_PX)) ** 0.5) if captures.from_bayer else 0.0
     return correspondence_decode.decode(captures.pictures, plan, camera_blur_px=blur_px, colours=colours)
+
+
+def _check_same_camera(captures: CaptureSet, steps: list[str]) -> None:
+    """The steps of a sinusoid add up to white and black: the same place, and the same order of colours."""
+    pictures = captures.pictures
+    if not {"black", "white", *steps} <= set(pictures):
+        return
+    ends = np.asarray(pictures["black"] + pictures["white"], np.float32)
+    mean = np.asarray(sum(pictures[step] for step in steps), np.float32)
+    if ends.shape != mean.shape or not np.nanmean(ends) > 0 or not np.nanmean(mean) > 0:
+        return
+    if ends.ndim == 3:
+        colours, later = (np.nanmean(one, axis=(0, 1)) / np.nanmean(one) for one in (ends, mean))
+        off, exchanged = np.abs(later - colours).max(), np.abs(later[::-1] - colours).max()
+        if off > EXCHANGED and exchanged < off / 4:
+            raise CalibrationError(
+                "captures-inconsistent",
+                what="Red and blue of the sinusoids are exchanged against those of black and white.",
+                remedy="Read all photographs in one way: OpenCV's imread gives blue first.",
+            )
+        ends, mean = ends.sum(axis=2), mean.sum(axis=2)
+    any_code.check_still(ends, mean, "white and the sinusoids")
+
+
+EXCHANGED = 0.04
+"""Of the mean of a photograph's colours."""
 
 
 def measure_response(captures: CaptureSet) -> Radiometry:
@@ -75,9 +118,10 @@ def measure_response(captures: CaptureSet) -> Radiometry:
     ``Radiometry``: ``response`` (3, 256) float64, light of each device value per channel, rising from 0 to 1;
     ``mixing`` (3, 3) float64, camera channel by projector channel, each row adds up to 1
 
-    Errors: ``capture-missing``, ``capture-shape-wrong``, ``projector-dark``, ``colours-do-not-add``, ``colours-alike``.
+    Errors: ``capture-missing``, ``capture-shape-wrong``, ``projector-dark``, ``captures-overexposed``,
+    ``projector-size-wrong``, ``colours-do-not-add``, ``colours-alike``.
     """
-    return measure_radiometry(captures.pictures, plan_patterns(captures.projector_px))[0]
+    return measure_radiometry(captures.pictures, _plan(captures))[0]
 
 
 def fit_metapixels(captures: CaptureSet, correspondence: Correspondence) -> FittedPixels:

@@ -225,6 +225,47 @@ def test_no_captures_and_a_dark_projector_are_refused() -> None:
     assert error.value.code == "projector-dark"
 
 
+def moved(name: str, image: Any) -> Any:
+    return np.roll(image, 1, axis=1) if name.startswith(("phase", "blur")) else image
+
+
+def colours_exchanged(name: str, image: Any) -> Any:
+    return image[..., ::-1] if name.startswith(("mosaic", "phase", "blur")) else image
+
+
+def overexposed(name: str, image: Any) -> Any:
+    return np.where(3 * image < 1, 3 * image, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("change", "size", "code", "words"),
+    [
+        (moved, SCENE.projector_px, "captures-inconsistent", "camera moved by .* px between white and the sinusoids"),
+        (colours_exchanged, SCENE.projector_px, "captures-inconsistent", "Red and blue"),
+        (overexposed, SCENE.projector_px, "captures-overexposed", "clipped"),
+        (lambda name, image: image, SCENE.projector_px[::-1], "projector-size-wrong", "48x64"),
+    ],
+)
+def test_captures_that_cannot_be_right_are_refused_with_their_fault(
+    change: Any, size: tuple[int, int], code: str, words: str
+) -> None:
+    tint = np.array([0.6, 0.9, 1.0], np.float32)
+    pictures = {name: change(name, image * tint) for name, image in photographed(SCENE).items()}
+    step: Any = api.decode if code == "captures-inconsistent" else api.measure_response
+    with pytest.raises(api.VelaturaError, match=words) as error:
+        step(api.CaptureSet(pictures, size))
+    assert error.value.code == code
+
+
+def test_a_size_with_as_many_bits_is_refused_because_the_code_goes_beyond_it() -> None:
+    scene = Scene((200, 150), (96, 72), 1.9, 3.0, seed=3)
+    captures = api.CaptureSet(photographed(scene), (72, 96))
+    for step in (api.decode, api.measure_response):
+        with pytest.raises(api.VelaturaError, match="72x96") as error:
+            step(captures)
+        assert error.value.code == "projector-size-wrong"
+
+
 @pytest.mark.parametrize("exposures_s", [[0.05, 0.2, 0.8], [0.01, 0.0333, 0.07, 0.3, 0.5, 1.9]])
 def test_brackets_of_jpegs_give_the_light_that_opencvs_debevec_gives(tmp_path: Path, exposures_s: list[float]) -> None:
     """Both get the same photographs and the same response; light is compared up to one factor."""

@@ -20,7 +20,7 @@ from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
 from controller.optics.calibrate.correspondence.captures import Captures, grey, step_variance
 from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces
-from controller.optics.calibrate.correspondence.gray_code import read_code
+from controller.optics.calibrate.correspondence.gray_code import check_size, read_code
 from controller.optics.calibrate.correspondence.phase_shift import CODED, CONTRADICTED, FINE, WAVES, locate_pixel
 from controller.optics.calibrate.correspondence.smoothing import correct_for_paint, fit_planes
 from controller.optics.calibrate.values import Correspondence
@@ -98,6 +98,7 @@ def decode(
     ------
     CalibrationError("capture-missing"), CalibrationError("capture-shape-wrong")
     CalibrationError("captures-inconsistent")  code and phases contradict each other: photographs in the wrong order
+    CalibrationError("projector-size-wrong")
     """
     black = grey(captures, "black")
     noise = noise or CameraNoise()
@@ -116,6 +117,7 @@ def decode(
     del sums, near
     if colours is not None:
         position += colours.to_green_px()
+    check_size(position[valid], plan.size_px)
     valid &= _inside(position, plan.size_px, 0.0)
     valid &= _inside(position, plan.size_px, frame_margin_px(modulation[valid]))
     as_seen = position

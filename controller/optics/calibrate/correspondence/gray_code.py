@@ -24,6 +24,7 @@ from controller.optics.calibrate.correspondence.captures import Captures, colour
 from controller.optics.capture.patterns import CELL_PX, Code, PatternKind, PatternPlan
 from controller.optics.capture.profile import CameraNoise
 
+MOST_OUTSIDE = 0.02
 WEAK_BIT = 0.25
 """Of half the white's light: nearer to the threshold, a bit is not reliable."""
 
@@ -50,6 +51,20 @@ class Cells:
         middle *= CELL_PX
         middle += (CELL_PX - 1) / 2
         return middle
+
+
+def check_size(position_px: FloatImage, size_px: tuple[int, int]) -> None:
+    """Refuse places (..., 2) in px of which many lie a cell or more outside of the projector's picture.
+
+    Raises CalibrationError("projector-size-wrong").
+    """
+    if position_px.size and np.mean((position_px > np.array(size_px) + CELL_PX).any(axis=-1)) > MOST_OUTSIDE:
+        x, y = np.percentile(position_px.reshape(-1, 2), 99, axis=0)
+        raise CalibrationError(
+            "projector-size-wrong",
+            what=f"The code reaches to {x:.0f} and {y:.0f} px, but the projector has {size_px[0]}x{size_px[1]}.",
+            remedy="Correct the projector's size: width first, then height, as its own picture has them.",
+        )
 
 
 def known_cells(known_px: FloatImage) -> tuple[Cells, Cells]:

@@ -15,9 +15,10 @@ from typing import Final
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage
+from controller.core.channels import finite
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.correspondence.captures import Captures, coloured
-from controller.optics.calibrate.correspondence.gray_code import Cells
+from controller.optics.calibrate.correspondence.captures import Captures, coloured, lit_pixels
+from controller.optics.calibrate.correspondence.gray_code import Cells, check_size
 from controller.optics.calibrate.photometry.colour_tiles import KnownIndirect, measure_tiles, tile_code
 from controller.optics.calibrate.photometry.separation import SinusoidContrast, indirect_share, shown_contrast
 from controller.optics.calibrate.photometry.tile_fit import evened, fit_tiles, with_paint
@@ -27,6 +28,8 @@ from controller.optics.capture.patterns import PatternPlan
 from controller.optics.capture.profile import CameraNoise
 
 FEWEST_TILES = 60
+OVEREXPOSED = 0.02
+"""Of the photograph."""
 SUSPECT_ADDITIVITY = 0.02
 """From here on a white segment is looked for."""
 BETTER = 0.7
@@ -84,13 +87,24 @@ def measure_radiometry(
     ------
     CalibrationError("capture-missing"), CalibrationError("capture-shape-wrong")
     CalibrationError("projector-dark")  too few colour tiles are seen
+    CalibrationError("captures-overexposed")  the same, and white is clipped
+    CalibrationError("projector-size-wrong")
     CalibrationError("colours-do-not-add")  the tiles do not follow from three responses and a mixing
     CalibrationError("colours-alike")  the primaries can't be separated
     """
     black = coloured(captures, "black")
     white = coloured(captures, "white", black.shape[:2]) - black
     code = code or tile_code(captures, plan, black, white, known_px=known_px, noise=noise)
+    places = np.stack([one.middle_px() for one in code], axis=-1)
+    check_size(places[code[0].sure & code[1].sure & lit_pixels(white)], plan.size_px)
     tiles = measure_tiles(captures, plan, black, white, code=code, indirect=indirect)
+    clipped = float(np.mean(finite(black) & ~finite(white)))
+    if tiles.ratio.shape[0] < FEWEST_TILES and clipped > OVEREXPOSED:
+        raise CalibrationError(
+            "captures-overexposed",
+            what=f"White is clipped in {100 * clipped:.0f} % of the photograph.",
+            remedy="Take the photographs again with a shorter exposure, so that white stays below full scale.",
+        )
     if tiles.ratio.shape[0] < FEWEST_TILES:
         raise CalibrationError(
             "projector-dark",
