@@ -117,7 +117,7 @@ class _Watch:
     """Reads what Blender says in a thread, so that a stop is followed while Blender says nothing."""
 
     def __init__(self, stream: IO[bytes], log: IO[bytes]) -> None:
-        self.share, self.note = 0.0, "starting Blender"
+        self.share, self.note, self._left_out = 0.0, "starting Blender", ""
         self._lines: list[str] = []
         self._stream, self._log = stream, log
         self._thread = threading.Thread(target=self._read, name="blender-output", daemon=True)
@@ -134,7 +134,10 @@ class _Watch:
         found = _SAMPLE.search(line)
         if found is not None:
             done, of = int(found[1]), max(int(found[2]), 1)
-            self.share, self.note = min(0.05 + 0.95 * done / of, 1.0), f"sample {done} of {of}"
+            self.share, self.note = min(0.05 + 0.95 * done / of, 1.0), f"sample {done} of {of}{self._left_out}"
+        elif line.startswith("Left out: "):
+            self._left_out = f" ({line.lower()})"
+            self.note += self._left_out
         elif line:
             self._lines = [*self._lines[-_TOLD_LINES:], line]
 

@@ -30,6 +30,7 @@ def main(folder: Path) -> None:
     else:
         # Scripts inside a scene do not run: a scene may come from anybody.
         bpy.ops.wm.open_mainfile(filepath=scene_file, use_scripts=False)
+        _check()
     with np.load(folder / "mesh.npz", allow_pickle=False) as arrays:
         mesh = _mesh({name: arrays[name] for name in arrays.files})
     body = _body(mesh)
@@ -40,9 +41,28 @@ def main(folder: Path) -> None:
     bpy.ops.render.render(write_still=True)
 
 
+def _check() -> None:
+    """Refuse a scene without its textures, which would be magenta, and tell what is left out of it."""
+    for image in bpy.data.images:
+        path = Path(bpy.path.abspath(image.filepath, library=image.library))
+        if image.source == "FILE" and image.users and image.packed_file is None and not path.is_file():
+            sys.exit(f"Error: the scene's picture {path} does not exist")
+    scene = bpy.context.scene
+    left_out = [] if scene.view_settings.view_transform in ("Raw", "Standard") else ["view transform"]
+    if scene.use_nodes and scene.render.use_compositing:
+        left_out.append("compositing")
+    if left_out:
+        sys.stdout.write(f"Left out: {' and '.join(left_out)}\n")
+        sys.stdout.flush()
+
+
+def _units_per_m() -> float:
+    return float(1 / bpy.context.scene.unit_settings.scale_length)
+
+
 def _mesh(arrays: dict[str, Any]) -> Any:
     mesh = bpy.data.meshes.new(PLACEHOLDER)
-    vertices, triangles = arrays["vertices_m"], arrays["triangles"]
+    vertices, triangles = arrays["vertices_m"] * _units_per_m(), arrays["triangles"]
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     mesh.loops.add(triangles.size)
@@ -67,6 +87,13 @@ def _body(mesh: Any) -> Any:
         for material in body.data.materials:
             mesh.materials.append(material)
         body.data = mesh
+        # what moves or hides the placeholder would move or hide the object: the projectors light it where it stands
+        body.animation_data_clear()
+        body.constraints.clear()
+        body.parent = None
+        body.hide_render = False
+        body.delta_location, body.delta_rotation_euler, body.delta_scale = (0, 0, 0), (0, 0, 0), (1, 1, 1)
+        body.delta_rotation_quaternion = (1, 0, 0, 0)
         body.matrix_world = Matrix.Identity(4)
         return body
     body = bpy.data.objects.new(PLACEHOLDER, mesh)
@@ -83,7 +110,7 @@ def _camera(camera: dict[str, Any]) -> None:
     data.lens = fx * SENSOR_MM / width
     data.shift_x = (width / 2 - (cx + 0.5)) / width
     data.shift_y = ((cy + 0.5) - height / 2) * (fx / fy) / width
-    data.clip_start, data.clip_end = camera["near_m"], camera["far_m"]
+    data.clip_start, data.clip_end = (camera[key] * _units_per_m() for key in ("near_m", "far_m"))
     place = bpy.data.objects.new("calibrated", data)
     place.rotation_euler = (np.pi / 2, 0, 0)
     scene = bpy.context.scene

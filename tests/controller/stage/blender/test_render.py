@@ -107,6 +107,48 @@ def test_blender_sees_what_the_calibrated_camera_sees(
     assert not target.image[~mask].any()
 
 
+MOVED = """
+body.keyframe_insert("location", frame=1)
+body.location = (5, 0, 0)
+body.keyframe_insert("location", frame=1)
+body.parent = bpy.data.objects.new("turntable", None)
+body.hide_render = True
+bpy.context.scene.unit_settings.scale_length = 0.001
+bpy.context.scene.view_settings.view_transform = "AgX"
+"""
+MISSING = """
+picture = nodes.new("ShaderNodeTexImage")
+picture.image = bpy.data.images.new("wood", 4, 4)
+picture.image.source = "FILE"
+picture.image.filepath = "/nowhere/wood.png"
+"""
+SAVE = "bpy.ops.wm.save_as_mainfile"
+
+
+def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_where_it_stands(
+    tmp_path: Path, blender: Blender
+) -> None:
+    geometry, light = ball()
+    mask = known(geometry)
+    (tmp_path / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{MOVED}{SAVE}"))
+    subprocess.run([blender.command[0], str(tmp_path / "make.py"), str(tmp_path / "moved.blend")], check=True)
+    write_job(tmp_path, geometry, mask, light, scene=tmp_path / "moved.blend", settings=QUICK)
+    notes: list[str] = []
+    rendered = render(blender, tmp_path, lambda share, note: notes.append(note))
+    target = as_seen(read_picture(rendered), geometry.camera, mask)
+    assert (target.image[mask].max(axis=1) > 0).mean() > 0.95
+    assert any("view transform" in note for note in notes)
+
+
+def test_a_scene_without_its_pictures_is_refused_by_their_name(tmp_path: Path, blender: Blender) -> None:
+    geometry, light = ball()
+    (tmp_path / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{MISSING}{SAVE}"))
+    subprocess.run([blender.command[0], str(tmp_path / "make.py"), str(tmp_path / "bare.blend")], check=True)
+    write_job(tmp_path, geometry, known(geometry), light, scene=tmp_path / "bare.blend", settings=QUICK)
+    with pytest.raises(WorkError, match=r"/nowhere/wood\.png does not exist"):
+        render(blender, tmp_path, no_progress)
+
+
 def test_every_scene_that_comes_along_covers_the_object_and_differs_from_the_others(
     tmp_path: Path, blender: Blender
 ) -> None:
