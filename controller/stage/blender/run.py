@@ -135,7 +135,7 @@ class _Watch:
         if found is not None:
             done, of = int(found[1]), max(int(found[2]), 1)
             self.share, self.note = min(0.05 + 0.95 * done / of, 1.0), f"sample {done} of {of}{self._left_out}"
-        elif line.startswith("Left out: "):
+        elif line.startswith("Omitted: "):
             self._left_out = f" ({line.lower()})"
             self.note += self._left_out
         elif line:

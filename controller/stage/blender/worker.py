@@ -52,7 +52,7 @@ def _check() -> None:
     if scene.use_nodes and scene.render.use_compositing:
         left_out.append("compositing")
     if left_out:
-        sys.stdout.write(f"Left out: {' and '.join(left_out)}\n")
+        sys.stdout.write(f"Omitted: {' and '.join(left_out)}\n")
         sys.stdout.flush()
 
 
