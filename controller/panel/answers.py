@@ -144,7 +144,7 @@ async def json_values(operation: Operation, request: Request) -> Values:
     """The values of a JSON body. Raises UsageError("body-wrong") and as ``parse``."""
     fields = [field for field in operation.fields if operation.where(field) == "body"]
     body = await request.body()
-    if not fields and not body:
+    if not body and not any(field.required for field in fields):
         return {}
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         raise UsageError("body-wrong", what="The body is not JSON.", remedy="Send it as application/json.")
