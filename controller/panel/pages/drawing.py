@@ -129,6 +129,7 @@ class Drawing:
             "sentence": lambda text: text[:1].upper() + text[1:],
             "said": gettext,
             "job_title": spoken.job_title,
+            "event_text": spoken.event_text,
             "value_text": spoken.value_text,
         }
         environment.globals |= {

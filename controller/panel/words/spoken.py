@@ -3,6 +3,7 @@ are."""
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 from controller.kiosk.state import LiveValue
@@ -56,6 +57,21 @@ REASONS: Final = (
     _("It opens when the lamps have cooled."),
     _("Nothing has moved or dimmed since the calibration."),
 )  # fmt: skip
+EVENT_TEXTS: Final = (
+    _("The kiosk is starting."), _("The kiosk has stopped."), _("The player is running."),
+    _("The player shows what it should again."), _("The waiting jobs were cancelled."),
+    _("The stage follows the schedule again."), _("The system time is known again."),
+    _("An operator asked to open the stage."), _("An operator asked to close the stage."),
+    _("Frames for the loss of any single projector are ready."), _("The test shots are done. See the aiming page."),
+)  # fmt: skip
+"""Whole texts of the event log."""
+EVENT_PATTERNS: Final = (
+    _("Started: {0}."), _("The player shows {0}."), _("The lamp of projector {0} is being switched on."),
+    _("{0} logged in from {1}."), _("{0} logged out."), _("An operator chose the appearance {0}."),
+    _("A new bundle is installed: {0}."), _("{0} is connected again."),
+)  # fmt: skip
+"""Texts of the event log with names in them."""
+_MATCHES: Final = [(re.compile(re.sub(r"\\\{\d\\\}", "(.+)", re.escape(one))), one) for one in EVENT_PATTERNS]
 SOURCES: Final = {
     "photograph": _("a photograph wrapped around the object"), "pattern": _("another pattern"),
     "checkerboard": _("a checkerboard"), "gloss": _("a gloss"), "recolour": _("recoloured"),
@@ -78,6 +94,14 @@ def value_text(value: LiveValue) -> str:
     if not value.pattern:
         return value.text
     return gettext(value.pattern).format(*(figures.number(one, value.digits) for one in value.numbers))
+
+
+def event_text(text: str) -> str:
+    """A line of the event log in the language, as far as it is one of the kiosk's own usual ones."""
+    for pattern, words in _MATCHES:
+        if match := pattern.fullmatch(text):
+            return gettext(words).format(*map(job_title, match.groups()))
+    return gettext(text)
 
 
 def job_title(name: str) -> str:

@@ -104,6 +104,14 @@ def test_what_the_devices_say_is_known() -> None:
     assert {"{0} pictures", "{0} h"} < said
 
 
+def test_usual_events_are_said_in_the_language() -> None:
+    with speaking("de"):
+        assert spoken.event_text("The kiosk is starting.") == "Der Kiosk startet."
+        assert spoken.event_text("Started: Test shots.") == "Begonnen: Testaufnahmen."
+        assert spoken.event_text("anna logged in from ::1.") == "anna hat sich von ::1 angemeldet."
+        assert spoken.event_text("Something {0} else.") == "Something {0} else."
+
+
 def test_a_value_of_a_device_is_said_in_the_language() -> None:
     value = LiveValue.said("Hours", "{0} h with Velatura, {1} strikes", 1204.4, 88)
     assert value.text == "1,204 h with Velatura, 88 strikes"
