@@ -56,7 +56,9 @@ def main() -> None:
     except UnfitFile:
         raise SystemExit(TOO_MANY_PIXELS) from None
     except (Unsuitable, MemoryError) as error:
-        sys.stdout.write(str(error) or "it needs too much memory")
+        sys.stdout.write(
+            str(error) if isinstance(error, Unsuitable) else "it is too large for the memory: scale it down"
+        )
         sys.stdout.flush()
         raise SystemExit(NOT_A_PICTURE) from None
     sys.stdout.buffer.write(png)

@@ -37,7 +37,7 @@ class UploadLimits:
 
     most_bytes: int = 64 << 20
     most_pixels: int = 40_000_000
-    memory_bytes: int = 1 << 30
+    memory_bytes: int = 2 << 30  # 40 million pixels of 16 bits with transparency
     seconds: int = 20
 
 
