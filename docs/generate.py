@@ -283,15 +283,16 @@ def python_api() -> str:
         head, _, _ = (importlib.import_module(home).__doc__ or "").partition("\n")
         text.append(f"## {home.removeprefix(STABLE + '.').capitalize()}\n\n{plain(head)}\n")
         text += [_autoname(module, name) for name in sorted(own[home], key=str.swapcase)]
-    text.append("## Values\n\nWhat the functions take and return.\n")
+    text.append("## Values\n\nWhat the functions take and return, and what reads it from files.\n")
     # Their docstrings say what is in them; methods of other modules are not stable.
-    text += [_autoname(module, name, "   :no-members:\n") for name in values]
+    text += [_autoname(module, name, members=False) for name in values]
     return "\n".join(text)
 
 
-def _autoname(module: Any, name: str, options: str = "") -> str:
+def _autoname(module: Any, name: str, *, members: bool = True) -> str:
     kind = "autoclass" if isinstance(getattr(module, name), type) else "autofunction"
-    return f"```{{eval-rst}}\n.. {kind}:: {STABLE}.{name}\n{options}```\n"
+    option = "" if members or kind == "autofunction" else "   :no-members:\n"
+    return f"```{{eval-rst}}\n.. {kind}:: {STABLE}.{name}\n{option}```\n"
 
 
 def api_pages() -> Iterator[tuple[str, str]]:
