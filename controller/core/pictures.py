@@ -7,7 +7,6 @@ can't be read right is refused by name. It runs in the panel's decoder, too, so 
 from __future__ import annotations
 
 import io
-import logging
 import re
 import struct
 import warnings
@@ -97,10 +96,12 @@ class Picture:
         return np.ascontiguousarray(shown if mask is None else np.where(mask[..., None], shown, 0), np.uint8)
 
 
-def prepare() -> None:
-    """Load the libraries that decoding needs, for a process that limits its memory then."""
+def prepare(data: bytes) -> None:
+    """Load the libraries that decoding ``data`` needs, for a process that limits its memory then."""
     import imagecodecs
-    import tifffile  # noqa: F401
+
+    if data[:4] in _TIFF:
+        import tifffile  # noqa: F401
 
     Image.init()
     imagecodecs.png_encode(imagecodecs.png_decode(imagecodecs.png_encode(np.zeros((1, 1), np.uint8))))
@@ -274,6 +275,8 @@ _WHITE_IS_ZERO, _GREY, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 
 def _read_tiff(data: bytes, least_px: tuple[int, int] | None, most_pixels: int) -> tuple[Picture, int]:
     """The first page that is no thumbnail. Raises as ``decode``."""
+    import logging
+
     import tifffile
 
     del least_px  # decoded whole

@@ -48,9 +48,9 @@ def decode(data: bytes, most_pixels: int, least_px: tuple[int, int] | None = Non
 
 def main() -> None:
     most_pixels, memory_bytes, seconds, wide, high = (int(argument) for argument in sys.argv[1:6])
-    pictures.prepare()
-    limit(memory_bytes, seconds)
     data = sys.stdin.buffer.read()
+    pictures.prepare(data)
+    limit(memory_bytes, seconds)
     try:
         png = decode(data, most_pixels, (wide, high) if wide else None)
     except UnfitFile:
