@@ -190,7 +190,8 @@ def _described(operation: Operation, answer: dict[str, Any], objects: dict[str, 
     elif body:
         schema = object_schema(body)
         objects |= schema.pop("$defs", {})
-        described["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
+        needed = any(field.required for field in body)
+        described["requestBody"] = {"required": needed, "content": {"application/json": {"schema": schema}}}
     return described
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from hal.codecs.ptp.datasets import DeviceInfo
-from hal.codecs.ptp.values import Answer, Operation, Vendor
+from hal.codecs.ptp.values import Answer, Operation
 from hal.deadline import Deadline, in_seconds, turn
 from hal.errors import DeviceBusy, DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, ProtocolError
 from hal.notices import Notice
@@ -29,7 +29,8 @@ from plugins.ptp.link import Diary, PtpLink, refused
 from plugins.ptp.shot import Picture, Shot, Timing
 
 GPHOTO2_MAKERS: Final = ("Nikon", "NIKON", "Sony")
-"""What the names of makers begin with; on the network their cameras call themselves MTP devices."""
+"""What the names of makers begin with. The number of their extension is no sign: cameras of others have it, too, and on
+the network theirs call themselves MTP devices."""
 
 
 def choose_body(channel: Channel, info: DeviceInfo, storage: PictureStorage) -> Body:
@@ -37,7 +38,7 @@ def choose_body(channel: Channel, info: DeviceInfo, storage: PictureStorage) -> 
     eos = {Operation.EOS_SET_PROPERTY, Operation.EOS_GET_EVENT} <= info.operations
     if eos and info.operations & {Operation.EOS_RELEASE, Operation.EOS_RELEASE_ON}:
         return EosBody(channel, storage)
-    if info.vendor_extension in (Vendor.NIKON, Vendor.SONY) or info.manufacturer.startswith(GPHOTO2_MAKERS):
+    if info.manufacturer.startswith(GPHOTO2_MAKERS):
         raise DeviceRefused(
             "camera-needs-gphoto2",
             what=f"The {info.model or 'camera'} has commands of its maker, which this driver does not know.",

@@ -20,14 +20,6 @@ LONGEST_STRING: Final = 255
 """UTF-16 units of a string, with its terminator: its length is one byte."""
 
 
-class Vendor(enum.IntEnum):
-    """Vendor extensions in DeviceInfo."""
-
-    CANON = 0x0000_000B
-    NIKON = 0x0000_000A
-    SONY = 0x0000_0011
-
-
 class Operation(enum.IntEnum):
     """Operation codes (ISO 15740 10.4) and those of Canon EOS (as libgphoto2 documents them)."""
 
