@@ -99,11 +99,12 @@ class Picture:
 def prepare(data: bytes) -> None:
     """Load the libraries that decoding ``data`` needs, for a process that limits its memory then."""
     import imagecodecs
+    from PIL import MpoImagePlugin, WebPImagePlugin  # noqa: F401 - the others are Pillow's first ones
 
     if data[:4] in _TIFF:
         import tifffile  # noqa: F401
 
-    Image.init()
+    Image.preinit()
     imagecodecs.png_encode(imagecodecs.png_decode(imagecodecs.png_encode(np.zeros((1, 1), np.uint8))))
 
 

@@ -1,8 +1,8 @@
 """A process that decodes one uploaded picture: bytes on standard input, a new PNG on standard output.
 
-Runs with ``python -I`` and imports nothing of the controller but its reader of pictures, so that its memory contains no
-secrets. Exit codes: 0 done; 3 not an accepted picture, with the reason instead of a PNG; 4 too many pixels; any other:
-a crash or a limit of the system.
+Runs with ``python -I -S``, so that nothing starts with it; the folders of its libraries are arguments. It imports
+nothing of the controller but its reader of pictures: its memory contains no secrets. Exit codes: 0 done; 3 not an
+accepted picture, with the reason instead of a PNG; 4 too many pixels; any other: a crash or a limit of the system.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[2]))
+    sys.path += [str(Path(__file__).parents[2]), *sys.argv[6:]]
 
 import numpy as np
 

@@ -7,6 +7,7 @@ import re
 import secrets
 import subprocess
 import sys
+import sysconfig
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,9 +48,10 @@ def decode_picture(file: Path, limits: UploadLimits, least_px: tuple[int, int] |
     Raises UsageError("picture-refused") unless it is a PNG, JPEG, TIFF or WebP that decodes within ``limits``, and
     UsageError("picture-too-large") for one with too many pixels.
     """
-    command = [sys.executable, "-I", str(Path(decoder.__file__))]
+    command = [sys.executable, "-I", "-S", str(Path(decoder.__file__))]
     wide, high = least_px or (0, 0)
     command += [str(number) for number in (limits.most_pixels, limits.memory_bytes, limits.seconds, wide, high)]
+    command += dict.fromkeys(sysconfig.get_path(kind) for kind in ("purelib", "platlib"))
     try:
         with file.open("rb") as data:
             done = subprocess.run(  # noqa: S603 - our own file, with numbers as arguments

@@ -175,11 +175,12 @@ def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> tuple[ByteIm
 
     light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
     made = light if of.indirect is None else light + of.indirect.forward(light)
-    difference = colour_difference(of.black + made, aim.asked, of.camera_to_xyz, aim.exposure, seen)
+    out = seen & ~aim.asked_possible.reachable
+    difference = colour_difference(of.black + made, aim.asked, of.camera_to_xyz, aim.exposure, out)
     asked, result = (to_screen(image, of.camera_to_xyz, white=aim.exposure) for image in (aim.asked, of.black + made))
     write_picture(folder / FILES["target"], asked, seen)
     write_picture(folder / FILES["result"], result, seen)
-    return np.asarray(asked.mean(axis=2), np.uint8), seen & (difference < ALIKE)
+    return np.asarray(asked.mean(axis=2), np.uint8), out & (difference < ALIKE)
 
 
 def map_of(kinds: dict[str, Mask], grey: ByteImage) -> ByteImage:
