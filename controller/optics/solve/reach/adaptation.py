@@ -140,7 +140,12 @@ def lowest_above(stiffness: Any, obstacle: Float64) -> Float64:
         free = np.flatnonzero(~lies)
         if free.size and lies.any():
             part = stiffness[free]
-            height[free] = splu(sp.csc_matrix(part[:, free])).solve(-(part @ height))
+            # Symmetric and positive: in half of the time, without pivots.
+            solver = splu(
+                sp.csc_matrix(part[:, free]), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )  # fmt: skip
+            height[free] = solver.solve(-(part @ height))
         pressed = stiffness @ height
         after = np.where(lies, pressed > 0, height < obstacle - 1e-9)
         if (after == lies).all():
