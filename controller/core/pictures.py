@@ -148,12 +148,18 @@ def _read_with_pillow(data: bytes, least_px: tuple[int, int] | None, most_pixels
                 has_exif = opened.format != "PNG" or b"eXIf" in data or b"Raw profile type exif" in data
                 exif = opened.getexif() if has_exif else Image.Exif()
                 orientation = exif.get(_ORIENTATION, 1)
-                if is_jpeg and least_px is not None:
+                drafted_px = least_px[::-1] if least_px and orientation >= TURNED else least_px
+                whole_px = opened.size
+                if is_jpeg and drafted_px is not None:
                     # A JPEG's blocks are decoded at a half, a quarter or an eighth in a fraction of the time.
-                    opened.draft(None, least_px[::-1] if orientation >= TURNED else least_px)
-                if is_jpeg and not _has_all_blocks(data, progressive="progressive" in opened.info):
-                    raise Unsuitable("its end is missing")
+                    opened.draft(None, drafted_px)
+                progressive = "progressive" in opened.info
                 values = _png_values(data) if opened.format == "PNG" else _pillow_values(opened)
+                if is_jpeg:
+                    # The last parts of a progressive picture show at full size alone.
+                    at_px = whole_px if progressive else drafted_px or (1, 1)
+                    if not _has_all_blocks(data, at_px, None if progressive or drafted_px is None else values):
+                        raise Unsuitable("its end is missing")
                 return _with_alpha(values, _colours(opened.info, exif, data)), orientation
     except UnfitFile:
         raise
@@ -188,21 +194,21 @@ _MARKER: Final = re.compile(rb"\xff[^\0\xd0-\xd7\xff]")
 _OTHER_BLOCKS: Final = b"\x55\x33" * 512
 
 
-def _has_all_blocks(data: bytes, *, progressive: bool) -> bool:
+def _has_all_blocks(jpeg: bytes, at_px: tuple[int, int], values: npt.NDArray[Any] | None) -> bool:
     """Whether a JPEG was written to its end. Decoders invent what is missing before the end marker, without a word.
 
-    More data before the end marker changes the picture only where blocks are missing. At an eighth of the size this is
-    quick; the last parts of a progressive picture show at full size alone.
+    More data before the end marker changes the picture only where blocks are missing. It is decoded to cover ``at_px``
+    (width, height); ``values``: the picture so decoded, if that was done already
     """
 
-    def decoded(jpeg: bytes) -> npt.NDArray[Any]:
-        with Image.open(io.BytesIO(jpeg), formats=("JPEG",)) as opened:
-            opened.draft(None, opened.size if progressive else (1, 1))
-            return np.asarray(opened)
+    def decoded(data: bytes) -> npt.NDArray[Any]:
+        with Image.open(io.BytesIO(data), formats=("JPEG",)) as opened:
+            opened.draft(None, at_px)
+            return _pillow_values(opened)
 
-    end = _end_marker(data)
-    whole = data[: end + 2]
-    return np.array_equal(decoded(whole), decoded(data[:end] + _OTHER_BLOCKS + data[end : end + 2]))
+    end = _end_marker(jpeg)
+    other = decoded(jpeg[:end] + _OTHER_BLOCKS + jpeg[end : end + 2])
+    return np.array_equal(decoded(jpeg[: end + 2]) if values is None else values, other)
 
 
 def _end_marker(jpeg: bytes) -> int:
