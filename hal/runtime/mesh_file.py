@@ -165,8 +165,8 @@ def _cut(polygon: Floats) -> list[tuple[int, int, int]]:
     """By cutting off ears: convex corners whose triangle holds no other corner (Meisters 1975)."""
     place = polygon - polygon.mean(axis=0)
     normal = np.cross(place, np.roll(place, -1, axis=0)).sum(axis=0)
-    flat = np.delete(place, int(np.abs(normal).argmax()), axis=1)
     axis = int(np.abs(normal).argmax())
+    flat = np.delete(place, axis, axis=1)
     sign = np.sign(normal[axis]) * (-1.0 if axis == 1 else 1.0)
 
     def area(a: int, b: int, c: int) -> float:

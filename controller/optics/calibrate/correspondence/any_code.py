@@ -224,21 +224,27 @@ def _binary(gray: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     return cell
 
 
-def _steps(cells: npt.NDArray[np.int32], clear: Mask) -> npt.NDArray[np.int32]:
-    """From clear camera pixels to clear ones right of them and below, along some rows and columns."""
-    steps = []
+def _beside(cells: npt.NDArray[np.int32], clear: Mask) -> npt.NDArray[np.int32]:
+    """(2, n): clear camera pixels, and the clear ones right of them and below, along some rows and columns."""
+    pairs = []
     for axis in range(2):
         across = np.s_[:: max(1, clear.shape[axis] // LINES)]
         here = (across,) if axis == 0 else (slice(None), across)
         line, at = (one[here] if axis else one[here].T for one in (cells, clear))
-        steps.append(np.diff(line, axis=0)[at[1:] & at[:-1]])
-    return np.concatenate(steps)
+        both = at[1:] & at[:-1]
+        pairs.append(np.stack([line[:-1][both], line[1:][both]]))
+    return np.concatenate(pairs, axis=1)
+
+
+def _steps(pairs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Cells from one pixel of each pair to the other, without a sign."""
+    return np.abs(pairs[1] - pairs[0])
 
 
 def _check_order(code: _Code, clear: Mask, axis: str) -> None:
     """Compare the code with what other orders of its pictures would give; the right one has the shortest steps."""
-    bits, gray = len(code.seen), code.gray
-    steps = np.abs(_steps(_binary(gray), clear))
+    bits, gray = len(code.seen), _beside(code.gray, clear)
+    steps = _steps(_binary(gray))
     if steps.size < FEWEST:
         return
     orders = {"its bits begin with the finest": list(range(bits))[::-1]}
@@ -253,7 +259,7 @@ def _check_order(code: _Code, clear: Mask, axis: str) -> None:
             others[what] = 2 * others[what] + ((gray >> (bits - 1 - bit)) & 1)
     best, fault = FEWEST // 2, ""
     for what, other in others.items():
-        would = np.abs(_steps(_binary(other), clear))
+        would = _steps(_binary(other))
         shorter, longer = int(np.count_nonzero(would < steps)), int(np.count_nonzero(would > steps))
         if shorter > 4 * longer and shorter - longer > best:
             best, fault = shorter - longer, what
@@ -330,7 +336,7 @@ def _with_neighbours(cells: list[npt.NDArray[np.int32]], sure: FloatImage) -> Ma
     """Where a pixel is sure alone, or most pixels around it look at almost the same cell."""
     within = []
     for cell in cells:
-        steps = np.abs(_steps(cell, sure > CLEAR))
+        steps = _steps(_beside(cell, sure > CLEAR))
         within.append(2 + 4 * int(np.ceil(np.median(steps))) if steps.size else 2)
     valid, fewer = sure > POSSIBLE, sure.size
     while fewer > sure.size * SETTLED:
