@@ -101,7 +101,7 @@ class PjLinkConversation:
         self._password = password
         self._answer_s = profile.timing.answer_s
         self._command_s = profile.timing.command_s
-        self.habits = self._habits = Habits(name, profile)
+        self.habits = Habits(name, profile)
         self._link: ByteLink | None = None
         self._closed = False
         self._answered_at_s = 0.0
@@ -113,13 +113,13 @@ class PjLinkConversation:
         """FAULT if it answers that it failed, UNKNOWN if it gives a state that the specification does not have."""
         reply = self.query("POWR", deadline)
         if reply is not Failure.UNAVAILABLE:
-            self._habits.unavailable_since_s = None
+            self.habits.unavailable_since_s = None
         power = self._failed_power(reply, deadline) if isinstance(reply, Failure) else pjlink.parse_power(reply)
-        self._habits.slow = power in (Power.WARMING, Power.COOLING)
+        self.habits.slow = power in (Power.WARMING, Power.COOLING)
         return power
 
     def _failed_power(self, reply: Failure, deadline: Deadline) -> Power:
-        power = self._habits.power_unavailable(deadline) if reply is Failure.UNAVAILABLE else None
+        power = self.habits.power_unavailable(deadline) if reply is Failure.UNAVAILABLE else None
         if reply is Failure.FAILURE:
             power = Power.FAULT
         if power is None:
@@ -136,21 +136,21 @@ class PjLinkConversation:
 
         Raises only Cancelled and the refusal of the password: only the power state is worth an error.
         """
-        if not self._habits.may_ask(name):
+        if not self.habits.may_ask(name):
             return None
         try:
             reply = self._once_more_if_closed(name, deadline, pj_class)
             answer = None if isinstance(reply, Failure) else parse(reply.strip())
         except (DeviceTimeout, DeviceGone):
             if not deadline.passed:
-                self._habits.silent(name)
+                self.habits.silent(name)
             return None
         except ProtocolError as error:
             # Further data on this connection may be the rest of it.
             self._hang_up()
-            self._habits.odd(name, error.what)
+            self.habits.odd(name, error.what)
             return None
-        self._habits.understood(name)
+        self.habits.understood(name)
         return answer
 
     def _once_more_if_closed(self, name: str, deadline: Deadline, pj_class: PjClass) -> str | Failure:
@@ -180,8 +180,8 @@ class PjLinkConversation:
             return self._say(name, parameter, deadline, self._command_s, 1)
         finally:
             if name == "POWR":
-                self._habits.slow = True
-                self._habits.switched(parameter == "1")
+                self.habits.slow = True
+                self.habits.switched(parameter == "1")
 
     def close(self) -> None:
         """Close for good. A call in another thread ends with DeviceGone."""
@@ -216,19 +216,19 @@ class PjLinkConversation:
     def _say(
         self, name: str, parameter: str, deadline: Deadline, patience_s: float, pj_class: PjClass
     ) -> str | Failure:
-        self._habits.wait(deadline)
+        self.habits.wait(deadline)
         self.check(deadline)
         message = pjlink.command(name, parameter, pj_class=pj_class)
         try:
             line = self._accepted(message, deadline, patience_s)
         except DeviceTimeout as error:
             self._hang_up()
-            self._habits.slow = True
+            self.habits.slow = True
             raise self.no_answer() from error
         except DeviceGone:
             self._hang_up()
-            self._habits.slow |= not self.reused
-            self._habits.closes |= self.reused and self._just_answered(deadline)
+            self.habits.slow |= not self.reused
+            self.habits.closes |= self.reused and self._just_answered(deadline)
             raise
         except BaseException:
             self._hang_up()
@@ -245,7 +245,7 @@ class PjLinkConversation:
 
     def _accepted(self, message: bytes, deadline: Deadline, patience_s: float) -> bytes:
         """The answer. A refusal of the digest is one of the message, too: nothing was done, and it is sent again."""
-        habits = self._habits
+        habits = self.habits
         line = self._exchanged(message, deadline, patience_s, second_level=habits.second_level is True)
         if pjlink.is_refusal(line) and self.reused:
             # The password was right on this connection: it wants the proof again, or a connection for each command.
@@ -259,14 +259,14 @@ class PjLinkConversation:
     def _by_second_level(self, message: bytes, deadline: Deadline, patience_s: float) -> bytes:
         """The answer, after the other password check; one that does not know it has refused the password itself."""
         self._hang_up()
-        self._habits.second_level = False
+        self.habits.second_level = False
         try:
             line = self._exchanged(message, deadline, patience_s, second_level=True)
         except (DeviceTimeout, DeviceGone) as error:
             if deadline.passed:
                 raise
             raise self._wrong_password() from error
-        self._habits.second_level = not pjlink.is_refusal(line)
+        self.habits.second_level = not pjlink.is_refusal(line)
         return line
 
     def _exchanged(self, message: bytes, deadline: Deadline, patience_s: float, *, second_level: bool) -> bytes:
@@ -275,15 +275,15 @@ class PjLinkConversation:
                 # Of an answer before nothing is left, and a connection that was closed meanwhile carries no command.
                 self._link.drain()
             except DeviceGone:
-                self._habits.closes |= self._just_answered(deadline)
+                self.habits.closes |= self._just_answered(deadline)
                 self._hang_up()
-        if self._habits.closes:
+        if self.habits.closes:
             self._hang_up()
         self.reused = self._link is not None
         link = self._greeted(deadline.within(patience_s), second_level)
         until = deadline.within(patience_s)
         link.write(self._prefix + message, deadline=until)
-        if not self._habits.proves_each:
+        if not self.habits.proves_each:
             self._prefix = b""
         return _answer_line(link, until)
 

@@ -238,7 +238,7 @@ def _beside(cells: npt.NDArray[np.int32], clear: Mask) -> npt.NDArray[np.int32]:
 
 def _steps(pairs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Cells from one pixel of each pair to the other, without a sign."""
-    return np.abs(pairs[1] - pairs[0])
+    return np.asarray(np.abs(pairs[1] - pairs[0]), np.int32)
 
 
 def _check_order(code: _Code, clear: Mask, axis: str) -> None:
