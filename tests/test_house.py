@@ -15,10 +15,10 @@ from controller.cli import groups
 from tests import house
 
 LIMITS: Final[Mapping[str, int]] = {
-    "lines": 102_000,
-    "files": 612,
+    "lines": 106_000,
+    "files": 640,
     "folders at the root of controller": 11,
-    "files with one importer": 135,
+    "files with one importer": 145,
     "small files with one importer": 5,
     "functions with 8 or more parameters": 11,
     "modules named by a participle": 10,
