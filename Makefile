@@ -1,4 +1,4 @@
-# make demo   the whole job on an emulated stage, ending in demo/report.html
+# make demo   the whole job on an emulated stage, ending in demo/report.html; OBJECT=painting, relief or statue; PROJECTORS=1
 # make test   every test but the long ones; WORKERS=3 chooses how many run side by side, TESTS=tests/hal which
 # make test-long   the long ones: booted machines, whole stages, a second renderer
 # make test-all    both at once, in less time than one after the other: the others run while a long one waits
@@ -20,7 +20,8 @@ empty :=
 OBJECT_NAME = $(notdir $(basename $(subst $(empty) $(empty),_,$(OBJECT))))
 quoted = '$(subst ','\'',$(1))'
 ROOM ?=
-OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))
+PROJECTORS ?=
+OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))$(if $(PROJECTORS),-$(PROJECTORS))
 SEED ?= 1
 OBJECT ?=
 DEBIAN ?= bookworm
@@ -40,7 +41,7 @@ DOCS_PYTHON ?= .venv/bin/python
 
 demo:
 	@.ci/setup demo
-	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(ROOM),--room $(ROOM)) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
+	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(ROOM),--room $(ROOM)) $(if $(PROJECTORS),--projectors $(PROJECTORS)) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
 
 blender:
 	@.ci/setup-blender

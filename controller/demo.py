@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
@@ -72,19 +73,45 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
 )
 
 
-def prepare(out: Path, *, size: str, object_file: Path | None, seed: int, room: str = DEFAULT_ROOM) -> Path:
+@dataclass(frozen=True, slots=True)
+class DemoStage:
+    """What a demo works on. ``thing``: one of the bench's built-in objects, or the path of a mesh; None: vase and bust;
+
+    ``projectors`` None: as many as the object usually has
+    """
+
+    size: str
+    seed: int
+    thing: str | None = None
+    room: str = DEFAULT_ROOM
+    projectors: int | None = None
+
+    @property
+    def built_in(self) -> str | None:
+        """The name of a built-in object. A name has no ending and no folder, which the path of a mesh always has."""
+        return self.thing if self.thing and re.fullmatch(r"[a-z]+(-[a-z]+)*", self.thing) else None
+
+    @property
+    def object_file(self) -> Path | None:
+        return Path(self.thing) if self.thing and not self.built_in else None
+
+
+def prepare(out: Path, asked: DemoStage) -> Path:
     """The stage folder ``out/stage`` for these options, created now or by an earlier demo.
 
     Raises UsageError("demo-folder-taken") if ``out`` holds a stage with other options, and what the bench refuses (a
     mesh without faces, an unknown size or room) before anything is written.
     """
     stage = out / "stage"
-    options = {"size": size, "seed": seed, "object": _object_digest(object_file), "room": room}
+    thing = asked.built_in or _object_digest(asked.object_file)
+    options = {"size": asked.size, "seed": asked.seed, "object": thing, "room": asked.room}
+    if asked.projectors is not None:
+        options["projectors"] = asked.projectors
     if (mark := stage / MARK).exists():
         if _read_mark(mark) != options:
             raise UsageError(
                 "demo-folder-taken",
-                what=f"{out} contains a demo with another size, object, seed or room.",
+                what=f"{out} contains a demo with another size, object, seed, room or number of projectors.",
                 remedy="Choose another folder with --out, or delete this one.",
             )
         return stage
@@ -94,16 +121,16 @@ def prepare(out: Path, *, size: str, object_file: Path | None, seed: int, room: 
             what=f"{stage} is not empty and is not from a demo.",
             remedy="Choose another folder with --out.",
         )
-    _build(out, stage, options, object_file)
+    _build(out, stage, options, asked)
     return stage
 
 
-def _build(out: Path, stage: Path, options: Mapping[str, Any], object_file: Path | None) -> None:
+def _build(out: Path, stage: Path, options: Mapping[str, Any], asked: DemoStage) -> None:
     """Write the stage under another name and rename it, so that a stopped demo leaves all of it or nothing."""
     building, there = out / BUILDING, out.exists()
     shutil.rmtree(building, ignore_errors=True)
     try:
-        tables = _write(building, options, object_file=object_file)
+        tables = _write(building, asked)
         write_stage(building / "stage.toml", tables)
         write_atomically(building / MARK, json.dumps(options).encode())
         building.rename(stage)
@@ -116,18 +143,18 @@ def _build(out: Path, stage: Path, options: Mapping[str, Any], object_file: Path
         raise
 
 
-def _write(stage: Path, options: Mapping[str, Any], *, object_file: Path | None) -> Mapping[str, Any]:
-    size = options["size"]
+def _write(stage: Path, asked: DemoStage) -> Mapping[str, Any]:
+    settings = {"room": asked.room, "object": asked.built_in, "projectors": asked.projectors}
     try:
-        bench = bench_of(stage, {"room": options["room"]})
-        devices = bench.prepare(stage, size=size, object_file=object_file, seed=options["seed"])
+        bench = bench_of(stage, {key: value for key, value in settings.items() if value is not None})
+        devices = bench.prepare(stage, size=asked.size, object_file=asked.object_file, seed=asked.seed)
     except DeviceError as error:
         kind = UsageError if error.code.startswith(("size-", "object-", "setting-")) else WorkError
         raise kind(error.code, what=error.what, remedy=error.remedy) from error
     _write_photograph(stage / PHOTOGRAPH)
     public = generate_key(stage / KEY_FILE)
     return {
-        "stage": {"name": f"demo {size}"},
+        "stage": {"name": " ".join(("demo", asked.size, *filter(None, (asked.built_in,))))},
         **devices,
         "safety": {"power_down_s": POWER_DOWN_S},
         "bundle": {"trusted_keys": [public.hex()]},
@@ -156,7 +183,7 @@ def _object_digest(object_file: Path | None) -> str:
         raise UsageError(
             "object-missing",
             what=f"The file {object_file} does not exist.",
-            remedy="Give OBJECT the path of a mesh, .obj or .ply.",
+            remedy="Give the path of a mesh, .obj or .ply, or the name of a built-in object such as painting.",
         )
     try:
         return sha256_of(object_file)

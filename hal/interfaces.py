@@ -241,6 +241,7 @@ class Bench(Protocol):
 
         The mapping has the stage.toml keys ``projectors`` (list), ``camera`` and ``display``, holding only what a
         technician of a real stage would know. The truth stays in the bench's own file, never read by the controller.
+        What the owner of a built-in object has, a picture or a scan of it, lies as files in ``stage``.
         """
 
     def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:

@@ -38,8 +38,18 @@ from plugins.emulated.core.truth import (
     read_truth,
     write_truth,
 )
-from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_engine, read_room, read_stands
-from plugins.emulated.optics.objects import default_object, load_object
+from plugins.emulated.optics.layout import (
+    DARK,
+    SETTINGS,
+    Stands,
+    arranged,
+    read_engine,
+    read_object,
+    read_room,
+    read_stands,
+)
+from plugins.emulated.optics.objects import VASE_AND_BUST, default_object, load_object
+from plugins.emulated.optics.scenes import BUILT_IN
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
@@ -112,13 +122,17 @@ PORTS: Final = range(20000, 32768)
 class EmulatedBench:
     """``hal.interfaces.Bench``.
 
-    ``stands``: where it puts the projectors of a stage that it prepares; ``engine`` None: as the ``room`` says
+    ``stands``: where it puts the projectors of a stage that it prepares; ``engine`` None: as the ``room`` says;
+    ``built_in``: a name of ``scenes.BUILT_IN``, which stands there where no mesh is given
     """
 
-    def __init__(self, stands: Stands | None = None, room: str = DARK, engine: str | None = None) -> None:
+    def __init__(
+        self, stands: Stands | None = None, room: str = DARK, engine: str | None = None, built_in: str | None = None
+    ) -> None:
         self._stands = stands or Stands()
         self._room = room
         self._engine = engine
+        self._built_in = built_in
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
         """Write ``bench.toml`` and ``bench/``; return the device tables of stage.toml (see ``hal.interfaces.Bench``).
@@ -127,9 +141,18 @@ class EmulatedBench:
         ``stage-not-written``.
         """
         size_named(size)
-        shape = default_object() if object_file is None else load_object(object_file)
-        kept = ObjectTruth("vase-and-bust" if object_file is None else "mesh", OBJECT_FILE, seed)
-        truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), self._stands), self._room, shape)
+        stands, hung = self._stands, False
+        files: Mapping[str, bytes] = {}
+        if object_file is None and self._built_in is not None:
+            thing = BUILT_IN[self._built_in]
+            (shape, files), hung = thing.on_stage(), thing.hung
+            if stands == Stands():
+                stands = Stands(names=thing.places)
+        else:
+            shape = default_object() if object_file is None else load_object(object_file)
+        kind = self._built_in or (VASE_AND_BUST if object_file is None else "mesh")
+        kept = ObjectTruth(kind, OBJECT_FILE, seed)
+        truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), stands), self._room, shape, hung=hung)
         truth = truth if self._engine is None else dataclasses.replace(truth, engine=self._engine)
         with _explained(stage):
             for folder in (FOLDER, "run"):
@@ -138,6 +161,8 @@ class EmulatedBench:
             _write_fast_profile(stage, DEFAULT_BOARD)
             write_truth(stage, truth)
             (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
+            for name, data in files.items():
+                (stage / name).write_bytes(data)
         return device_tables(truth, shape)
 
     def disturb(self, stage: Path, changes: Sequence[Mapping[str, Any]]) -> None:
@@ -375,7 +400,8 @@ def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
-    return EmulatedBench(read_stands(settings, context.stage), read_room(settings), read_engine(settings))
+    stands = read_stands(settings, context.stage)
+    return EmulatedBench(stands, read_room(settings), read_engine(settings), read_object(settings))
 
 
 DRIVER: Final = Driver(

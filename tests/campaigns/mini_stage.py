@@ -42,7 +42,7 @@ def prepare_mini(out: Path, seed: int = 3) -> Path:
     two = bench.EmulatedBench(Stands(PROJECTORS))
     sizes = patch.object(staging, "SIZES", {**staging.SIZES, "mini": MINI})
     with sizes, patch.object(demo_stage, "bench_of", lambda folder, settings: two):
-        stage = demo_stage.prepare(out, size="mini", object_file=None, seed=seed, room="dark")
+        stage = demo_stage.prepare(out, demo_stage.DemoStage("mini", seed, room="dark"))
     truth, known = stage / "bench.toml", stage / "stage.toml"
     truth.write_text(truth.read_text().replace("time_scale = 0.25", f"time_scale = {TIME_SCALE}"))
     head = known.read_text().partition("\n[[appearances]]")[0].rpartition("\n#")[0]

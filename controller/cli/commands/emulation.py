@@ -27,8 +27,10 @@ def demo(
         Literal["small", "medium", "paper", "uhd"], typer.Option(help="Size of projectors and camera.")
     ] = "small",
     object: Annotated[  # noqa: A002 - the option's name is fixed
-        Path | None, typer.Option(help="Mesh of the object, .obj or .ply (default: a vase and a bust).")
+        str | None,
+        typer.Option(help="painting, relief, statue, or a mesh, .obj or .ply (default: a vase and a bust)."),
     ] = None,
+    projectors: Annotated[int | None, typer.Option(help="How many projectors (default: 3, painting 2).", min=1)] = None,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
     room: Annotated[
@@ -40,9 +42,9 @@ def demo(
     """Run a complete job on an emulated stage, up to the report."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.demo import prepare
+        from controller.demo import DemoStage, prepare
 
-        stage = prepare(out.resolve(), size=size, object_file=object, seed=seed, room=room)
+        stage = prepare(out.resolve(), DemoStage(size, seed, object, room, projectors))
         if prepare_only:
             from controller.stage.sessions.check import check_stage
 

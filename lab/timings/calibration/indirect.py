@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.demo import prepare
+from controller.demo import DemoStage, prepare
 from controller.optics.solve.result.metrics import colour_difference
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated
@@ -91,7 +91,7 @@ def traced_stage(folder: Path, scene: str, size: str, seed: int) -> Path:
     if (folder / "stage" / "stage.toml").exists():
         return folder / "stage"
     folder.mkdir(parents=True, exist_ok=True)
-    stage = prepare(folder, size=size, object_file=write_scene(scene, folder / "scene.ply"), seed=seed)
+    stage = prepare(folder, DemoStage(size, seed, str(write_scene(scene, folder / "scene.ply"))))
     write_truth(stage, dataclasses.replace(read_truth(stage), engine="mitsuba"))
     width, height = read_truth(stage).camera.lens.size_px
     cv2.imwrite(str(stage / "grey.png"), np.full((height, width, 3), 188, np.uint8))

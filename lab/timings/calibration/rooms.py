@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import TroubleCode
-from controller.demo import APPEARANCES, demo, prepare
+from controller.demo import APPEARANCES, DemoStage, demo, prepare
 from controller.run.progress import Silent
 from lab.timings import Row, at_least, at_most
 from plugins.emulated.core.truth import NO_BANDS, BenchTruth, ProjectorTruth, read_truth
@@ -53,7 +53,7 @@ def measure(size: str) -> list[Row]:
 def _figures(out: Path, room: str, size: str, seed: int) -> tuple[Path, dict[str, Any]]:
     """The folder of a demo, run now or before, and its report.json."""
     if not (out / "report.json").exists():
-        stage = prepare(out, size=size, object_file=None, seed=seed, room=room)
+        stage = prepare(out, DemoStage(size, seed, room=room))
         demo(stage, reporter=Silent(), cancel=threading.Event())
     return out, json.loads((out / "report.json").read_bytes())
 

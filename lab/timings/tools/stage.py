@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.demo import DEFAULT_ROOM, prepare
+from controller.demo import DEFAULT_ROOM, DemoStage, prepare
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
@@ -39,7 +39,7 @@ class CalibratedStage:
 def prepared_stage(size: str, seed: int, *, room: str = DEFAULT_ROOM) -> Iterator[Path]:
     """A stage folder of a random truth, removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="velatura-bench-") as folder:
-        yield prepare(Path(folder), size=size, object_file=None, seed=seed, room=room)
+        yield prepare(Path(folder), DemoStage(size, seed, room=room))
 
 
 @contextmanager

@@ -260,7 +260,8 @@ class ProjectorTruth:
 
 @dataclass(frozen=True, slots=True)
 class ObjectTruth:
-    """``kind`` is ``vase-and-bust`` or ``mesh``; ``file``, relative to the stage folder, has its triangles.
+    """``kind`` is ``vase-and-bust``, ``mesh`` or a name of ``optics.scenes``; ``file``, relative to the stage folder,
+    has its triangles.
 
     Without ``file`` the vase and the bust are computed again, which takes seconds.
 

@@ -40,7 +40,8 @@ class StageObject:
     ``vertices`` (V, 3) float32; ``faces`` (F, 3) int32; ``normals`` (F, 3, 3) float32: unit, one a face's corner;
     ``paint``: ``vase-and-bust``, ``solid``, ``corners`` (colours at the corners) or ``texture``;
     ``corner_values``: (F, 3, 3) linear RGB for ``corners``, (F, 3, 2) texture coordinates for ``texture``, else empty;
-    ``texture``: (rows, columns, 3) linear RGB for ``texture``, else empty; ``parts``: first face of each painted part
+    ``texture``: (rows, columns, 3) linear RGB for ``texture``, else empty; ``parts``: first face of each part that has
+    a paint, or with ``texture`` projectors, of its own
     """
 
     vertices: npt.NDArray[np.float32]
@@ -201,8 +202,7 @@ def _assembled(
 
 def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
     """Unit normals (F, 3, 3): the mean of the faces that meet at a point by their angles, or flat at sharp creases."""
-    corners = vertices[faces]
-    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    corners, flat = vertices[faces], face_normals(vertices, faces)
     # Files split vertices along texture seams; the surface is smooth there all the same.
     _, place = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
     place = place.reshape(-1)
@@ -217,6 +217,12 @@ def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArra
     return np.where(creased[..., None], flat[:, None], smooth).astype(np.float32)
 
 
+def face_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
+    """Unit normals (F, 3)."""
+    corners = vertices[faces]
+    return _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
 def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(length(vectors), 1e-30)[..., None])
 
@@ -226,6 +232,12 @@ def _linear(srgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     value = np.arange(256) / 255.0
     table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.asarray(table[srgb])
+
+
+def srgb_bytes(light: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """The inverse of ``_linear``, rounded."""
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(255.0 * np.clip(value, 0.0, 1.0)).astype(np.uint8)
 
 
 def _sampled(image: npt.NDArray[np.float32], x: Floats, y: Floats) -> Rgb:

@@ -28,7 +28,7 @@ from plugins.emulated.core.truth import (
     three,
 )
 from plugins.emulated.optics.layout import DEFAULT, Stands
-from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.objects import VASE_AND_BUST, StageObject
 from plugins.emulated.optics.rays import project
 
 Floats = npt.NDArray[np.float64]
@@ -89,8 +89,13 @@ def random_truth(
     points = stage_object.vertices[:: max(1, len(stage_object.vertices) // 6000)].astype(np.float64)
     camera = _camera(sizes, rng, points, ports)
     stands = stands or Stands()
+    aims = [points]
+    if stage_object.paint != VASE_AND_BUST and len(stage_object.parts) > 1:
+        parts = np.split(stage_object.faces, stage_object.parts[1:])
+        aims = [stage_object.vertices[np.unique(part)].astype(np.float64) for part in parts]
     drawn = (
-        _projector(index, *place, sizes, rng, points) for index, place in enumerate(stands.places(sizes.projectors))
+        _projector(index, *place, sizes, rng, aims[index % len(aims)])
+        for index, place in enumerate(stands.places(sizes.projectors))
     )
     projectors = tuple(stands.put(index, projector) for index, projector in enumerate(drawn))
     return BenchTruth(

@@ -13,7 +13,7 @@ import pytest
 from controller import demo as module
 from controller.config import load_stage
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.demo import BUILDING, DEFAULT_ROOM, MARK, prepare
+from controller.demo import BUILDING, DEFAULT_ROOM, MARK, DemoStage, prepare
 from hal.errors import DeviceError
 
 TABLES = {
@@ -28,7 +28,7 @@ class ModelBench:
 
     def __init__(self) -> None:
         self.prepared: list[Path] = []
-        self.rooms: list[str] = []
+        self.settings: list[Mapping[str, Any]] = []
         self.error: BaseException | None = None
 
     def prepare(self, stage: Path, *, size: str, object_file: Path | None, seed: int) -> Mapping[str, Any]:
@@ -48,17 +48,15 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModelBench:
     bench = ModelBench()
 
     def bench_of(stage: Path, settings: Mapping[str, Any]) -> ModelBench:
-        bench.rooms.append(settings["room"])
+        bench.settings.append(settings)
         return bench
 
     monkeypatch.setattr(module, "bench_of", bench_of)
     return bench
 
 
-def prepared(
-    out: Path, *, size: str = "small", seed: int = 1, object_file: Path | None = None, room: str = DEFAULT_ROOM
-) -> Path:
-    return prepare(out, size=size, seed=seed, object_file=object_file, room=room)
+def prepared(out: Path, *, size: str = "small", seed: int = 1, thing: Path | str | None = None, **more: Any) -> Path:
+    return prepare(out, DemoStage(size, seed, None if thing is None else str(thing), **more))
 
 
 def test_it_writes_a_stage_that_reads_and_signs_with_a_private_key(bench: ModelBench, tmp_path: Path) -> None:
@@ -77,19 +75,19 @@ def test_it_writes_a_stage_that_reads_and_signs_with_a_private_key(bench: ModelB
 def test_the_same_options_find_it_again_and_others_are_refused(bench: ModelBench, tmp_path: Path) -> None:
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v 0 0 0")
-    stage = prepared(tmp_path / "out", object_file=mesh)
+    stage = prepared(tmp_path / "out", thing=mesh)
     key = (stage / "keys" / "stage.key").read_bytes()
-    assert prepared(tmp_path / "out", object_file=mesh) == stage
+    assert prepared(tmp_path / "out", thing=mesh) == stage
     assert (stage / "keys" / "stage.key").read_bytes() == key
     assert len(bench.prepared) == 1
-    assert bench.rooms == [DEFAULT_ROOM]
-    for options in ({"seed": 2}, {"size": "medium"}, {"object_file": None}, {"room": "hard"}):
+    assert bench.settings == [{"room": DEFAULT_ROOM}]
+    for options in ({"seed": 2}, {"size": "medium"}, {"thing": None}, {"room": "hard"}, {"projectors": 1}):
         with pytest.raises(UsageError) as refused:
-            prepared(tmp_path / "out", **{"object_file": mesh, **options})  # type: ignore[arg-type]
+            prepared(tmp_path / "out", **{"thing": mesh, **options})  # type: ignore[arg-type]
         assert refused.value.code == "demo-folder-taken"
     mesh.write_text("v 1 1 1")
-    with pytest.raises(UsageError, match="another size, object, seed or room"):
-        prepared(tmp_path / "out", object_file=mesh)
+    with pytest.raises(UsageError, match="another size, object, seed, room or number"):
+        prepared(tmp_path / "out", thing=mesh)
 
 
 @pytest.mark.parametrize(
@@ -138,12 +136,43 @@ def test_a_damaged_mark_makes_the_folder_foreign(bench: ModelBench, tmp_path: Pa
 
 def test_an_object_that_can_not_be_read_is_told(bench: ModelBench, tmp_path: Path) -> None:
     with pytest.raises(UsageError) as refused:
-        prepared(tmp_path / "out", object_file=tmp_path / "nowhere.obj")
+        prepared(tmp_path / "out", thing=tmp_path / "nowhere.obj")
     assert refused.value.code == "object-missing"
     with pytest.raises(UsageError) as refused:
-        prepared(tmp_path / "out", object_file=tmp_path)
+        prepared(tmp_path / "out", thing=tmp_path)
     assert refused.value.code == "object-missing"
     assert bench.prepared == []
+
+
+def test_a_bare_word_is_a_built_in_object_and_all_else_a_mesh(bench: ModelBench, tmp_path: Path) -> None:
+    """Even where a file of that name lies: no mesh can be read without its ending."""
+    stage = prepared(tmp_path / "out", thing="painting", projectors=2)
+    assert bench.settings == [{"room": DEFAULT_ROOM, "object": "painting", "projectors": 2}]
+    assert tomllib.loads((stage / "stage.toml").read_text())["stage"]["name"] == "demo small painting"
+    assert prepared(tmp_path / "out", thing="painting", projectors=2) == stage
+    with pytest.raises(UsageError):
+        prepared(tmp_path / "out", thing="statue", projectors=2)
+    for path in ("./painting", "painting.obj", "Painting", "a/painting", "painting "):
+        with pytest.raises(UsageError) as refused:
+            prepared(tmp_path / "other", thing=path)
+        assert refused.value.code == "object-missing"
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "words"),
+    [
+        ({"thing": "vase"}, "object-missing", "painting, relief, statue"),
+        ({"projectors": 7}, "setting-wrong", "from 1 to 6"),
+    ],
+)
+def test_what_the_bench_has_not_is_refused_with_what_it_has(
+    tmp_path: Path, asked: dict[str, Any], code: str, words: str
+) -> None:
+    with pytest.raises(UsageError) as refused:
+        prepared(tmp_path / "out", **asked)
+    assert refused.value.code == code
+    assert words in refused.value.remedy
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_room_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
