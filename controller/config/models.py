@@ -241,8 +241,8 @@ class SolveTable(ConfigTable):
         default=1.0,
         ge=0,
         le=1,
-        description="how far a target is bent where light is lacking, so that the object's own pattern does not "
-        "show, from 0 (what can't be shown is cut off) to 1",
+        description="how far a target is bent where it is darker or more saturated than can be shown, so that the "
+        "object's own pattern does not show, from 0 (such parts are cut off) to 1",
     )
     method: Literal["global", "regions"] = Field(
         default="global",

@@ -175,6 +175,17 @@ def read_refining(run: Path, name: str) -> Any:
     return read_json(json_path(run, StepKind.REFINED, name))["refined"] if _is_refined(run, name) else None
 
 
+def of_asked(figures: Mapping[str, Any]) -> str:
+    """What refining did to the error against what was asked for, for people; "" where it aimed at just that."""
+    before, after = figures.get("asked_before"), figures.get("asked_after")
+    if before is None or after is None:
+        return ""
+    of_aim, of_request = (
+        f"{one:.2f} to {other:.2f}" for one, other in ((figures["before"], figures["after"]), (before, after))
+    )
+    return "" if of_request == of_aim else f", {of_request} against what was asked for,"
+
+
 def _is_refined(run: Path, name: str) -> bool:
     """An appearance that was solved again since has its new frames."""
     path = json_path(run, StepKind.REFINED, name)

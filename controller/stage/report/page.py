@@ -18,6 +18,7 @@ from controller.core.plotting import font_file
 from controller.core.storage import write_atomically
 from controller.optics.solve.result.metrics import as_rows
 from controller.stage.artefacts.names import REPORT_FIGURES, REPORT_PAGE
+from controller.stage.artefacts.solved import of_asked
 from controller.stage.report.pictures import ERROR_SCALE_DELTA_E, data_uri, scale_bar
 
 
@@ -117,7 +118,8 @@ def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
         return ()
     expected = " (expected)" if figures["expected"] else ""
     count = len(figures["photographs"])
-    text = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}, {count} photograph{'s' * (count != 1)}"
+    change = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}{of_asked(figures).removesuffix(',')}"
+    text = f"{change}, {count} photograph{'s' * (count != 1)}"
     return (("refined", text),)
 
 

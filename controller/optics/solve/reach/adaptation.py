@@ -1,17 +1,16 @@
-"""Bends targets so that the object's own pattern doesn't show where light is lacking.
+"""Bends targets so that the object's own pattern doesn't show in their dark and saturated parts.
 
-Cutting a target off at each pixel shows the object's paint: a dark patch stays dark, and where light of other surfaces
-falls on a pale one it stays pale. What is not seen is a limit that varies slowly. So what single pixels can't make
-becomes smooth limits (``SmoothLimits``), and the target is bent towards them as a film bends highlights: what keeps
-well away from a limit stays as it is, differences beyond it shrink.
+Cutting a target off at each pixel shows the object's paint: where light of other surfaces falls on a pale patch it
+stays pale, and a saturated patch keeps its colour. What is not seen is a limit that varies slowly. So what single
+pixels can't make becomes smooth limits (``SmoothLimits``), and the target is bent towards them: what keeps well away
+from a limit stays as it is, differences beyond it shrink.
 
 1. Dark: no darker than a smooth floor, in grey, so that shadows don't take on the colour of the light in them. Paint on
    which no grey outshines that colour keeps it, and does not lift what is around.
 2. Chroma: no more saturated than can be shown around; the hue and the lightness stay.
-3. Light: no brighter than a smooth ceiling. Mostly all channels together, so that highlights keep their colour.
 
-Chroma comes before lightness: a pixel whose channels lack light alone is not dimmed. Arrays in, arrays out
-(docs/decisions/0011).
+What is brighter than the projectors can make is cut off: to hide it, parts in reach would have to be dimmed. Arrays in,
+arrays out (docs/decisions/0011).
 
 A smooth limit is an elastic sheet that lies on obstacles, on the object alone: the least one above its obstacles of all
 that are held down by springs and drawn flat by their tension (the obstacle problem). It is found on cells of about a
@@ -33,7 +32,7 @@ from controller.core.arrays import Float64, FloatImage, Mask, strips
 from controller.core.errors import UsageError
 from controller.core.jit import compiled
 from controller.optics.solve.bounded.solver import check_target
-from controller.optics.solve.reach.drive_levels import Colour, DriveLevels, levels_at, light_at
+from controller.optics.solve.reach.drive_levels import Colour, DriveLevels, levels_at
 from controller.optics.transport import LightTransport
 
 CELL: Final = 0.012
@@ -189,18 +188,11 @@ def _blocks(image: npt.NDArray[Any], side: int) -> npt.NDArray[Any]:
     return whole.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
 
 
-KNEE: Final = 0.8
-"""Of the ceiling: light below this part of it stays as it is."""
-TOGETHER: Final = 0.8
-"""How far channels are dimmed together, from 0 (each by itself, which colours highlights) to 1."""
-DEEPEST: Final = 2.5
-"""Largest logarithm of the brightest target's light over a ceiling: what hardly any light reaches is given up."""
 CLEAR: Final = 1.0
 """Chroma counts in full where a target is brighter than its floor by this part of it; in the dark it hardly shows."""
 FORGIVEN: Final = 1e-3
 """Drive beyond [0, 1] that is no lack of light."""
 LEAST: Final = np.float32(1e-12)
-NOT_DIMMED: Final = np.zeros((3, 0, 0), np.float32)
 
 
 def adapted_target(
@@ -237,7 +229,7 @@ def adapted_target(
     target = _Bent(np.asarray(wanted, np.float32), np.asarray(floor, np.float32), drive, SmoothLimits.on(drive.mask))
     target.lift()
     target.pale()
-    return target.dimmed(strength)
+    return target.bent(strength)
 
 
 class _Bent:
@@ -273,20 +265,10 @@ class _Bent:
                 needs[channel] = self._limits.above(needs[channel])
             _chroma_left(self._stage[-1], self._wanted, self._level, needs, self._chroma)
 
-    def dimmed(self, strength: float) -> FloatImage:
-        """Bend the brightest parts below a smooth ceiling; all steps together, as strong as ``strength``."""
-        mask = self._stage[-1]
-        brightest = _brightest(mask, self._wanted, self._level, self._chroma)
-        top = np.float32(brightest.max(initial=0) / KNEE)
-        depths = np.zeros((3, *mask.shape), np.float32)
-        _depths(*self._stage, self._wanted, self._floor, self._level, self._chroma, top, depths)
-        if depths.any():
-            for channel in range(3):
-                depths[channel] = self._limits.above(depths[channel])
-        else:
-            depths = NOT_DIMMED
+    def bent(self, strength: float) -> FloatImage:
+        """Both steps together, as strong as ``strength``."""
         changed = self._wanted.copy()
-        _bend(mask, self._wanted, self._level, self._chroma, depths, top, np.float32(strength), changed)
+        _bend(self._stage[-1], self._wanted, self._level, self._chroma, np.float32(strength), changed)
         return changed
 
 
@@ -362,71 +344,17 @@ def _chroma_left(mask: Mask, wanted: FloatImage, level: FloatImage, limits: Floa
 
 
 @compiled(parallel=True)
-def _brightest(mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage) -> FloatImage:
-    """(rows,): the brightest channel of the paler target in each row."""
+def _bend(
+    mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage, strength: np.float32, out: FloatImage
+) -> None:
+    """The target (rows, columns, 3) on the object, lifted and paler."""
     rows, columns = mask.shape
-    out = np.zeros(rows, np.float32)
     for y in prange(rows):
-        most = np.float32(0)
         for x in range(columns):
             if mask[y, x]:
-                r, s, t = _paler(wanted, level, chroma, y, x)
-                most = max(most, r, s, t)
-        out[y] = most
-    return out
-
-
-@compiled(parallel=True)
-def _depths(
-    matrices: FloatImage, segment_share: FloatImage, mask: Mask, wanted: FloatImage, floor: FloatImage,
-    level: FloatImage, chroma: FloatImage, top: np.float32, depths: FloatImage,
-) -> None:  # fmt: skip
-    """How far the ceiling (3, rows, columns) is below ``top``, where light is lacking."""
-    rows, columns = mask.shape
-    none, one = np.float32(0), np.float32(1)
-    for y in prange(rows):
-        for x in range(columns):
-            if not mask[y, x]:
-                continue
-            r, s, t = _paler(wanted, level, chroma, y, x)
-            dark = floor[y, x, 0], floor[y, x, 1], floor[y, x, 2]
-            levels = levels_at(matrices, segment_share, y, x, r - dark[0], s - dark[1], t - dark[2])
-            if max(levels[0], levels[1], levels[2]) > 1 + FORGIVEN:
-                first, second, third = levels
-                most = light_at(
-                    matrices, segment_share, y, x, min(max(first, none), one), min(max(second, none), one),
-                    min(max(third, none), one),
-                )  # fmt: skip
+                bent = _paler(wanted, level, chroma, y, x)
                 for c in range(3):
-                    if levels[c] > 1 + FORGIVEN:
-                        depth = np.log(top / max(dark[c] + most[c], LEAST))
-                        depths[c, y, x] = min(max(depth, none), np.float32(DEEPEST))
-
-
-@compiled(parallel=True)
-def _bend(
-    mask: Mask, wanted: FloatImage, level: FloatImage, chroma: FloatImage, depths: FloatImage, top: np.float32,
-    strength: np.float32, out: FloatImage,
-) -> None:  # fmt: skip
-    """The target (rows, columns, 3) on the object, paler and below its ceiling; none with ``depths`` of 0 rows."""
-    rows, columns = mask.shape
-    one = np.float32(1)
-    for y in prange(rows):
-        gain = np.ones(3, np.float32)
-        for x in range(columns):
-            if not mask[y, x]:
-                continue
-            paler = _paler(wanted, level, chroma, y, x)
-            together = one
-            for c in range(3 if depths.shape[1] else 0):
-                of_ceiling = paler[c] / (top * np.exp(-depths[c, y, x]))
-                gain[c] = _quotient(_shoulder(of_ceiling), of_ceiling, one)
-                together = min(together, gain[c])
-            for c in range(3):
-                bent = paler[c]
-                if together < one:
-                    bent *= gain[c] ** np.float32(1 - TOGETHER) * together ** np.float32(TOGETHER)
-                out[y, x, c] += strength * (bent - out[y, x, c])
+                    out[y, x, c] += strength * (bent[c] - out[y, x, c])
 
 
 @compiled()
@@ -460,15 +388,6 @@ def _paler(wanted: FloatImage, level: FloatImage, chroma: FloatImage, y: int, x:
     r, s, t, grey = _lifted(wanted, level, y, x)
     lost = np.float32(1) - chroma[y, x]
     return r + lost * (grey - r), s + lost * (grey - s), t + lost * (grey - t)
-
-
-@compiled()
-def _shoulder(value: np.float32) -> np.float32:
-    """The identity up to ``KNEE``, then towards 1 with the same slope at the knee."""
-    knee, room = np.float32(KNEE), np.float32(1 - KNEE)
-    above = max(value - knee, np.float32(0)) / room
-    bent: np.float32 = min(value, knee) + room * (np.float32(1) - np.exp(-above))
-    return bent
 
 
 @compiled()

@@ -38,7 +38,15 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import IndirectFigures
-from controller.stage.artefacts.solved import Refining, Solved, read_solved, solving_digest, write_causes, write_refined
+from controller.stage.artefacts.solved import (
+    Refining,
+    Solved,
+    of_asked,
+    read_solved,
+    solving_digest,
+    write_causes,
+    write_refined,
+)
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.photographing import brightest, speeds, take_bracket
@@ -162,6 +170,7 @@ class _Refinement:
         photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
         error = self._error(photograph.radiance, trusted)
         row = {"delta_e00_median": error.median, "delta_e00_p95": error.p95, "delta_e00_mean": error.mean,
+               "asked_median": self._of_asked(photograph.radiance, trusted),
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
         state = replace(state, photographs=(*state.photographs, row), equations=causes)
         judged = self._judge(state, error)
@@ -215,10 +224,12 @@ class _Refinement:
             exposure=self.solved.exposure,
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
-        expected = self._error(self._predicted(new) + seen.light, seen.known)
+        light = self._predicted(new) + seen.light
+        expected = self._error(light, seen.known)
         if not gain(left, expected.map).worth_it:
             return replace(state, ended=ENOUGH)
-        row = {**state.photographs[-1], "expected_median": expected.median}
+        row = {**state.photographs[-1], "expected_median": expected.median,
+               "expected_asked_median": self._of_asked(light, seen.known)}  # fmt: skip
         return replace(state, frames=new, photographs=(*state.photographs[:-1], row))
 
     @property
@@ -237,6 +248,15 @@ class _Refinement:
     def _error(self, radiance: FloatImage, mask: Mask) -> PhotographedError:
         matrix = self.calibrated.calibration.camera_to_xyz
         return photographed_error(radiance, self.solved.target, matrix, self.solved.exposure, mask)
+
+    def _of_asked(self, radiance: FloatImage, mask: Mask) -> float | None:
+        """The median error against what was asked for, where that is in reach; None where nothing is."""
+        asked, calibration = self.solved.requested, self.calibrated.calibration
+        mask = mask & asked.reachable
+        if not mask.any():
+            return None
+        matrix, white = calibration.camera_to_xyz, self.solved.exposure
+        return photographed_error(radiance, asked.target, matrix, white, mask).median
 
     def _predicted(self, frames: Mapping[str, FloatImage]) -> FloatImage:
         light = self.calibrated.predicted_light(self._in_order(frames))
@@ -282,15 +302,22 @@ def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context)
 
 
 def _figures(found: Refining, asked: int) -> dict[str, Any]:
-    """What is reported: ``before`` and ``after``, medians of CIEDE2000; the latter is ``expected`` or photographed."""
+    """What is reported: ``before`` and ``after``, medians of CIEDE2000; the latter is ``expected`` or photographed.
+
+    They are against what was aimed at; ``asked_before`` and ``asked_after`` against what was asked for.
+    """
     counted = [row for row in found.photographs if "refused" not in row]
     kept = [row for row in counted if row.get("kept", True)]
     before = kept[0]["delta_e00_median"] if kept else None
     last = kept[-1] if kept else {}
     expected = "expected_median" in last and not found.ended
-    after = last.get("expected_median" if expected else "delta_e00_median")
-    return {"asked": asked, "before": before, "after": after, "expected": expected, "ended": found.ended,
-            "photographs": list(found.photographs)}  # fmt: skip
+    after, asked_after = (
+        last.get(f"expected_{name}" if expected else photographed)
+        for name, photographed in (("median", "delta_e00_median"), ("asked_median", "asked_median"))
+    )
+    asked_before = kept[0].get("asked_median") if kept else None
+    return {"asked": asked, "before": before, "after": after, "asked_before": asked_before, "asked_after": asked_after,
+            "expected": expected, "ended": found.ended, "photographs": list(found.photographs)}  # fmt: skip
 
 
 def sentence(name: str, figures: Mapping[str, Any]) -> str:
@@ -301,9 +328,9 @@ def sentence(name: str, figures: Mapping[str, Any]) -> str:
         return f"{name} was not refined: no photograph could be used ({photographs})."
     if len(figures["photographs"]) == 1 and figures["ended"]:
         return f"{name} needed no refinement: {figures['before']:.2f} (CIEDE2000 median), {photographs}."
-    before, after = f"{figures['before']:.2f}", f"{figures['after']:.2f}"
     expected = "an expected " if figures["expected"] else ""
-    return f"Refined {name}: {before} to {expected}{after} (CIEDE2000 median) with {photographs}."
+    change = f"{figures['before']:.2f} to {expected}{figures['after']:.2f} (CIEDE2000 median)"
+    return f"Refined {name}: {change}{of_asked(figures)} with {photographs}."
 
 
 def causes_step(calibrated: Calibrated, names: Sequence[str], photographs: int, *, after: Sequence[StepId]) -> Step:

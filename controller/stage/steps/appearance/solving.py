@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 from controller.config.models import SolveTable
 from controller.core.arrays import ByteImage, FloatImage
@@ -31,6 +31,8 @@ from hal.notices import Level
 from hal.runtime.compute import free_bytes
 
 BASE = StepId(StepKind.BASE)
+MOSTLY: Final = 0.5
+"""A target of which less is in reach is mostly out of reach."""
 
 
 def options_of(table: SolveTable) -> SolveOptions:
@@ -171,6 +173,14 @@ def _solve_appearance(
     made = (answering or partial(_answer_here, calibrated))(request, options, context)
     if made.figures["advice"] is not None:
         context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
+    share = made.figures["reachable_share"]
+    if isinstance(share, float) and share < MOSTLY:
+        context.reporter.say(
+            f"{request.title}: only {share:.0%} of the object can be shown as asked for; the rest asks for stronger "
+            "colours, or for more or less light, than the projectors can make there. Choose paler colours or a target "
+            "nearer to the object's own paint, or make the room darker.",
+            Level.WARNING,
+        )
     figures: dict[str, object] = {
         "name": request.name,
         "title": request.title,

@@ -53,22 +53,27 @@ def highlight(peak: float) -> FloatImage:
 def test_where_light_suffices_nothing_changes() -> None:
     wanted = np.asarray(STAGE.black + 0.5 * REACH, np.float32)
     np.testing.assert_array_equal(adapted(wanted), wanted)
-    bent = adapted(highlight(2.0))
-    far = np.s_[:, :20]
-    np.testing.assert_allclose(bent[far], highlight(2.0)[far], rtol=0.03)
 
 
-def test_a_highlight_that_lacks_light_is_bent_and_stays_a_highlight_of_its_colour() -> None:
+@pytest.mark.parametrize("light", [0.2, 0.05, 0.0])
+def test_a_shadow_or_dark_paint_pulls_down_nothing_around(light: float) -> None:
+    """A third of an even grey gets a part of the light, or is painted dark: all the rest stays as asked."""
+    shape = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
+    shadow = np.s_[:, 50:100]
+    for part in shape.projectors:
+        part.white[shadow] *= np.float32(light)
+    transport = build_transport(shape)
+    wanted = np.full_like(shape.black, 0.6 * float(np.median(REACH)))
+    bent = adapted_target(transport, wanted, shape.black)
+    np.testing.assert_array_equal(bent, wanted)
+
+
+def test_a_highlight_out_of_reach_keeps_all_in_reach_as_it_is() -> None:
     wanted = highlight(2.0)
     bent = adapted(wanted)
-    before, after = (feasibility(TRANSPORT, one, STAGE.black, drive=DRIVE).share for one in (wanted, bent))
-    assert after > max(0.97, before + 0.02)
-    row = bent[60, :, 1]
-    assert row[78:82].mean() > 2 * row[10]
-    rise = row[30:80]
-    assert (rise > 0.93 * np.maximum.accumulate(rise)).all(), "no ring is seen round it"
-    ratio = bent[60, 80] / bent[60, 80].mean()
-    np.testing.assert_allclose(ratio, wanted[60, 80] / wanted[60, 80].mean(), atol=0.12)
+    in_reach = feasibility(TRANSPORT, wanted, STAGE.black, drive=DRIVE).reachable
+    assert 0.3 < in_reach.mean() < 0.98
+    np.testing.assert_array_equal(bent[in_reach], wanted[in_reach])
 
 
 def test_dark_places_of_the_object_do_not_show_through_a_highlight() -> None:

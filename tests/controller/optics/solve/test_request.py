@@ -64,12 +64,14 @@ def test_reachable_pixels_are_those_where_the_target_says_something(transport: L
 
 
 def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport, base: Base) -> None:
-    options = replace(OPTIONS, share=0.6, adapt=1.0)
+    options = replace(OPTIONS, adapt=1.0)
     asked = picture(60)
-    found = solve_appearance(StageLight(transport, STAGE.black), base, asked, options)
-    plain = solve_appearance(StageLight(transport, STAGE.black), base, asked, replace(options, adapt=0.0))
+    asked = replace(asked, image=asked.image**4)
+    light = StageLight(transport, np.asarray(STAGE.black + 0.1 * np.median(transport.reach()), np.float32))
+    found = solve_appearance(light, base, asked, options)
+    plain = solve_appearance(light, base, asked, replace(options, adapt=0.0))
     values = {key: value for key, value in found.figures.items() if isinstance(value, float)}
-    assert values["reachable_share"] < 0.7 < 0.95 < values["adapted_share"]
+    assert values["reachable_share"] < 0.7 < 0.8 < values["adapted_share"]
     np.testing.assert_allclose(found.asked, plain.target)
     np.testing.assert_array_equal(found.asked_reachable, plain.reachable)
     np.testing.assert_array_equal(plain.asked, plain.target)

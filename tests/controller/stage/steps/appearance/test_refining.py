@@ -32,6 +32,7 @@ from controller.stage.artefacts.solved import (
     read_solved,
     remove_refined,
 )
+from controller.stage.report.page import refined_row
 from controller.stage.steps.appearance import refining
 from controller.stage.steps.appearance.refining import RefineOptions, refine_steps
 from controller.stage.steps.appearance.solving import device_frames
@@ -175,14 +176,17 @@ class Stage:
             Runner(steps, journal, reporter=self.told).run("refine", deadline=in_seconds(60))
         return read_refining(self.calibrated.folder, NAME)
 
-    def error(self, solved: Solved | None = None, light: Light = indirect) -> float:
-        """The median CIEDE2000 of frames, by the same camera without noise."""
+    def error(
+        self, solved: Solved | None = None, light: Light = indirect, asked: RequestedTarget | None = None
+    ) -> float:
+        """The median CIEDE2000 of frames, by the same camera without noise; ``asked``: against that, where in reach."""
         solved = self.present() if solved is None else solved
         self.display.shown.append({o: solved.frames[n] for o, n in zip(OUTPUTS, NAMES, strict=True)})
         matrix = self.calibrated.calibration.camera_to_xyz
         levels = np.full((2, 2), float(BLACK)), np.full((2, 2), float(WHITE))
         picture = develop(self.camera.samples(light, 0.5), RGGB, *levels).image / np.float32(0.5)
-        return compare(picture, target(), matrix, EXPOSURE, solved.reachable).delta_e00_median
+        aim, mask = (target(), solved.reachable) if asked is None else (asked.target, asked.reachable)
+        return compare(picture, aim, matrix, EXPOSURE, mask).delta_e00_median
 
 
 @pytest.fixture
@@ -210,15 +214,21 @@ def test_one_photograph_corrects_the_frames_and_says_what_is_expected(stage: Sta
 
 
 def test_it_corrects_towards_the_adapted_target_and_not_towards_what_was_out_of_reach(stage: Stage) -> None:
-    requested = RequestedTarget(
-        np.asarray(3 * target(), np.float32), np.zeros(CAMERA, np.bool_), np.ones(CAMERA, np.bool_)
-    )
+    reachable = np.zeros(CAMERA, np.bool_)
+    reachable[8:-8, 8:30] = True
+    requested = RequestedTarget(np.asarray(1.3 * target(), np.float32), reachable, np.ones(CAMERA, np.bool_))
     replace(stage.solved, asked=requested).write(stage.calibrated.folder, NAME)
     before = stage.error()
+    of_request = stage.error(asked=requested)
     figures = stage.refine(2)
     assert stage.error() < 0.4 * before, "nearer to the adapted target"
     assert figures["before"] == pytest.approx(before, rel=0.25), "judged by it, too"
     np.testing.assert_array_equal(stage.present().requested.target, requested.target)
+    assert figures["asked_before"] == pytest.approx(of_request, rel=0.1), "what was asked for is told, too"
+    assert figures["asked_after"] == pytest.approx(stage.error(asked=requested), rel=0.1)
+    told = f"{figures['asked_before']:.2f} to {figures['asked_after']:.2f} against what was asked for"
+    assert any(told in line for line in stage.told.said)
+    assert told in refined_row(figures)[0][1]
 
 
 def test_it_stops_when_the_rest_is_noise_and_the_last_frames_were_photographed(stage: Stage) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage
@@ -21,6 +22,7 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_solved
 from controller.stage.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
 from hal.deadline import in_seconds
+from hal.notices import Level
 from lab.timings.tools.synthetic import synthetic_target, write_synthetic_run
 
 CAMERA = (36, 50)
@@ -75,3 +77,26 @@ def test_a_stage_can_be_solved_by_the_paper_s_regions(tmp_path: Path) -> None:
     kkt = float(str(read_solved(tmp_path, "grey", names).figures["kkt"]))
     assert 0 < kkt < 0.05
     assert calibrated.base.solution.converged
+
+
+class Said(Silent):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.lines.append(text)
+
+
+@pytest.mark.parametrize(("colour", "told"), [((1.0, 0.0, 0.0), True), ((0.5, 0.5, 0.5), False)])
+def test_a_target_that_is_mostly_out_of_reach_is_named(
+    tmp_path: Path, colour: tuple[float, float, float], told: bool
+) -> None:
+    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
+    image = np.broadcast_to(np.array(colour, np.float32), (*CAMERA, 3)).copy()
+    request = AppearanceRequest("one", "One", lambda: Target(image, np.ones(CAMERA, np.bool_)), {})
+    said = Said()
+    with Journal(tmp_path) as journal:
+        runner = Runner(solve_steps(Calibrated(tmp_path, names), [request], options_of(SolveTable()), ()), journal,
+                        reporter=said)  # fmt: skip
+        runner.run("appearance", deadline=in_seconds(60))
+    assert any("of the object can be shown as asked for" in line for line in said.lines) is told
