@@ -71,6 +71,11 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "checkerboard", "kind": "checkerboard"},
     {"name": "gloss", "kind": "gloss"},
 )
+IN_OTHER_LIGHT: tuple[dict[str, Any], ...] = (
+    {"name": "evening", "kind": "recolour", "tint": [1.0, 0.62, 0.36]},
+    {"name": "moonlight", "kind": "recolour", "tint": [0.42, 0.60, 1.0]},
+)
+"""Of an object whose shape is not measured: one that is flat, or that one projector lights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +95,10 @@ class DemoStage:
     def built_in(self) -> str | None:
         """The name of a built-in object. A name has no ending and no folder, which the path of a mesh always has."""
         return self.thing if self.thing and re.fullmatch(r"[a-z]+(-[a-z]+)*", self.thing) else None
+
+    @property
+    def appearances(self) -> tuple[dict[str, Any], ...]:
+        return IN_OTHER_LIGHT if self.projectors == 1 or self.built_in not in (None, "statue") else APPEARANCES
 
     @property
     def object_file(self) -> Path | None:
@@ -158,7 +167,7 @@ def _write(stage: Path, asked: DemoStage) -> Mapping[str, Any]:
         **devices,
         "safety": {"power_down_s": POWER_DOWN_S},
         "bundle": {"trusted_keys": [public.hex()]},
-        "appearances": list(APPEARANCES),
+        "appearances": list(asked.appearances),
     }
 
 

@@ -1,9 +1,10 @@
-"""The demo in rooms with real light: its four appearances without and with one photograph, and the troubles it names.
+"""The demo in rooms with real light: its appearances without and with one photograph, and the troubles it names.
 
 Each demo is a whole job through emulated devices, and its figures are those of its report: photographed, against the
 adapted target over what is in reach of it; then against the target as asked. What it names is compared with what
 bench.toml says there is. ``BENCH_ROOMS`` and ``BENCH_SEEDS`` choose some; ``BENCH_FOLDER`` keeps the demos, and
-measures kept ones again.
+measures kept ones again. ``BENCH_OBJECT`` is one of the bench's objects instead of vase and bust, and
+``BENCH_PROJECTORS`` how many projectors light it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import TroubleCode
-from controller.demo import APPEARANCES, DemoStage, demo, prepare
+from controller.demo import DemoStage, demo, prepare
 from controller.run.progress import Silent
 from lab.timings import Row, at_least, at_most
 from plugins.emulated.core.truth import NO_BANDS, BenchTruth, ProjectorTruth, read_truth
@@ -40,20 +41,23 @@ def measure(size: str) -> list[Row]:
     """Run every chosen demo that is not there yet, and judge all of them."""
     rooms = os.environ.get("BENCH_ROOMS", ROOMS).split()
     seeds = os.environ.get("BENCH_SEEDS", SEEDS).split()
+    thing, count = os.environ.get("BENCH_OBJECT"), int(os.environ.get("BENCH_PROJECTORS", "0")) or None
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="velatura-bench-") as temporary:
         folder = Path(os.environ.get("BENCH_FOLDER", temporary))
         for room in rooms:
-            found = [_figures(folder / f"{room}-{size}-{seed}", room, size, int(seed)) for seed in seeds]
+            found = [_figures(folder, DemoStage(size, int(seed), thing, room, count)) for seed in seeds]
             rows += _appearances(room, found)
             rows += _troubles(room, [(read_truth(out / "stage"), figures) for out, figures in found])
     return rows
 
 
-def _figures(out: Path, room: str, size: str, seed: int) -> tuple[Path, dict[str, Any]]:
+def _figures(folder: Path, asked: DemoStage) -> tuple[Path, dict[str, Any]]:
     """The folder of a demo, run now or before, and its report.json."""
+    extra = [str(one) for one in (asked.thing, asked.projectors) if one is not None]
+    out = folder / "-".join((asked.room, asked.size, str(asked.seed), *extra))
     if not (out / "report.json").exists():
-        stage = prepare(out, DemoStage(size, seed, room=room))
+        stage = prepare(out, asked)
         demo(stage, reporter=Silent(), cancel=threading.Event())
     return out, json.loads((out / "report.json").read_bytes())
 
@@ -61,8 +65,8 @@ def _figures(out: Path, room: str, size: str, seed: int) -> tuple[Path, dict[str
 def _appearances(room: str, found: Sequence[tuple[Path, dict[str, Any]]]) -> list[Row]:
     before, after = GOALS.get(room, (None, None))
     rows = []
-    for table in APPEARANCES:
-        each = [next(one for one in figures["appearances"] if one["name"] == table["name"]) for _, figures in found]
+    for appearance in (one["name"] for one in found[0][1]["appearances"]):
+        each = [next(one for one in figures["appearances"] if one["name"] == appearance) for _, figures in found]
         ways = (
             ("no photograph", [one["refined"]["photographs"][0] for one in each], before),
             ("one photograph", [one["adapted"] for one in each], after),
@@ -72,7 +76,7 @@ def _appearances(room: str, found: Sequence[tuple[Path, dict[str, Any]]]) -> lis
         for way, values, goals in ways:
             for n, key in enumerate(("delta_e00_median", "delta_e00_p95")):
                 seen = [one[key] for one in values]
-                name = f"{room}, {table['name']}, {way}, {('median', '95 %')[n]}"
+                name = f"{room}, {appearance}, {way}, {('median', '95 %')[n]}"
                 how = "by seed " + ", ".join(f"{value:.2f}" for value in seen)
                 rows.append(at_most(name, max(seen), None if goals is None else goals[n], unit="CIEDE2000", how=how))
     return rows

@@ -148,7 +148,9 @@ def test_a_bare_word_is_a_built_in_object_and_all_else_a_mesh(bench: ModelBench,
     """Even where a file of that name lies: no mesh can be read without its ending."""
     stage = prepared(tmp_path / "out", thing="painting", projectors=2)
     assert bench.settings == [{"room": DEFAULT_ROOM, "object": "painting", "projectors": 2}]
-    assert tomllib.loads((stage / "stage.toml").read_text())["stage"]["name"] == "demo small painting"
+    tables = load_stage(stage).tables
+    assert tables.stage.name == "demo small painting"
+    assert [one.kind for one in tables.appearances] == ["recolour", "recolour"]
     assert prepared(tmp_path / "out", thing="painting", projectors=2) == stage
     with pytest.raises(UsageError):
         prepared(tmp_path / "out", thing="statue", projectors=2)
