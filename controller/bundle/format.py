@@ -111,6 +111,12 @@ def tiled(name: str, width_px: int, height_px: int, *, narrow: bool) -> OutputLa
     return OutputLayout(name, width_px, height_px, -(-width_px // across), -(-height_px // bands))
 
 
+def lowest_version(layouts: Iterable[OutputLayout], codec: str) -> int:
+    """The version to write, so that players before version 3 read what they can show: images that need no tiles."""
+    stripes = codec == CODECS[0] and all(layout.tile_width_px == layout.width_px for layout in layouts)
+    return TILED_FROM - 1 if stripes else VERSION
+
+
 @dataclass(frozen=True, slots=True)
 class BundledAppearance:
     """One appearance: the bands of each output's image from top to bottom, a PNG thumbnail, free metadata (JSON)."""

@@ -39,16 +39,18 @@ from controller.bundle.format import (
     band_bound,
     compressed_bound,
     damaged,
+    lowest_version,
     valid_name,
 )
 from controller.core.errors import BundleError
 
 
 def encode_index(index: Index) -> bytes:
-    """The index, in the newest version, as canonical JSON: UTF-8, keys sorted, no spaces.
+    """The index, in the lowest version that can hold it, as canonical JSON: UTF-8, keys sorted, no spaces.
 
     Raises BundleError("bundle-metadata").
     """
+    tiled = lowest_version(index.outputs, index.codec) >= TILED_FROM
     document = {
         "stage": index.stage,
         "calibration": index.calibration,
@@ -59,21 +61,23 @@ def encode_index(index: Index) -> bytes:
                 "name": o.name,
                 "width_px": o.width_px,
                 "height_px": o.height_px,
-                "tile_width_px": o.tile_width_px,
-                "tile_height_px": o.tile_height_px,
+                **({"tile_width_px": o.tile_width_px} if tiled else {}),
+                "tile_height_px" if tiled else "stripe_rows": o.tile_height_px,
             }
             for o in index.outputs
         ],
         "appearances": [
             {
                 "name": a.name,
-                "bands": {name: [_packed(blob) for blob in blobs] for name, blobs in a.bands.items()},
+                "bands" if tiled else "stripes": {
+                    name: [_packed(blob) for blob in blobs] for name, blobs in a.bands.items()
+                },
                 "thumbnail": None if a.thumbnail is None else _packed(a.thumbnail),
                 "metadata": dict(a.metadata),
             }
             for a in index.appearances
         ],
-        "codec": index.codec,
+        **({"codec": index.codec} if tiled else {}),
         "schedule": [[hint.appearance, hint.duration_ms, hint.fade_ms] for hint in index.schedule],
         "live": None if index.live is None else _live_document(index.live),
     }

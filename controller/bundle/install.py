@@ -119,7 +119,12 @@ def current(folder: Path) -> Path | None:
 
 def previous(folder: Path) -> Path | None:
     """The file of the bundle to go back to, or None."""
-    return _target(folder, PREVIOUS)
+    now, before = current(folder), _target(folder, PREVIOUS)
+    if before is None or before != now:
+        return before
+    # Both links are of one bundle: a switch was cut off between them. A bundle that came since is the newest file.
+    others = [file for file in folder.glob("*.vel") if file != now and _target(folder, file=file.name)]
+    return min(others, key=lambda file: file.stat().st_mtime_ns, default=None)
 
 
 def revision_floor(folder: Path, trust: Trust) -> int:
@@ -170,17 +175,18 @@ def _switch(folder: Path, target: Path) -> None:
         if before is not None:
             _link(folder, PREVIOUS, before)
         _link(folder, CURRENT, target)
-    keep = {target, _target(folder, PREVIOUS)}
+    keep = {target, previous(folder)}
     for file in folder.iterdir():
         if _INSTALLED.fullmatch(file.name) and file not in keep:
             file.unlink()
     sync_folder(folder)
 
 
-def _target(folder: Path, link: str) -> Path | None:
+def _target(folder: Path, link: str = "", *, file: str = "") -> Path | None:
+    """The installed file that a link leads to, or that has this name; None if it is none."""
     # By the names alone: a kiosk asks this several times at each of its steps.
     try:
-        name = os.readlink(f"{folder}/{link}")  # noqa: PTH115
+        name = file or os.readlink(f"{folder}/{link}")  # noqa: PTH115
     except OSError:
         return None
     sound = _INSTALLED.fullmatch(name) and os.path.isfile(f"{folder}/{name}")  # noqa: PTH113

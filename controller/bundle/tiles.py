@@ -49,8 +49,8 @@ def pack_tile(tile: npt.NDArray[np.uint8], pack: Callable[[bytes], bytes]) -> by
     return pack(delta.tobytes())
 
 
-def pack_bands(image: npt.NDArray[np.uint8], layout: fmt.OutputLayout, codec: str) -> Iterator[bytes]:
-    """The bands of an image (rows, columns, 3) uint8, from the top."""
+def pack_bands(image: npt.NDArray[np.uint8], layout: fmt.OutputLayout, codec: str, version: int) -> Iterator[bytes]:
+    """The bands of an image (rows, columns, 3) uint8, from the top; without tables before version 3."""
     pack = packer(codec)
     for band in np.split(image, np.cumsum(layout.band_heights)[:-1]):
         tiles = np.split(band, np.cumsum(layout.tile_widths)[:-1], axis=1)
@@ -58,7 +58,7 @@ def pack_bands(image: npt.NDArray[np.uint8], layout: fmt.OutputLayout, codec: st
         table = np.zeros(len(tiles), fmt.TILE_ENTRY)
         table["length"] = [len(data) for data in packed]
         table["content"] = [xxhash.xxh3_64_intdigest(np.ascontiguousarray(tile).data) for tile in tiles]
-        yield table.tobytes() + b"".join(packed)
+        yield (table.tobytes() if version >= fmt.TILED_FROM else b"") + b"".join(packed)
 
 
 class Inflater:

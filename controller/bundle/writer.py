@@ -168,9 +168,9 @@ class _Blobs:
 
 def _finish(blobs: _Blobs, index: fmt.Index, key: SigningKey | None) -> None:
     file, end = blobs.file, blobs.align()
-    data = encode_index(index)
+    data, version = encode_index(index), fmt.lowest_version(index.outputs, index.codec)
     try:
-        parse_index(data, data_end=end)
+        parse_index(data, data_end=end, version=version)
     except BundleError as error:
         raise BundleError(
             "bundle-not-writable",
@@ -178,7 +178,7 @@ def _finish(blobs: _Blobs, index: fmt.Index, key: SigningKey | None) -> None:
             remedy="Change the name or size that is not allowed; docs/reference/bundle-format.md lists the limits.",
         ) from error
     size = end + len(data) + BLOCK_BYTES
-    header = fmt.pack_header(fmt.Header(end, len(data), size, hashlib.sha256(data).digest()))
+    header = fmt.pack_header(fmt.Header(end, len(data), size, hashlib.sha256(data).digest(), version))
     file.write(data)
     file.write(UNSIGNED_BLOCK if key is None else sign(header, data, key))
     file.seek(0)
@@ -247,9 +247,10 @@ def _choose_codec(layouts: Sequence[fmt.OutputLayout], frames: Mapping[str, npt.
 
 
 def _write_appearance(blobs: _Blobs, packing: Packing, appearance: NewAppearance) -> fmt.BundledAppearance:
+    version = fmt.lowest_version(packing.layouts, packing.codec)
     bands = {
         layout.name: tuple(
-            blobs.write(band) for band in pack_bands(appearance.frames[layout.name], layout, packing.codec)
+            blobs.write(band) for band in pack_bands(appearance.frames[layout.name], layout, packing.codec, version)
         )
         for layout in packing.layouts
     }

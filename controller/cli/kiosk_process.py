@@ -36,6 +36,7 @@ from hal.links import host_and_port
 from hal.notices import Level
 
 RETRY_S: Final = 5.0
+_NO_STAGE: Final = "There is no stage yet. Set it up in the panel."
 PORT: Final = 8377
 
 
@@ -119,7 +120,7 @@ def serve(
                 if first and not setup:
                     raise
                 missing = not (stage / FILE).exists()
-                before, reported = reported, f"{error.what} {error.remedy}"
+                before, reported = reported, _NO_STAGE if missing else f"{error.what} {error.remedy}"
                 kiosk.attach(None, "" if missing else reported)
                 if reported != before:  # it is tried again every few seconds
                     # A new kiosk without a stage is no error.

@@ -15,6 +15,15 @@ EXPOSED_TENTHS = 30
 """Of systemd's measure of what a service could do; 100 is everything."""
 
 
+def test_the_journal_of_a_first_start_has_no_warning_and_says_what_to_do(bare: Kiosk) -> None:
+    read = ("journalctl", "--boot", "--no-pager", "--output=cat", "--unit=velatura*")
+    assert bare.machine.call(*read, "--priority=warning") == ""
+    # Xorg explains its own marks with the words that are looked for.
+    told = bare.machine.call(*read, *(f"--identifier={one}" for one in ("sh", "systemd", "python", "velatura")))
+    assert not re.search("(?i)error|warning|fail|does not exist|prepare-only", told)
+    assert "There is no stage yet. Set it up in the panel." in told
+
+
 def test_without_a_stage_the_projectors_show_the_way_to_the_panel(bare: Kiosk) -> None:
     address = bare.read_code()
     assert address == f"https://{ADDRESS}:8377/"

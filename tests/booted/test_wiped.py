@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.booted.kiosk import Kiosk
-from tests.booted.machine import STAGE
+from tests.booted.machine import STAGE, Machine
 
 RESTORED_S = 900.0
 """From a blank Debian with the package to the picture of a backup."""
@@ -32,6 +32,24 @@ def lit(screen: npt.NDArray[np.uint8] | None) -> bool:
     return screen is not None and bool(screen.any())
 
 
+INCOMPLETE = """
+mkdir /opt/unpacked
+cd /opt/unpacked
+tar xzf /opt/velatura-20260504.tar.gz
+rm backup-files/cues.csv
+tar czf /opt/incomplete.tar.gz velatura-backup.json $(ls | grep -v velatura-backup.json)
+"""
+
+
+def refer_to_other_folders(machine: Machine) -> None:
+    """Give the stage files that lie outside of its folder, and that no restored computer has."""
+    machine.write(Path("/srv/far.png"), "a picture")
+    machine.write(Path("/srv/cues.csv"), "time,verb,values\n")
+    machine.write(STAGE / "building.toml", '[cues]\nfile = "/srv/cues.csv"\n')
+    with machine.at(STAGE / "stage.toml").open("a") as settings:
+        settings.write('\n[[appearances]]\nname = "far"\nkind = "picture"\nfile = "/srv/far.png"\n')
+
+
 def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playing: Kiosk) -> None:
     machine = playing.machine
     began_s = time.monotonic()
@@ -40,11 +58,18 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     machine.call(
         "sh", "-c", f"mkdir /opt/devices && cp -a {STAGE}/bench* /opt/devices && mkfifo /opt/answer && touch /opt/told"
     )
+    refer_to_other_folders(machine)
     machine.call("/opt/velatura/bin/velatura", "kiosk", "backup", STAGE)
     machine.call("sh", "-c", f"mv $(ls -t {STAGE}/kiosk/archives/backup-* | head -n 1) /opt/velatura-20260504.tar.gz")
+    machine.call("sh", "-ec", INCOMPLETE)
     machine.call("/opt/velatura/bin/velatura", "kiosk", "uninstall", "--purge")
+    machine.call("rm", "-r", "/srv", "/opt/unpacked")
     assert not machine.at(STAGE).exists()
     assert machine.called("getent", "passwd", "velatura").returncode != 0
+    refused = machine.called("/opt/velatura/bin/velatura", "kiosk", "install", "--backup", "/opt/incomplete.tar.gz")
+    assert refused.returncode != 0
+    assert "The backup is not complete: building.toml names backup-files/cues.csv" in refused.stdout + refused.stderr
+    assert machine.called("getent", "passwd", "velatura").returncode != 0, "nothing was done"
     command = "/opt/velatura/bin/velatura kiosk install --backup /opt/velatura-20260504.tar.gz "
     command += "< /opt/answer > /opt/told 2>&1"
     with ThreadPoolExecutor(1) as pool:
@@ -71,3 +96,4 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
         machine.wait_for(playing.shows)
     # where this Debian was calibrated, `board` plays into the file that the bench's camera sees, not on X
     assert time.monotonic() - began_s < RESTORED_S
+    assert (machine.at(STAGE) / "backup-files/far.png").read_text() == "a picture"

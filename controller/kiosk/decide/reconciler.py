@@ -115,7 +115,7 @@ class ContentSelector:
 
 _EMPTY: Final = Notice(
     "nothing-installed", "The stage should be open, but no bundle is installed.",
-    "Calibrate the stage and compute appearances. The lamps stay off until then.", Level.ERROR,
+    "Calibrate the stage and compute appearances. The lamps stay off until then.", Level.WARNING,
 )  # fmt: skip
 
 

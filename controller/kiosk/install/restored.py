@@ -54,12 +54,12 @@ def restore(
 
     Raises UsageError("kiosk-has-stage", "not-a-backup"), WorkError("outputs-not-named"), and as ``steps.install``.
     """
+    for cut_off in system.at(STATE).glob(f"{_UNPACKED}*"):
+        shutil.rmtree(cut_off, ignore_errors=True)
     if system.read(STAGE / FILE) is not None:
         raise UsageError("kiosk-has-stage", what="This kiosk has a stage already.",
                          remedy=f"Replace it: runuser -u {USER} -- velatura kiosk restore {STAGE} FILE")  # fmt: skip
     archive.check_backup(file)
-    for cut_off in system.at(STATE).glob(f"{_UNPACKED}*"):
-        shutil.rmtree(cut_off, ignore_errors=True)
     steps.install(system, outputs_again=True, restart=False, say=say, prefix=prefix)
     if system.dry:
         say("Then the projectors are found by their serial numbers, or asked for, and the backup is put in place.")
@@ -84,12 +84,12 @@ def restore(
         steps.write_outputs(system, placed(there, sizes.pop() if len(sizes) == 1 else None))
         system.run("chown", "--recursive", _OWNER, str(STAGE))
         os.sync()
-        # Last: with it the stage is there.
+        system.run("systemctl", "start", _CONTROLLER)
+        # Last: with it the stage is there, and begins.
         system.write(STAGE / FILE, text, owner=_OWNER)
     for one in references(system.at(STAGE)):
         if one.holds is Holds.KEY_FILE and one.missing:
             say(f"{one.missing} It holds a secret, so it is in no backup: copy it there.")
-    system.run("systemctl", "start", _CONTROLLER)
 
 
 def _put(part: Path, place: Path) -> None:

@@ -23,6 +23,8 @@ CONFIGURATION: Final = Path("/etc/velatura")
 CERTIFICATE: Final = CONFIGURATION / "panel.crt"
 KEY: Final = CONFIGURATION / "panel.key"
 CONTROLLER_OPTIONS: Final = CONFIGURATION / "controller.env"
+UNFINISHED: Final = CONFIGURATION / ".installing"
+"""There from the first change to the last: an installation that was cut off is done again, with all that follows."""
 X_OUTPUTS: Final = Path("/etc/X11/xorg.conf.d/20-velatura-outputs.conf")
 COMMAND: Final = Path("/usr/local/bin/velatura")
 SHIPPED_PREFIX: Final = "/opt/velatura"
@@ -86,19 +88,24 @@ def install(
     WorkError("kiosk-step-failed").
     """
     check(system, prefix)
+    system.folder(CONFIGURATION)
+    mark = system.at(UNFINISHED)
+    cut_off = mark.exists()
+    if not system.dry:
+        mark.touch()
     _packages(system)
     _user(system)
-    changed = [system.write(path, text) for path, text in shipped(prefix).items()]
+    changed = [cut_off, *(system.write(path, text) for path, text in shipped(prefix).items())]
     _folders(system)
     if not os.path.lexists(system.at(COMMAND)):
         system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(COMMAND))
-    _panel(system)
+    _panel(system, cut_off=cut_off)
     if any(changed):
         system.run("systemctl", "daemon-reload")
         system.run("udevadm", "control", "--reload", may_fail=True)
         system.run("udevadm", "trigger", may_fail=True)
     system.run("systemctl", "enable", "--quiet", TARGET)
-    system.run("systemctl", "start", "velatura-x11")
+    system.run("systemctl", "restart" if cut_off else "start", "velatura-x11")
     _outputs(system, again=outputs_again, say=say)
     if restart or any(changed):
         # In this order the player stops only once the controller has, and starts at once, before the controller. In the
@@ -108,6 +115,7 @@ def install(
     system.run("systemctl", "start", TARGET, may_fail=restart)
     if not system.dry:
         _first_login(system, say)
+        mark.unlink()
 
 
 def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -> None:
@@ -161,6 +169,7 @@ def _packages(system: System) -> None:
     # Debian 13 calls some libraries with 64-bit times by another name, and provides the old one.
     missing = [name for name in wanted if name not in there and f"{name}t64" not in there]
     if missing:
+        system.run("dpkg", "--configure", "--pending")
         system.run("apt-get", "update", "--quiet")
         system.run("apt-get", "install", "--yes", "--no-install-recommends", *missing)
 
@@ -179,7 +188,6 @@ def _user(system: System) -> None:
 
 def _folders(system: System) -> None:
     owner = f"{USER}:{USER}"
-    system.folder(CONFIGURATION)
     system.folder(STATE, mode=0o750, owner=owner)
     system.folder(STAGE, mode=0o750, owner=owner)
     # The example of docs/how-to/run-a-kiosk.md.
@@ -188,15 +196,17 @@ def _folders(system: System) -> None:
         system.run("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/velatura.conf")
 
 
-def _panel(system: System) -> None:
+def _panel(system: System, *, cut_off: bool) -> None:
     host = (system.look("hostname") or system.read(Path("/etc/hostname")) or "velatura").strip()
-    if system.read(KEY) is None:
+    fresh = system.read(KEY) is None or (cut_off and system.read(CERTIFICATE) is None)
+    if fresh:
         names = f"subjectAltName=DNS:{host},DNS:{host}.local"
         system.run(
             "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
             "-days", "7300", "-subj", f"/CN={host}", "-addext", names,
             "-keyout", str(KEY), "-out", str(CERTIFICATE),
         )  # fmt: skip
+    if fresh or cut_off:
         system.run("chown", f"root:{USER}", str(KEY))
         system.run("chmod", "0640", str(KEY))
     if system.read(CONTROLLER_OPTIONS) is None:
@@ -228,13 +238,15 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
         say("No projector is plugged in and switched on. Type `velatura kiosk install --outputs` once they are.")
     else:
         say("Projectors: " + ", ".join(f"{one.name} with {one.mode.name}" for one in found) + ".")
-        write_outputs(system, found)
     # A stage has outputs of its own, which the service writes there.
     if system.read(STAGE / "stage.toml") is None:
         settings = PlayerSettings(player_outputs(found) or NO_OUTPUTS, None, bundle=STAGE / "bundles" / "current")
         text = "".join(f"{word}\n" for word in settings.arguments())
         if system.write(PLAYER_OPTIONS, text, mode=0o600, owner=f"{USER}:{USER}"):
             system.run("systemctl", "try-restart", "velatura-player")
+    if found:
+        # Last: where they are, all this was done.
+        write_outputs(system, found)
 
 
 def _first_login(system: System, say: Callable[[str], None]) -> None:

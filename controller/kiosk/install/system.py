@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from controller.core.errors import WorkError
-from controller.core.storage import write_atomically
+from controller.core.storage import sync_folder, write_atomically
 
 
 class System:
@@ -35,17 +35,22 @@ class System:
             return False
         self._tell(f"write {path}")
         if not self.dry:
-            write_atomically(self.at(path), text.encode(), mode=mode)
-            self._own(path, owner)
+            new = self.at(path).with_name(f".{path.name}.new")
+            write_atomically(new, text.encode(), mode=mode)
+            self._own(new, owner)
+            new.replace(self.at(path))
+            sync_folder(new.parent)
         return True
 
     def folder(self, path: Path, *, mode: int = 0o755, owner: str = "root:root") -> None:
         if not self.at(path).is_dir():
             self._tell(f"make folder {path}")
             if not self.dry:
-                self.at(path).mkdir(parents=True)
-                self.at(path).chmod(mode)
-                self._own(path, owner)
+                new = self.at(path).with_name(f".{path.name}.new")
+                new.mkdir(parents=True, exist_ok=True)
+                new.chmod(mode)
+                self._own(new, owner)
+                new.rename(self.at(path))
 
     def remove(self, path: Path) -> None:
         """A file, or a folder with everything in it."""
@@ -90,8 +95,8 @@ class System:
                 remedy="Correct the cause, and type the same command again: it continues from there.",
             )
 
-    def _own(self, path: Path, owner: str) -> None:
+    def _own(self, place: Path, owner: str) -> None:
         user, _, group = owner.partition(":")
         # Below another root there are no such users.
         if self._root == Path("/"):
-            shutil.chown(self.at(path), user, group)
+            shutil.chown(place, user, group)

@@ -31,7 +31,7 @@ from controller.core.files import read_text
 from controller.core.storage import sync_folder
 from controller.core.text import printable
 from controller.kiosk.outputs import outputs_of_x
-from controller.kiosk.store.references import BUILDING, OWN, Reference, building, references
+from controller.kiosk.store.references import BUILDING, OWN, Reference, building, linked, references
 from controller.kiosk.store.runs import began_s
 from controller.kiosk.store.settings import checked_settings
 from controller.kiosk.store.unpacking import DAMAGED, not_ours, read_first, unpack
@@ -75,11 +75,11 @@ def backup(stage: Path, *, photographs: bool = False) -> Path:
     WorkError("cannot-write").
     """
     runs = finished_calibrations(stage)[:1]
-    changed, named = _named(stage, references(stage))
+    changed, named, lacks = _named(stage, references(stage))
     # On another computer the connectors have other names; the displays have not.
     displays = {one.name: one.serials for one in outputs_of_x()}
     mark = {"velatura": _VERSION, "made_unix_s": time.time(), "run": runs[0].name if runs else "", "displays": displays,
-            "missing": missing(stage)}  # fmt: skip
+            "missing": lacks}  # fmt: skip
     parts = [stage / name for name in (*_FILES, *_FOLDERS) if (stage / name).exists() and name not in changed]
     files = {name: path for part in [*parts, *runs] for name, path in _below(part, str(part.relative_to(stage)))}
 
@@ -95,14 +95,15 @@ def backup(stage: Path, *, photographs: bool = False) -> Path:
 
 
 def missing(stage: Path) -> list[str]:
-    """A sentence for each file that the stage reads, and that does not exist."""
-    return [one.missing for one in references(stage) if one.holds is Holds.FILE and one.missing]
+    """A sentence for each file that the stage reads, and that does not exist or that no backup can hold."""
+    return _named(stage, references(stage))[2]
 
 
-def _named(stage: Path, found: Sequence[Reference]) -> tuple[dict[str, bytes], dict[str, Path]]:
-    """The settings that had to be changed, by file, and the named files by their names in the backup."""
+def _named(stage: Path, found: Sequence[Reference]) -> tuple[dict[str, bytes], dict[str, Path], list[str]]:
+    """The settings that had to be changed, by file; the named files by their names in the backup; what it lacks."""
     named: dict[str, Path] = {}
     changes = defaultdict[str, list[KeyChange]](list)
+    lacks = [one.missing for one in found if one.holds is Holds.FILE and one.missing]
     for one in found:
         if one.holds is not Holds.FILE or one.missing:
             continue
@@ -112,7 +113,17 @@ def _named(stage: Path, found: Sequence[Reference]) -> tuple[dict[str, bytes], d
             name = name or _free_name(stage, one.place, named)
             changes[one.file].append(KeyChange(one.path[:-1], str(one.path[-1]), name))
         named[name] = one.place
-    return {file: edited(read_text(stage / file), rows).encode() for file, rows in changes.items()}, named
+        for link in linked(one.place):
+            inner = _own_name(stage, link) if _own_name(stage, one.place) else _beside(name, one.place, link)
+            if inner is None or named.setdefault(inner, link) != link:
+                lacks.append(f"The scene {one.text} links to {link}, outside of its folder. Pack it into the scene.")
+    return {file: edited(read_text(stage / file), rows).encode() for file, rows in changes.items()}, named, lacks
+
+
+def _beside(name: str, scene: Path, link: Path) -> str | None:
+    """The name of a file below the folder of a scene that is called ``name`` in the backup; None for any other."""
+    inner = _own_name(scene.parent, link)
+    return None if inner is None else str(Path(name).parent / inner)
 
 
 def _own_name(stage: Path, place: Path) -> str | None:
@@ -205,6 +216,7 @@ def _unpack(file: Path, fresh: Path) -> None:
     checked_settings(fresh)
     found = [one for one in references(fresh) if one.holds is Holds.FILE]
     allowed = {fresh / name for name in (MARK, *_FILES)} | {one.place for one in found}
+    allowed |= {link for one in found for link in linked(one.place)}
     for top in fresh.iterdir():
         for path in () if top.name in (*_FOLDERS, _RUNS) else (top, *top.rglob("*")):
             if not path.is_dir() and (path not in allowed or (top.name in OWN and top.name not in _FILES)):

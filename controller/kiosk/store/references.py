@@ -1,14 +1,20 @@
-"""The files that stage.toml and building.toml name, wherever they are: what a backup has to hold in addition."""
+"""The files that stage.toml, building.toml and scenes of Blender name: what a backup has to hold in addition."""
 
 from __future__ import annotations
 
 import contextlib
+import gzip
+import itertools
 import os
+import re
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
+
+import zstandard
 
 from controller.config import load_stage
 from controller.config.loader import FILE
@@ -26,6 +32,12 @@ OWN: Final = frozenset({
 """What Velatura itself keeps in a stage's folder (docs/architecture.md): no file with such a name comes with a backup
 because stage.toml names it. ``bench`` is not among them: an emulated stage names profiles there, and they stay there.
 """
+
+_LINK: Final = re.compile(rb"(//[^\0]{1,1021}|(?<=\0)/[^\0]{1,1022})\0")
+"""A path in a scene, which Blender keeps as a text that ends with a zero; // at its start is the scene's folder."""
+_AT_ONCE, _MOST_PARTS = 1 << 24, 256
+_OPENERS: Final = {b"\x28\xb5\x2f\xfd": zstandard.open, b"\x1f\x8b\x08\x00": gzip.open}
+"""How newer and older Blenders compress a scene, by its first bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +73,31 @@ def references(stage: Path) -> list[Reference]:
         elif holds is not None:
             found.append(Reference(file, path, text, place, holds))
     return found
+
+
+def linked(scene: Path) -> set[Path]:
+    """The files that a scene of Blender links to, as textures, and those of its libraries; none for another file."""
+    found, new = set[Path](), {scene}
+    while new:
+        links = {link for one in new if one.suffix == ".blend" for link in _links(one)}
+        new = links - found - {scene}
+        found |= new
+    return found
+
+
+def _links(scene: Path) -> Iterator[Path]:
+    """Without Blender, so its data are only searched for paths of files that are there."""
+    with contextlib.suppress(OSError, EOFError, zstandard.ZstdError):
+        with scene.open("rb") as file:
+            opened: Any = _OPENERS.get(file.read(4), open)
+        with opened(scene, "rb") as content:
+            before = b""
+            for data in itertools.islice(iter(partial(content.read, _AT_ONCE), b""), _MOST_PARTS):
+                for text in {os.fsdecode(match[1]).replace("\\", "/") for match in _LINK.finditer(before + data)}:
+                    place = scene.parent / text[2:] if text.startswith("//") else Path(text)
+                    if _is_file(place):
+                        yield Path(os.path.normpath(place))
+                before = data[-1025:]
 
 
 _Text: TypeAlias = tuple[str, tuple[KeyPath, str, Holds | None]]

@@ -163,7 +163,7 @@ def test_schedule_and_live_section_are_told_and_compared(tmp_path: Path) -> None
 
     with bundle("1.vel", 250, 1) as one, bundle("2.vel", 500, 1) as other, bundle("3.vel", 250, 2) as third:
         found = describe(one)
-        assert (found["version"], found["schedule"]) == (3, [["a", 5000, 250]])
+        assert (found["version"], found["schedule"]) == (2, [["a", 5000, 250]])
         assert found["live"]["target_px"] == [7, 6]
         assert "a for 5 s, fade 0.25 s" in as_text(found)
         assert "targets of 7x6" in as_text(found)

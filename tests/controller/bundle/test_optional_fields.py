@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 from nacl.signing import SigningKey
 
+from controller.bundle.format import OutputLayout
 from controller.bundle.index import parse_index
 from controller.bundle.reader import Bundle
-from controller.bundle.writer import NewAppearance
+from controller.bundle.writer import NewAppearance, NewBundle, Packing, write_bundle
 from controller.core.errors import BundleError
-from tests.controller.bundle.conftest import write
+from tests.controller.bundle.conftest import OUTPUTS
 
 TABLES_0_2_0 = {
     "index": {
@@ -67,22 +68,32 @@ def test_images_of_an_output_that_is_not_listed_are_refused() -> None:
         parse_index(json.dumps(index).encode(), data_end=8192)
 
 
-def test_what_is_written_has_the_keys_of_0_2_0_and_metadata_is_signed(
-    tmp_path: Path, appearances: list[NewAppearance], key: SigningKey
+STRIPES = {
+    "index": TABLES_0_2_0["index"] - {"codec"},
+    "outputs": {"name", "width_px", "height_px", "stripe_rows"},
+    "appearances": {"name", "stripes", "thumbnail", "metadata"},
+}
+"""Those of version 2, the only one that players before 0.2.0 read; they refuse any other, too."""
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_is_written_has_the_keys_of_the_oldest_player_that_can_show_it_and_metadata_is_signed(
+    tmp_path: Path, appearances: list[NewAppearance], key: SigningKey, version: int
 ) -> None:
     later: dict[str, Any] = {"later": {"any": [1, None]}}
     added = [NewAppearance(one.name, one.frames, one.thumbnail, {**one.metadata, **later}) for one in appearances]
-    file = write(tmp_path / "later.vel", added, key)
+    packing = Packing(tuple(OutputLayout(name, w, h, w, h) for name, w, h in OUTPUTS), ("zstd", "lz4")[version - 2])
+    file = tmp_path / "later.vel"
+    write_bundle(file, NewBundle("demo", "run-1", 0, OUTPUTS), added, key=key, packing=packing)
     with Bundle.open(file, trusted=[bytes(key.verify_key)]) as bundle:
+        assert bundle.version == version
         assert bundle.index.appearances[0].metadata["later"] == later["later"]
     data = file.read_bytes()
     offset, length = (int.from_bytes(data[at : at + 8], "little") for at in (16, 24))
-    index = json.loads(data[offset : offset + length])
-    assert index.keys() == TABLES_0_2_0["index"], (
-        "players of 0.2.0 would refuse this: CONTRIBUTING, 'A field of a bundle'"
-    )
+    index, tables = json.loads(data[offset : offset + length]), TABLES_0_2_0 if version == 3 else STRIPES
+    assert index.keys() == tables["index"], "older players would refuse this: CONTRIBUTING, 'A field of a bundle'"
     for table in ("outputs", "appearances"):
-        assert all(row.keys() == TABLES_0_2_0[table] for row in index[table])
+        assert all(row.keys() == tables[table] for row in index[table])
     at = data.index(b'"later"')
     file.write_bytes(data[:at] + b'"lates"' + data[at + 7 :])
     with pytest.raises(BundleError):

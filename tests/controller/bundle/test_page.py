@@ -16,8 +16,8 @@ import zstandard
 from nacl.exceptions import BadSignatureError
 from nacl.signing import SigningKey
 
-from controller.bundle.format import PlaylistEntry
-from controller.bundle.writer import NewAppearance, NewBundle, NewLive, write_bundle
+from controller.bundle.format import OutputLayout, PlaylistEntry
+from controller.bundle.writer import NewAppearance, NewBundle, NewLive, Packing, write_bundle
 from tests.controller.bundle.conftest import OUTPUTS, PNG
 from tests.controller.bundle.test_round_trip import documented_reader
 
@@ -39,7 +39,8 @@ def full(tmp_path: Path, appearances: list[NewAppearance], key: SigningKey) -> P
         schedule=[PlaylistEntry("ramp", 9000, 250)],
         live=NewLive((5, 7), arrays),
     )
-    write_bundle(tmp_path / "full.vel", new, appearances, key=key)
+    tiles = Packing(tuple(OutputLayout(name, w, h, w // 2, h // 2) for name, w, h in OUTPUTS), "zstd")
+    write_bundle(tmp_path / "full.vel", new, appearances, key=key, packing=tiles)
     return tmp_path / "full.vel"
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.bundle.install import CountedStart, Starts, current, install
+from controller.bundle.install import CountedStart, Starts, current, install, previous, rollback
+from controller.bundle.reader import Bundle
 from tests.controller.bundle.power_cuts import every_cut
 from tests.controller.bundle.test_install import made, plays
 
@@ -22,6 +23,12 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(os, "fsync", lambda handle: None)
     with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as folder:
         yield Path(folder)
+
+
+def shows(file: Path | None) -> int:
+    assert file is not None
+    with Bundle.open(file, allow_unsigned=True) as bundle:
+        return int(bundle.decode("a", "P1")[0, 0, 0])
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -51,6 +58,29 @@ def test_after_a_cut_of_an_installation_the_old_or_the_new_bundle_plays(disk: Pa
         shutil.rmtree(folder)
     assert seen.keys() == {None if first else 2, 3}, "neither a third bundle nor none where there was one"
     assert sum(seen.values()) > (400 if first else 1000)
+
+
+@pytest.mark.parametrize("rolls_back", [False, True])
+def test_after_a_cut_at_any_step_both_bundles_of_before_or_both_of_after_are_there(
+    disk: Path, rolls_back: bool
+) -> None:
+    files = [made(disk / f"{value}.vel", value) for value in (1, 2, 3)]
+
+    def begin(folder: Path) -> None:
+        for file in files[:2]:
+            install(file, folder, allow_unsigned=True)
+
+    def work(folder: Path) -> None:
+        _ = rollback(folder) if rolls_back else install(files[2], folder, allow_unsigned=True)
+
+    seen = set()
+    for folder in every_cut(disk, begin, work, outcomes=8):
+        pair = plays(folder), shows(previous(folder))
+        rollback(folder)
+        assert (plays(folder), shows(previous(folder))) == pair[::-1]
+        seen.add(pair)
+        shutil.rmtree(folder)
+    assert seen == ({(2, 1), (1, 2)} if rolls_back else {(2, 1), (3, 2)})
 
 
 def test_the_simulated_disk_punishes_a_forgotten_sync(disk: Path) -> None:

@@ -176,6 +176,15 @@ def test_older_bundles_are_decoded_exactly_by_both_readers(tmp_path: Path, pictu
                 np.testing.assert_array_equal(reader["read_image"](data, index, name, output), frame)
 
 
+def test_images_that_need_no_tiles_are_written_for_a_reader_that_knows_none(unsigned: Path, pictures: Pictures) -> None:
+    data, reader = unsigned.read_bytes(), documented_reader()
+    assert data[8:12] == bytes((2, 0, 0, 0))
+    index = json.loads(data[-128 - index_length(data) : -128])
+    for name, frames in pictures.items():
+        for output, frame in frames.items():
+            np.testing.assert_array_equal(reader["read_image"](data, index, name, output), frame)
+
+
 def test_the_codec_and_the_tiles_are_chosen_by_what_the_pictures_are() -> None:
     random = np.random.default_rng(8)
     size = ("P1", 4096, 2800)

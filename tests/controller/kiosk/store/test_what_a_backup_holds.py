@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 import shutil
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import zstandard
 from pydantic import BaseModel
 
 from controller.config import load_stage
@@ -112,6 +114,38 @@ def test_a_file_behind_every_field_comes_back(stage: Path, tmp_path: Path, where
     if where == "stage":
         assert (other / "stage.toml").read_text() == text
         assert (other / "pictures/clouds.png").exists()
+
+
+def scene_of(place: Path, *links: str, pack: Callable[[bytes], bytes] = bytes) -> Path:
+    """A file with these texts where Blender has the paths of pictures and libraries."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    texts = b"".join(b"IM\0\0" + link.encode().ljust(1024, b"\0") for link in links)
+    place.write_bytes(pack(b"BLENDER-v405" + texts + b"ENDB"))
+    return place
+
+
+@pytest.mark.parametrize("where", ["stage", "outside"])
+@pytest.mark.parametrize("pack", [bytes, zstandard.compress, gzip.compress])
+def test_the_textures_of_a_scene_come_with_it_and_its_libraries_and_others_are_named(
+    stage: Path, tmp_path: Path, where: str, pack: Callable[[bytes], bytes]
+) -> None:
+    folder = (stage if where == "stage" else tmp_path / "outside") / "scenes"
+    far = put(tmp_path / "elsewhere/far.png", "far")
+    put(folder / "textures/wood.png", "wood")
+    put(folder / "lib/moss.png", "moss")
+    scene_of(folder / "lib/plants.blend", "//moss.png", "//../scene.blend")
+    links = ("//textures\\wood.png", "//lib/plants.blend", "//packed.png", str(far), "//../keys/stage.key")
+    scene = scene_of(folder / "scene.blend", *links, pack=pack)
+    named = scene.relative_to(stage) if where == "stage" else scene
+    (stage / "stage.toml").write_text(TEXT + f'[[appearances]]\nname = "m"\nkind = "blender"\nscene = "{named}"\n')
+    lacks = [one.split(",")[0] for one in archive.missing(stage)]
+    assert f"The scene {named} links to {far}" in lacks
+    assert len(lacks) == 1 + (where == "stage"), "the key, too"
+    other = on_another_computer(stage, tmp_path)
+    (there,) = (one.place for one in references(other) if one.place.name == "scene.blend")
+    assert (there.parent / "textures/wood.png").read_text() == "wood"
+    assert (there.parent / "lib/moss.png").read_text() == "moss"
+    assert not (other / "keys").exists()
 
 
 def test_links_out_of_a_folder_are_followed_and_those_in_it_stay(stage: Path, tmp_path: Path) -> None:
