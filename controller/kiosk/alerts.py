@@ -20,7 +20,7 @@ from controller.config.models import AlertsTable
 from controller.core.errors import UsageError, WorkError
 from controller.core.files import read_text
 from controller.core.text import printable
-from controller.kiosk.interface import EventRow
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
 from hal.secret_words import concealed

@@ -1,4 +1,4 @@
-"""The interface of a kiosk: one Protocol, and the values it returns.
+"""The interface of a kiosk: one Protocol; its values are in ``state`` and ``values``.
 
 ``controller.kiosk.api.kiosk`` implements it. The panel itself stores only accounts and sessions: every page and every
 answer of the API is made from these values.
@@ -15,40 +15,25 @@ from pathlib import Path
 from typing import Protocol
 
 from controller.kiosk.state import (
-    BundleIdentity,
-    DeviceRow,
-    DriftCheck,
     EventLevel,
     EventRow,
-    Grade,
     Job,
-    JobStep,
     KioskState,
-    Lamp,
-    LiveValue,
-    NextEvent,
-    Place,
 )
 from controller.kiosk.values import (
-    Achieved,
     Aiming,
     Appearance,
-    Change,
     Changes,
     Comparison,
     Computed,
-    Finding,
     Fit,
     FoundDevice,
     LampDay,
-    ProjectorAim,
     Reach,
     RecalibrationKind,
     Results,
     Scene,
     Schedule,
-    ScheduleRow,
-    Sharpness,
     TriedDevice,
     Unsubscribe,
 )
@@ -260,42 +245,3 @@ class Kiosk(Protocol):
 
     def try_device(self, key: str) -> TriedDevice:
         """Open the device and read its identity. Seconds; changes nothing."""
-
-
-__all__ = [
-    "Achieved",
-    "Aiming",
-    "Appearance",
-    "BundleIdentity",
-    "Change",
-    "Changes",
-    "Comparison",
-    "Computed",
-    "DeviceRow",
-    "DriftCheck",
-    "EventLevel",
-    "EventRow",
-    "Finding",
-    "Fit",
-    "FoundDevice",
-    "Grade",
-    "Job",
-    "JobStep",
-    "Kiosk",
-    "KioskState",
-    "Lamp",
-    "LampDay",
-    "LiveValue",
-    "NextEvent",
-    "Place",
-    "ProjectorAim",
-    "Reach",
-    "RecalibrationKind",
-    "Results",
-    "Scene",
-    "Schedule",
-    "ScheduleRow",
-    "Sharpness",
-    "TriedDevice",
-    "Unsubscribe",
-]

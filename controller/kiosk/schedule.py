@@ -22,8 +22,7 @@ from zoneinfo import ZoneInfo
 from controller.core.errors import UsageError
 from controller.core.files import read_text
 from controller.core.storage import write_atomically
-from controller.kiosk.interface import Schedule, ScheduleRow
-from controller.kiosk.values import IN_TURN, MIDNIGHT
+from controller.kiosk.values import IN_TURN, MIDNIGHT, Schedule, ScheduleRow
 
 if TYPE_CHECKING:  # the models need pydantic, and `velatura --help` gets here
     from controller.config.models import ScheduleTable

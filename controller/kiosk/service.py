@@ -22,10 +22,10 @@ from controller.kiosk.decide.clock import Timetable, TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, DISK_FULL, Condition, Request, title_of
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
-from controller.kiosk.interface import DeviceRow, Lamp
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobHandler, JobRunner
 from controller.kiosk.schedule import ScheduleFile
+from controller.kiosk.state import DeviceRow, Lamp
 from controller.kiosk.store.bundle_store import BundleStore, BundleWatch
 from controller.kiosk.store.disk_space import TIDY_S, purge_old_photographs
 from controller.kiosk.store.event_log import EventLog

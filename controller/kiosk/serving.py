@@ -14,9 +14,9 @@ from typing import Final
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import file_error
 from controller.core.kiosk_places import PLAYER_OPTIONS, PLAYER_SOCKET, RUNTIME
-from controller.kiosk.interface import EventRow
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.service import MakeJobs, Service
+from controller.kiosk.state import EventRow
 from controller.kiosk.store import archive
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.store.settings import checked_settings, last_good

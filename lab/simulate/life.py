@@ -19,11 +19,11 @@ from typing import Any, Final
 from controller.core.errors import VelaturaError
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Condition
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule, ScheduleRow
 from controller.run.state_machine import State
 from hal.deadline import Stop
 from hal.errors import CodedError, DeviceError

@@ -17,9 +17,10 @@ from controller.bundle.install import install, revision_floor
 from controller.bundle.signing import Trust
 from controller.bundle.writer import NewAppearance, NewBundle, write_bundle
 from controller.config.writer import toml_text
-from controller.kiosk.interface import EventRow, Schedule
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.bundle_store import slots_without
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule
 
 NAMES: Final = ("left", "right", "above")
 OUTPUTS: Final = {name: f"P{number}" for number, name in enumerate(NAMES, 1)}

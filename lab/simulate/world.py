@@ -15,7 +15,7 @@ from controller.config.models import AlertsTable, StageTables
 from controller.core.errors import WorkError
 from controller.kiosk.alerts import Send
 from controller.kiosk.changes.inventory import Fact, Inventory
-from controller.kiosk.interface import EventRow
+from controller.kiosk.state import EventRow
 from controller.kiosk.world import Lock as AnyLock
 from controller.kiosk.world import Thread, World
 from controller.play.control.launch import PlayerSettings

@@ -23,7 +23,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
-from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.values import Schedule, ScheduleRow
 from controller.run.state_machine import State
 from tests.controller.kiosk.model import NAMES, Kiosk
 

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import Request
-from controller.kiosk.interface import EventRow
+from controller.kiosk.state import EventRow
 from controller.run.state_machine import State
 from tests.campaigns.kills import REPOSITORY, copy
 from tests.campaigns.usb_faults import WORDS, mend_usb, tether_faults, usb_faults, usb_well

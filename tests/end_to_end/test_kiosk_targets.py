@@ -21,8 +21,8 @@ from controller.core.arrays import load_arrays
 from controller.core.colour import srgb_to_linear
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
-from controller.kiosk.interface import Job
 from controller.kiosk.service import Service
+from controller.kiosk.state import Job
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.values import Computed
 from controller.optics.solve.request import solve_appearance

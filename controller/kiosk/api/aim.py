@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from controller.core.arrays import Mask
 from controller.core.errors import VelaturaError
-from controller.kiosk.interface import Aiming, ProjectorAim, Sharpness
 from controller.kiosk.store.runs import began_s
 from controller.kiosk.supervisors.devices import Devices
+from controller.kiosk.values import Aiming, ProjectorAim, Sharpness
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import Checked
 from hal.deadline import in_seconds

@@ -13,11 +13,12 @@ from controller.core.errors import WorkError
 from controller.kiosk.api import finding
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.api.snapshot import Snapshots
-from controller.kiosk.interface import EventLevel, EventRow, KioskState, Unsubscribe
 from controller.kiosk.operations.accounts import Accounts as AccountsInUse
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.kiosk.service import Service
+from controller.kiosk.state import EventLevel, EventRow, KioskState
 from controller.kiosk.store.accounts import Accounts, stage_accounts
+from controller.kiosk.values import Unsubscribe
 from controller.kiosk.world import World
 from hal.notices import Level, Notice
 

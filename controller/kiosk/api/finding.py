@@ -12,9 +12,9 @@ from typing import Final
 
 from controller.config.writer import toml_text
 from controller.core.text import printable
-from controller.kiosk.interface import FoundDevice, TriedDevice
 from controller.kiosk.service import Service
 from controller.kiosk.state import troubles
+from controller.kiosk.values import FoundDevice, TriedDevice
 from controller.run.progress import Silent
 from controller.stage.doctor.examine import Tools, examine
 from controller.stage.doctor.values import Examination

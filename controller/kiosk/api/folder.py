@@ -10,23 +10,14 @@ from controller.config import load_stage
 from controller.core.errors import VelaturaError
 from controller.kiosk.changes.machine import Machine
 from controller.kiosk.changes.watch import since_good, take
-from controller.kiosk.interface import (
-    Appearance,
-    Changes,
-    Comparison,
-    EventRow,
-    LampDay,
-    Reach,
-    Results,
-    Scene,
-    Schedule,
-)
 from controller.kiosk.schedule import ScheduleFile, check
+from controller.kiosk.state import EventRow
 from controller.kiosk.store import archive, runs, settings
 from controller.kiosk.store.archive import diagnostics
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors.light_records import LampHistory
+from controller.kiosk.values import Appearance, Changes, Comparison, LampDay, Reach, Results, Scene, Schedule
 from controller.stage.sessions.calibrations import finished_calibration, stage_trust, worst_grade
 from controller.stage.sessions.check import Checked, check_stage
 

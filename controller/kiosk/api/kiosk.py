@@ -19,7 +19,13 @@ from controller.kiosk.api.photograph import newest_photograph
 from controller.kiosk.changes.watch import since_good
 from controller.kiosk.decide.interfaces import Request, title_of
 from controller.kiosk.decide.operator_overrides import effect
-from controller.kiosk.interface import (
+from controller.kiosk.schedule import check
+from controller.kiosk.service import Service
+from controller.kiosk.state import Job
+from controller.kiosk.store import archive, runs, settings, targets
+from controller.kiosk.store.archive import diagnostics
+from controller.kiosk.values import (
+    IN_TURN,
     Aiming,
     Appearance,
     Changes,
@@ -27,7 +33,6 @@ from controller.kiosk.interface import (
     Computed,
     Fit,
     FoundDevice,
-    Job,
     LampDay,
     Reach,
     RecalibrationKind,
@@ -35,11 +40,6 @@ from controller.kiosk.interface import (
     Schedule,
     TriedDevice,
 )
-from controller.kiosk.schedule import check
-from controller.kiosk.service import Service
-from controller.kiosk.store import archive, runs, settings, targets
-from controller.kiosk.store.archive import diagnostics
-from controller.kiosk.values import IN_TURN
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
 from hal.notices import Notice

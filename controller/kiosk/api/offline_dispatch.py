@@ -17,7 +17,6 @@ from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.text import printable
 from controller.kiosk.api.control import call_kiosk, is_running, plain, user_name
 from controller.kiosk.api.folder import FolderKiosk
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.operations.accounts import Accounts
 from controller.kiosk.operations.dispatch import local_values, offline_operation
 from controller.kiosk.operations.operation import Effect, Operation
@@ -25,6 +24,7 @@ from controller.kiosk.schedule import check_schedule, expanded
 from controller.kiosk.state import EventLevel
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule, ScheduleRow
 from controller.run.progress import Phase, Progress, Reporter
 from controller.stage.sessions.calibrations import stage_trust
 from controller.stage.sessions.run import stage_lock

@@ -12,8 +12,8 @@ import numpy as np
 from controller.core.arrays import Float64
 from controller.core.errors import VelaturaError
 from controller.kiosk.decide.interfaces import title_of
-from controller.kiosk.interface import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, Place
 from controller.kiosk.service import Service
+from controller.kiosk.state import BundleIdentity, DeviceRow, DriftCheck, Grade, Job, KioskState, Place
 from controller.kiosk.store import runs
 from controller.kiosk.world import World
 from controller.run.state_machine import State

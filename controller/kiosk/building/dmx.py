@@ -14,7 +14,7 @@ from pydantic import Field
 from controller.core.errors import VelaturaError
 from controller.kiosk.building.protocol import NetworkOptions
 from controller.kiosk.building.verbs import Verbs
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from controller.run.state_machine import State
 
 LOST_S: Final = 2.5

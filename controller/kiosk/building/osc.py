@@ -19,8 +19,8 @@ from pythonosc.osc_packet import OscPacket, ParseError
 from controller.core.errors import SEND_DIAGNOSTICS, VelaturaError
 from controller.kiosk.building.protocol import NetworkOptions, Protocol, changes
 from controller.kiosk.building.verbs import Verbs
-from controller.kiosk.interface import KioskState
 from controller.kiosk.operations.fields import Field as Value
+from controller.kiosk.state import KioskState
 from hal.errors import DeviceError
 from hal.links import host_and_port
 

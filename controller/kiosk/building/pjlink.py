@@ -25,7 +25,7 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.core.files import read_text
 from controller.kiosk.building.protocol import NetworkOptions, Protocol
 from controller.kiosk.building.verbs import MOST_SOURCES, Verbs
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from controller.run.state_machine import State
 from hal.codecs.projectors import pjlink
 from hal.codecs.projectors.pjlink import LONGEST_LINE, MOST_LAMPS

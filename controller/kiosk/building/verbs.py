@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.interface import Kiosk, KioskState
+from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.fields import Field, Values, parse
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.roles import Role
+from controller.kiosk.state import KioskState
 
 MOST_SOURCES: Final = 256
 

@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from typing import Final, Protocol
 
 from controller.kiosk.decide.planner import DOUBT_S, EARLIEST_S, HOLD_S, Plan, believed, plan
-from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule
 from hal.notices import Level, Notice
 
 _UNSYNCHRONISED: Final = 0x40

@@ -9,10 +9,9 @@ from datetime import datetime
 from typing import Any, Final
 
 from controller.kiosk.decide.planner import Plan, plan
-from controller.kiosk.interface import Schedule
 from controller.kiosk.schedule import openings, zone_of
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.values import IN_TURN
+from controller.kiosk.values import IN_TURN, Schedule
 from hal.notices import Notice
 
 KEY: Final = "live-changes"

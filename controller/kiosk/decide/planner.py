@@ -13,8 +13,9 @@ from functools import lru_cache
 from operator import itemgetter
 from typing import Final
 
-from controller.kiosk.interface import NextEvent, Schedule
 from controller.kiosk.schedule import Opening, always_open, local_day, moment, openings, zone_of
+from controller.kiosk.state import NextEvent
+from controller.kiosk.values import Schedule
 
 EARLIEST_S: Final = 1_735_689_600.0
 """2025-01-01: an earlier clock was never set."""

@@ -12,7 +12,7 @@ from typing import Final
 
 from controller.core.errors import SEND_DIAGNOSTICS
 from controller.kiosk.decide.interfaces import BACKGROUND, Finished, Request, title_of
-from controller.kiosk.interface import Job, JobStep
+from controller.kiosk.state import Job, JobStep
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.world import Thread, World
 from controller.run.progress import Phase, Progress

@@ -10,27 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Protocol
 
-from controller.kiosk.interface import (
-    Aiming,
-    Appearance,
-    Changes,
-    Comparison,
-    Computed,
-    EventRow,
-    Finding,
-    Fit,
-    FoundDevice,
-    Job,
-    Kiosk,
-    KioskState,
-    LampDay,
-    Reach,
-    Results,
-    Scene,
-    Schedule,
-    ScheduleRow,
-    TriedDevice,
-)
+from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.accounts import ACCOUNT_OPERATIONS
 from controller.kiosk.operations.arguments import (
     MOST_EVENTS,
@@ -80,7 +60,25 @@ from controller.kiosk.operations.operation import (
 )
 from controller.kiosk.roles import Role
 from controller.kiosk.schedule import expanded
-from controller.kiosk.values import NewTarget
+from controller.kiosk.state import EventRow, Job, KioskState
+from controller.kiosk.values import (
+    Aiming,
+    Appearance,
+    Changes,
+    Comparison,
+    Computed,
+    Finding,
+    Fit,
+    FoundDevice,
+    LampDay,
+    NewTarget,
+    Reach,
+    Results,
+    Scene,
+    Schedule,
+    ScheduleRow,
+    TriedDevice,
+)
 
 VIEWER, OPERATOR, TECHNICIAN = Role.VIEWER, Role.OPERATOR, Role.TECHNICIAN
 LOOKS, SHOWS, CHANGES, WORKS = Effect.LOOKS, Effect.SHOWS, Effect.CHANGES, Effect.WORKS

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.text import well_formed
-from controller.kiosk.interface import EventRow
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.log_file import MOST_DONE, Content, LogFile
 from hal.notices import Notice
 

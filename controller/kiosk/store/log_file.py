@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from controller.kiosk.interface import EventLevel, EventRow
+from controller.kiosk.state import EventLevel, EventRow
 
 MOST_EVENTS: Final = 20_000
 MOST_DONE: Final = 400

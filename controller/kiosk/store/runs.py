@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.kiosk.interface import Achieved, Comparison, DriftCheck, Grade, Results
+from controller.kiosk.state import DriftCheck, Grade
+from controller.kiosk.values import Achieved, Comparison, Results
 from controller.stage.artefacts.comparison import Compared, all_compared, history_of, pictures_of
 from controller.stage.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
 from controller.stage.artefacts.kinds import StepKind

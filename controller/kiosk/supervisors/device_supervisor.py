@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.world import Lock, World
 from hal.deadline import Deadline
 from hal.errors import CodedError, DeviceError

@@ -13,7 +13,7 @@ from controller.core.text import printable
 from controller.kiosk.changes.devices import camera_facts, projector_facts
 from controller.kiosk.changes.inventory import Fact
 from controller.kiosk.decide.interfaces import DISK_FULL, NOT_YET, Condition, ProjectorView
-from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.light_records import LightDose
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor

@@ -11,7 +11,7 @@ from controller.config.models import DiskTable
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.decide.interfaces import DISK_FULL
-from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import make_room, runs_of
 from controller.kiosk.store.event_log import EventLog

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from controller.kiosk.interface import DeviceRow
+from controller.kiosk.state import DeviceRow
 from controller.run.state_machine import State
 from hal.errors import CodedError
 from hal.interfaces import ButtonPanel

@@ -14,7 +14,8 @@ from typing import Any, Final
 from controller.core.errors import VelaturaError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
-from controller.kiosk.interface import Lamp, LampDay
+from controller.kiosk.state import Lamp
+from controller.kiosk.values import LampDay
 
 FILE: Final = "kiosk/lamps.json"
 MOST_DAYS: Final = 400

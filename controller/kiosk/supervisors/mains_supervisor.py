@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import cast
 
-from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import LOOK_S, DeviceSupervisor
 from controller.kiosk.supervisors.projector_supervisor import ProjectorSupervisor
 from controller.kiosk.world import World

@@ -17,10 +17,11 @@ import anyio
 
 from controller.core.files import read_text
 from controller.kiosk.building.verbs import Verbs
-from controller.kiosk.interface import DriftCheck, Kiosk, KioskState
+from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.panel_address import bracketed
+from controller.kiosk.state import DriftCheck, KioskState
 from controller.panel.answers import FAILURES
 from controller.panel.mqtt import home_assistant
 from controller.panel.mqtt.options import BrokerOptions

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import quote
 
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from controller.run.state_machine import State
 
 ADVICE: Final = ("nothing", "quick", "full", "look")

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Final
 
-from controller.kiosk.interface import EventRow, Lamp, LampDay, Schedule, ScheduleRow
 from controller.kiosk.schedule import grouped
-from controller.kiosk.values import MIDNIGHT
+from controller.kiosk.state import EventRow, Lamp
+from controller.kiosk.values import MIDNIGHT, LampDay, Schedule, ScheduleRow
 
 DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 SHOWN: Final = 14

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from controller.kiosk.interface import Comparison, DriftCheck, Grade, Sharpness
+from controller.kiosk.state import DriftCheck, Grade
+from controller.kiosk.values import Comparison, Sharpness
 from controller.panel.words import figures
 
 LEFT, RIGHT, TOP, BOTTOM = 44, 452, 16, 156

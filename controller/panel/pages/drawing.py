@@ -14,8 +14,7 @@ from typing import Any, Final
 import jinja2
 
 from controller.core.text import duration
-from controller.kiosk.interface import EventRow, KioskState
-from controller.kiosk.state import troubles
+from controller.kiosk.state import EventRow, KioskState, troubles
 from controller.panel.pages import curves
 from controller.panel.words import days, figures, spoken
 from controller.panel.words.language import LANGUAGES, gettext, language, look, mark, ngettext

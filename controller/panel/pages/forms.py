@@ -18,13 +18,12 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from controller.core.errors import UsageError
-from controller.kiosk.interface import FoundDevice, TriedDevice
 from controller.kiosk.operations.arguments import HoursRow
 from controller.kiosk.operations.fields import Values, missing, parse
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import schedule_of
 from controller.kiosk.store.accounts import Role
-from controller.kiosk.values import NewTarget
+from controller.kiosk.values import FoundDevice, NewTarget, TriedDevice
 from controller.panel import answers
 from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from controller.kiosk.decide.interfaces import Condition
-from controller.kiosk.interface import EventRow
 from controller.kiosk.service import Service
+from controller.kiosk.state import EventRow
 from lab.simulate.monitors.invariants import Violation
 from lab.simulate.world import SimulatedWorld
 

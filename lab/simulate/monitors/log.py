@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from controller.kiosk.interface import EventRow
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.event_log import SHOWN
 from controller.run.state_machine import State
 from lab.simulate.monitors.invariants import Violation

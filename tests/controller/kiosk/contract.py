@@ -13,26 +13,24 @@ import pytest
 from PIL import Image
 
 from controller.core.errors import VelaturaError
-from controller.kiosk.interface import (
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.dispatch import local_values
+from controller.kiosk.operations.operation import Answer
+from controller.kiosk.operations.table import AT_SOCKET
+from controller.kiosk.state import EventRow, Job, KioskState
+from controller.kiosk.values import (
     Aiming,
     Appearance,
     Changes,
     Comparison,
-    EventRow,
     Finding,
     FoundDevice,
-    Job,
-    Kiosk,
-    KioskState,
     LampDay,
     Results,
     Scene,
     Schedule,
     TriedDevice,
 )
-from controller.kiosk.operations.dispatch import local_values
-from controller.kiosk.operations.operation import Answer
-from controller.kiosk.operations.table import AT_SOCKET
 from controller.panel.answers import plain
 from controller.panel.api import answer_schemas
 from controller.stage.blender.job import BUILTIN

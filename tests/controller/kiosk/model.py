@@ -10,10 +10,9 @@ from controller.kiosk.decide.clock import Timetable, TrustedClock, beginning
 from controller.kiosk.decide.interfaces import BLACK, Finished, PlayerView, Request, Showing
 from controller.kiosk.decide.reconciler import Reconciler
 from controller.kiosk.decide.stage_states import Limits
-from controller.kiosk.interface import Schedule
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors.projector_supervisor import LampBefore, ProjectorSupervisor
-from controller.kiosk.values import Turn
+from controller.kiosk.values import Schedule, Turn
 from controller.run.state_machine import State
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampRecord

@@ -20,12 +20,12 @@ from controller.kiosk import service as service_module
 from controller.kiosk.api import finding
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.decide.interfaces import Finished, PlayerView, Request, Showing
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.schedule import WEEKDAYS
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule, ScheduleRow
 from controller.stage.doctor.values import Examination
 from controller.stage.sessions.check import check_stage
 from hal.notices import Notice

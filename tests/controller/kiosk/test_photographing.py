@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from controller.kiosk.decide.interfaces import Finished, Request
-from controller.kiosk.interface import Job
 from controller.kiosk.jobs.job_handlers import JobHandlers
 from controller.kiosk.jobs.job_runner import JobReporter
+from controller.kiosk.state import Job
 from controller.kiosk.store import runs
 from controller.kiosk.store.event_log import EventLog
 from controller.stage.services import compare as comparison_services

@@ -9,22 +9,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageOps
 
-from controller.kiosk.interface import (
-    Aiming,
-    BundleIdentity,
-    Change,
-    Changes,
-    DeviceRow,
-    FoundDevice,
-    KioskState,
-    Lamp,
-    LampDay,
-    LiveValue,
-    NextEvent,
-    Place,
-    ProjectorAim,
-    Sharpness,
-)
+from controller.kiosk.state import BundleIdentity, DeviceRow, KioskState, Lamp, LiveValue, NextEvent, Place
+from controller.kiosk.values import Aiming, Change, Changes, FoundDevice, LampDay, ProjectorAim, Sharpness
 from hal.notices import Level, Notice
 from tests.controller.kiosk.vase import TEXT
 

@@ -16,19 +16,18 @@ from pathlib import Path
 from PIL import Image
 
 from controller.core.errors import UsageError, WorkError
-from controller.kiosk.interface import (
+from controller.kiosk.schedule import check
+from controller.kiosk.state import DriftCheck, EventLevel, Grade, Job
+from controller.kiosk.store import settings, targets
+from controller.kiosk.values import (
     Achieved,
     Aiming,
     Appearance,
     Changes,
     Comparison,
     Computed,
-    DriftCheck,
-    EventLevel,
     Fit,
     FoundDevice,
-    Grade,
-    Job,
     LampDay,
     Reach,
     RecalibrationKind,
@@ -38,8 +37,6 @@ from controller.kiosk.interface import (
     ScheduleRow,
     TriedDevice,
 )
-from controller.kiosk.schedule import check
-from controller.kiosk.store import settings, targets
 from controller.stage.blender.job import BUILTIN
 from hal.notices import Notice
 from tests.controller.kiosk.vase import TEXT

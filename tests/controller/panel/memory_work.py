@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from controller.core.errors import WorkError
-from controller.kiosk.interface import EventRow, Job, JobStep, KioskState, Unsubscribe
+from controller.kiosk.state import EventRow, Job, JobStep, KioskState
+from controller.kiosk.values import Unsubscribe
 from tests.controller.panel.example_values import BORN
 
 STEPS = ("Power", "Warm up", "Find the brackets", "Photograph patterns", "Decode", "Solve the geometry", "Grade")

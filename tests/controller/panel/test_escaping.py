@@ -9,18 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.interface import (
-    Appearance,
-    DeviceRow,
-    Grade,
-    Job,
-    JobStep,
-    Lamp,
-    LiveValue,
-    NextEvent,
-    Schedule,
-    ScheduleRow,
-)
+from controller.kiosk.state import DeviceRow, Grade, Job, JobStep, Lamp, LiveValue, NextEvent
+from controller.kiosk.values import Appearance, Schedule, ScheduleRow
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import served
 

@@ -13,7 +13,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from controller.kiosk.interface import BundleIdentity, Grade
+from controller.kiosk.state import BundleIdentity, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel import live
 from controller.panel.pages.routes import NAVIGATION

@@ -15,9 +15,10 @@ import pytest
 from PIL import Image
 
 from controller.kiosk.api.aim import FIGURES, FOLDER, SOFT_FOCUS, aiming, camera_picture, focus_of, grazing_share
-from controller.kiosk.interface import Aiming, DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.devices import Devices
+from controller.kiosk.values import Aiming
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Deadline

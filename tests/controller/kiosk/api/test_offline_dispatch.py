@@ -26,8 +26,9 @@ from controller.kiosk.api.offline_dispatch import (
     status_of,
     status_text,
 )
-from controller.kiosk.interface import Aiming, DeviceRow, Job, JobStep, KioskState, LiveValue, ProjectorAim, Schedule
+from controller.kiosk.state import DeviceRow, Job, JobStep, KioskState, LiveValue
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Aiming, ProjectorAim, Schedule
 from controller.stage.sessions.run import stage_lock
 from hal.notices import Level, Notice
 from tests.controller.kiosk.vase import graded_run, vase

@@ -21,7 +21,7 @@ from pypjlink.projector import ProjectorError
 
 from controller.kiosk.building import pjlink as lines
 from controller.kiosk.building.protocol import read, serving
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from hal.codecs.projectors.pjlink import second_level_digest
 from tests.aiopjlink_client import talk
 from tests.controller.panel.memory_kiosk import MemoryKiosk

@@ -16,7 +16,7 @@ from sacn import DataPacket, sACNsender
 from controller.kiosk.building.dmx import Follower, Frame, Sources
 from controller.kiosk.building.protocol import read, serving
 from controller.kiosk.building.sacn import SacnOptions, frame_of
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.ports import kept_port
 from tests.waiting import wait_for

@@ -10,8 +10,8 @@ import pytest
 
 from controller.kiosk.decide.operator_overrides import OperatorOverrides, effect
 from controller.kiosk.decide.planner import Plan, plan
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule, ScheduleRow
 
 MONDAY_NOON = datetime(2026, 5, 4, 12, 0, tzinfo=UTC).timestamp()
 NOW, EVENING = (Schedule("UTC", (ScheduleRow("mon", opens, "20:00"),)) for opens in ("10:00", "18:00"))

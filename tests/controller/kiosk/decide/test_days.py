@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import WEEKDAYS, check_overlaps, days_of, expanded, grouped, rows_of
+from controller.kiosk.values import Schedule, ScheduleRow
 
 FIRST = date(2026, 5, 4)
 CLOCK = st.builds("{:02d}:{:02d}".format, st.integers(0, 23), st.sampled_from((0, 30)))

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.core.errors import UsageError
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import MOST_ROWS, WEEKDAYS, check_schedule, moment, openings, rows_of, zone_of
+from controller.kiosk.values import Schedule, ScheduleRow
 
 ZONES = ("UTC", "Europe/Vienna", "America/New_York", "Australia/Lord_Howe", "Asia/Kathmandu", "America/St_Johns",
          "Africa/Casablanca", "Pacific/Chatham", "America/Asuncion")  # fmt: skip

@@ -8,9 +8,8 @@ import pytest
 
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.decide.interfaces import BLACK, Showing
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import WEEKDAYS, check_schedule
-from controller.kiosk.values import IN_TURN
+from controller.kiosk.values import IN_TURN, Schedule, ScheduleRow
 from controller.run.state_machine import State
 from tests.controller.kiosk.model import BUNDLE, Kiosk
 

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from controller.kiosk.decide.operator_overrides import OperatorOverrides
 from controller.kiosk.decide.planner import Plan, plan
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.values import IN_TURN
+from controller.kiosk.values import IN_TURN, Schedule, ScheduleRow
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 HOURS = Schedule("Europe/Vienna", tuple(ScheduleRow(day, "10:00", "18:00") for day in DAYS), "03:00")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from controller.config.models import HoursTable, ScheduleTable
 from controller.core.errors import UsageError
 from controller.kiosk.decide.planner import DOUBT_S, WINDOW_S, Plan, believed, plan
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import check_overlaps, check_schedule, expanded, of_table, openings
+from controller.kiosk.values import Schedule, ScheduleRow
 
 VIENNA = ZoneInfo("Europe/Vienna")
 WEEK = tuple(ScheduleRow(day, "10:00", "18:00") for day in ("mon", "tue", "wed", "thu", "fri", "sat", "sun"))

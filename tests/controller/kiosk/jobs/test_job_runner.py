@@ -10,8 +10,8 @@ import pytest
 
 from controller.core.errors import WorkError
 from controller.kiosk.decide.interfaces import Finished, Request
-from controller.kiosk.interface import Job
 from controller.kiosk.jobs.job_runner import JobHandler, JobReporter, JobRunner, run_name
+from controller.kiosk.state import Job
 from controller.kiosk.store.event_log import EventLog
 from controller.run.progress import Phase, Progress
 from hal.deadline import Cancelled

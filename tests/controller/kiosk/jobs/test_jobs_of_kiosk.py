@@ -19,12 +19,13 @@ from controller.kiosk.api.control import NAME, ControlServer
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.api.offline_dispatch import ask_and_follow
 from controller.kiosk.decide.interfaces import Request
-from controller.kiosk.interface import Job, Schedule
 from controller.kiosk.operations.dispatch import socket_table
 from controller.kiosk.service import Service
+from controller.kiosk.state import Job
 from controller.kiosk.store import archive
 from controller.kiosk.store.accounts import Accounts, Role
 from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.values import Schedule
 from controller.run.progress import Silent
 from controller.stage.sessions.check import check_stage
 from hal.deadline import Cancelled

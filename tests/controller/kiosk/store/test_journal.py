@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.interface import EventRow
 from controller.kiosk.serving import journal_of
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.event_log import EventLog
 from hal.notices import Level, Notice
 

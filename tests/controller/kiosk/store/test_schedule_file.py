@@ -6,8 +6,8 @@ import pytest
 
 from controller.config.models import ScheduleTable
 from controller.core.errors import UsageError
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import FILE, ScheduleFile, of_table
+from controller.kiosk.values import Schedule, ScheduleRow
 
 TABLE = ScheduleTable.model_validate(
     {"time_zone": "Europe/Vienna", "hours": [{"day": "fri", "opens": "18:00", "closes": "01:30"}]}

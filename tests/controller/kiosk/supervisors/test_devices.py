@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.kiosk.interface import DeviceRow
 from controller.kiosk.service import Service
+from controller.kiosk.state import DeviceRow
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors import projector_supervisor
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor

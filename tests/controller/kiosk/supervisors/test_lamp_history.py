@@ -5,8 +5,9 @@ from __future__ import annotations
 from datetime import date
 from pathlib import Path
 
-from controller.kiosk.interface import Lamp, LampDay
+from controller.kiosk.state import Lamp
 from controller.kiosk.supervisors.light_records import EVERY_S, FILE, MOST_DAYS, LampHistory
+from controller.kiosk.values import LampDay
 
 MONDAY, TUESDAY = date(2026, 1, 5), date(2026, 1, 6)
 

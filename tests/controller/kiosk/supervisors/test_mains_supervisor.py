@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from controller.kiosk import world as kiosk_world
-from controller.kiosk.interface import DeviceRow, LiveValue
+from controller.kiosk.state import DeviceRow, LiveValue
 from controller.kiosk.supervisors.device_supervisor import DeviceSupervisor
 from controller.kiosk.supervisors.mains_supervisor import Boards, MainsSupervisor
 from controller.kiosk.supervisors.projector_supervisor import Mains as ProjectorsMains

@@ -19,7 +19,7 @@ import pytest
 
 from controller.cli.commands.service import Broker
 from controller.core.errors import UsageError
-from controller.kiosk.interface import KioskState
+from controller.kiosk.state import KioskState
 from controller.kiosk.store.accounts import Accounts
 from controller.panel.app import make_panel
 from controller.panel.context import PanelOptions

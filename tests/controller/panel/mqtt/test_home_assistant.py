@@ -18,8 +18,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.kiosk.interface import DriftCheck, Kiosk
+from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.state import DriftCheck
 from controller.panel.mqtt.bridge import BuildingControl
 from controller.panel.mqtt.home_assistant import messages, node
 from controller.panel.mqtt.options import BrokerOptions

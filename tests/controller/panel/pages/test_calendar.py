@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.kiosk.interface import Schedule, ScheduleRow
 from controller.kiosk.schedule import openings, zone_of
+from controller.kiosk.values import Schedule, ScheduleRow
 from controller.panel.pages.calendar import DAYS, SHOWN, days, zones
 
 MONDAY = date(2026, 5, 4)

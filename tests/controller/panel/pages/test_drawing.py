@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from controller.kiosk.interface import BundleIdentity, DeviceRow, EventRow, Job, JobStep, KioskState, NextEvent
+from controller.kiosk.state import BundleIdentity, DeviceRow, EventRow, Job, JobStep, KioskState, NextEvent
 from controller.panel.pages.drawing import EVENTS_SHOWN, STATES, Drawing
 from controller.run.state_machine import State
 

@@ -11,7 +11,7 @@ import httpx
 import pytest
 from PIL import Image
 
-from controller.kiosk.interface import Schedule, ScheduleRow
+from controller.kiosk.values import Schedule, ScheduleRow
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from controller.kiosk.interface import EventRow, Lamp, LampDay
+from controller.kiosk.state import EventRow, Lamp
+from controller.kiosk.values import LampDay
 from controller.panel.pages.calendar import LampUse, lamp_reports
 
 LEFT = Lamp("left", 1210.0, 90, True)

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from controller.kiosk.interface import Aiming, EventRow, ProjectorAim
+from controller.kiosk.state import EventRow
 from controller.kiosk.store.accounts import Role
+from controller.kiosk.values import Aiming, ProjectorAim
 from controller.optics.calibrate.verify.error_causes import COLOURS, WORDS
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf, served

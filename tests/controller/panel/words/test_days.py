@@ -11,8 +11,8 @@ from babel.dates import get_day_names, get_month_names
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.kiosk.interface import ScheduleRow
 from controller.kiosk.schedule import WEEKDAYS, days_of, grouped
+from controller.kiosk.values import ScheduleRow
 from controller.panel.words.days import canonical, written
 from controller.panel.words.language import LANGUAGES, speaking
 from tests.controller.panel.served import Served, csrf
