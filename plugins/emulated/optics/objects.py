@@ -126,7 +126,7 @@ def _vase_and_bust() -> StageObject:
     points = np.concatenate([vase_points, bust_points])
     faces = np.concatenate([vase_faces, bust_faces + len(vase_points)]).astype(np.int32)
     world = (points - (0.0, 0.5 * HEIGHT_M, 0.0)) * (1.0, -1.0, -1.0)
-    return _assembled(world, faces, VASE_AND_BUST, parts=np.array([0, len(vase_faces)], dtype=np.int32))
+    return assembled(world, faces, VASE_AND_BUST, parts=np.array([0, len(vase_faces)], dtype=np.int32))
 
 
 def load_object(path: Path) -> StageObject:
@@ -148,11 +148,11 @@ def load_object(path: Path) -> StageObject:
         )
     vertices = _fitted(_with_size(path, vertices, faces), faces)
     if mesh.texture is not None:
-        return _assembled(vertices, faces, "texture", corner_values=mesh.uv, texture=_linear(mesh.texture))
+        return assembled(vertices, faces, "texture", corner_values=mesh.uv, texture=_linear(mesh.texture))
     if mesh.colours is not None:
         light = mesh.colours if mesh.linear else _linear(np.rint(255 * mesh.colours).astype(np.uint8))
-        return _assembled(vertices, faces, "corners", corner_values=light)
-    return _assembled(vertices, faces, "solid")
+        return assembled(vertices, faces, "corners", corner_values=light)
+    return assembled(vertices, faces, "solid")
 
 
 def _with_size(path: Path, vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
@@ -179,7 +179,7 @@ def _fitted(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
     return np.asarray((vertices - 0.5 * (low + high)) * scale * (1.0, -1.0, -1.0))
 
 
-def _assembled(
+def assembled(
     vertices: Floats,
     faces: npt.NDArray[np.int32],
     paint: str,
@@ -188,6 +188,7 @@ def _assembled(
     texture: npt.NDArray[np.float32] | None = None,
     parts: npt.NDArray[np.int32] | None = None,
 ) -> StageObject:
+    """The object of these arrays (see ``StageObject``), with its normals."""
     empty = np.zeros(0, dtype=np.float32)
     return StageObject(
         vertices=vertices.astype(np.float32),
@@ -202,7 +203,8 @@ def _assembled(
 
 def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
     """Unit normals (F, 3, 3): the mean of the faces that meet at a point by their angles, or flat at sharp creases."""
-    corners, flat = vertices[faces], face_normals(vertices, faces)
+    corners = vertices[faces]
+    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     # Files split vertices along texture seams; the surface is smooth there all the same.
     _, place = np.unique(np.round(vertices, 7), axis=0, return_inverse=True)
     place = place.reshape(-1)
@@ -215,12 +217,6 @@ def corner_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> npt.NDArra
     smooth = _unit(total)[place][faces]
     creased = np.einsum("fkc,fc->fk", smooth, flat) < SHARPEST_CREASE
     return np.where(creased[..., None], flat[:, None], smooth).astype(np.float32)
-
-
-def face_normals(vertices: Floats, faces: npt.NDArray[np.int32]) -> Floats:
-    """Unit normals (F, 3)."""
-    corners = vertices[faces]
-    return _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from plugins.emulated.optics.objects import StageObject, corner_normals, face_normals, srgb_bytes
+from plugins.emulated.optics.objects import StageObject, assembled, srgb_bytes
 from plugins.emulated.optics.shapes import BUST_AXIS_X, Floats, Rgb, bust, paint_bust
 
 CANVAS_M: Final = (0.30, 0.24)
@@ -34,12 +34,11 @@ LEFT_OF_IT: Final = 0.22
 class Part:
     """A surface through a grid of points (rows, columns, 3); ``uv`` (rows, columns, 2): their places in the picture.
 
-    Rows go down and columns to the right, as the audience sees them; ``flat``: each face is shaded by its own normal
+    Rows go down and columns to the right, as the audience sees them.
     """
 
     points: Floats
     uv: Floats
-    flat: bool = False
 
     @property
     def faces(self) -> npt.NDArray[np.int32]:
@@ -73,25 +72,15 @@ class BuiltIn:
     def on_stage(self) -> tuple[StageObject, Mapping[str, bytes]]:
         """It in the middle of the stage, and the files that a technician gets of it."""
         model = self.model()
-        counts = [part.points[..., 0].size for part in model.parts]
-        pieces = [part.faces for part in model.parts]
+        pieces, counts = [part.faces for part in model.parts], [part.points[..., 0].size for part in model.parts]
         vertices = np.concatenate([part.points.reshape(-1, 3) for part in model.parts]) * (1.0, -1.0, -1.0)
         vertices -= 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        offsets = np.cumsum([0, *counts[:-1]])
-        faces = np.concatenate([piece + first for piece, first in zip(pieces, offsets, strict=True)]).astype(np.int32)
-        flat = np.repeat([part.flat for part in model.parts], [len(piece) for piece in pieces])
-        starts = np.cumsum([0, *(len(piece) for piece in pieces[:-1])])
-        thing = StageObject(
-            vertices=vertices.astype(np.float32),
-            faces=faces,
-            normals=np.where(
-                flat[:, None, None], face_normals(vertices, faces)[:, None], corner_normals(vertices, faces)
-            ),
-            paint="texture",
-            corner_values=np.concatenate([part.uv.reshape(-1, 2) for part in model.parts])[faces].astype(np.float32),
-            texture=model.picture,
-            parts=(starts if self.apart else starts[:1]).astype(np.int32),
-        )
+        first = np.cumsum([0, *counts[:-1]])
+        faces = np.concatenate([piece + start for piece, start in zip(pieces, first, strict=True)]).astype(np.int32)
+        uv = np.concatenate([part.uv.reshape(-1, 2) for part in model.parts])[faces].astype(np.float32)
+        starts = np.cumsum([0, *(len(piece) for piece in pieces[:-1])]) if self.apart else np.zeros(1)
+        parts = starts.astype(np.int32)
+        thing = assembled(vertices, faces, "texture", corner_values=uv, texture=model.picture, parts=parts)
         return thing, model.files
 
 
@@ -142,16 +131,16 @@ def painting() -> Model:
     rows, columns = original.shape[:2]
     share = STRIP_PX / (STRIP_PX + rows)
     across, up = (0.5 * size for size in CANVAS_M)
-    canvas = _sheet(2, 2, lambda u, v: (across * (2 * u - 1), up * (2 * v - 1), 0.0 * u))
+    (canvas,) = _facets(_sheet(2, 2, lambda u, v: (across * (2 * u - 1), up * (2 * v - 1), 0.0 * u)))
     canvas.uv[..., 1] = share + (1.0 - share) * canvas.uv[..., 1]
     corners = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1], [-1, 1]], dtype=np.float64)
     rings = [np.column_stack((corners * (across + out, up + out), np.full(5, before))) for out, before in FRAME[::-1]]
     places = np.meshgrid(np.linspace(0.0, 0.999, 5), share * np.linspace(0.2, 0.8, len(FRAME)))
-    frame = Part(np.array(rings), np.stack(places, axis=-1), flat=True)
+    frame = Part(np.array(rings), np.stack(places, axis=-1))
     grain = np.random.default_rng(51).normal(1.0, 0.5, (STRIP_PX, columns))
     wood = cv2.GaussianBlur(grain, (0, 0), 8.0, sigmaY=2.0)[..., None] * (0.52, 0.36, 0.15)
     picture = np.concatenate([faded(original), wood.astype(np.float32)])
-    return Model((canvas, frame), picture, {"original.png": _png(original)})
+    return Model((canvas, *_facets(frame)), picture, {"original.png": _png(original)})
 
 
 def relief() -> Model:
@@ -188,7 +177,7 @@ def corner() -> Model:
         across = 0.18 * (2 * u - 1)
         return across, 0.14 * (2 * v - 1), np.abs(across) / np.tan(0.5 * OPENING)
 
-    return Model((_sheet(2, 3, walls, flat=True),), _marble(0.15))
+    return Model(_facets(_sheet(2, 3, walls)), _marble(0.15))
 
 
 def cylinder(radius: float = 0.1, high: float = 0.28, x: float = 0.0) -> Model:
@@ -218,12 +207,17 @@ BUILT_IN: Final[Mapping[str, BuiltIn]] = {
 }
 
 
-def _sheet(
-    rows: int, columns: int, surface: Callable[[Floats, Floats], tuple[Floats, ...]], *, flat: bool = False
-) -> Part:
+def _sheet(rows: int, columns: int, surface: Callable[[Floats, Floats], tuple[Floats, ...]]) -> Part:
     """Points of ``surface`` over u to the right and v up, both from 0 to 1."""
     u, v = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(1.0, 0.0, rows))
-    return Part(np.stack(surface(u, v), axis=-1), np.stack((u, v), axis=-1), flat)
+    return Part(np.stack(surface(u, v), axis=-1), np.stack((u, v), axis=-1))
+
+
+def _facets(part: Part) -> tuple[Part, ...]:
+    """Its quadrilaterals, a micrometre apart, so that each is shaded by its own normal."""
+    windows = [np.s_[i : i + 2, j : j + 2] for i, j in np.ndindex(*(side - 1 for side in part.points.shape[:2]))]
+    inwards = [1e-6 * np.sign(part.points[at].mean(axis=(0, 1)) - part.points[at]) for at in windows]
+    return tuple(Part(part.points[at] + step, part.uv[at]) for at, step in zip(windows, inwards, strict=True))
 
 
 def _round(profile: Callable[[Floats], tuple[Floats, Floats]], x: float) -> Part:
