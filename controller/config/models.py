@@ -176,6 +176,11 @@ class DistanceTable(ConfigTable):
 
 
 class ObjectTable(ConfigTable):
+    shape: Literal["auto", "surface", "plane", "unknown"] = Field(
+        default="auto",
+        description='"surface" (the shape is measured), "plane" (it is flat, or consists of flat parts), "unknown" (no '
+        'shape is needed), or "auto" (the most that the photographs give)',
+    )
     distances: Annotated[tuple[DistanceTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[object.distances]] tables with from_px, to_px and distance_m"
     )

@@ -54,6 +54,7 @@ class TroubleCode(enum.StrEnum):
     PANEL_ALIGNMENT = "panel-alignment"
     PIXEL_RESPONSE = "pixel-response"
     PROJECTOR_GLARE = "projector-glare"
+    SHAPE_UNKNOWN = "shape-unknown"
     SURFACE_SPREAD = "surface-spread"
     UNSTEADY_LAMP = "unsteady-lamp"
     WHITE_SEGMENT = "white-segment"

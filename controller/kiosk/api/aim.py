@@ -149,7 +149,8 @@ def _of_calibration(calibrated: Calibrated) -> Aiming:
     for number, part in enumerate(calibration.projectors):
         aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus_of(part.metapixels)))
     dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
-    grazing = grazing_share(read_geometry_of(calibrated), lit, mask)
+    geometry = known_geometry_of(calibrated)
+    grazing = 0.0 if geometry is None else grazing_share(geometry, lit, mask)
     return Aiming(
         tuple(aims), float((lit.sum(axis=0) >= 2).sum() / area), dark, grazing,
         None, None, (*_hints(aims), *_shared_hints(dark, grazing)), "calibration", began_s(calibrated.folder.name),
@@ -185,8 +186,8 @@ def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) ->
     return float((steepest[known] < GRAZING).mean()) if known.any() else 0.0
 
 
-def read_geometry_of(calibrated: Calibrated) -> Geometry:
-    """As ``artefacts.geometry.read_geometry``."""
-    from controller.stage.artefacts.geometry import read_geometry
+def known_geometry_of(calibrated: Calibrated) -> Geometry | None:
+    """As ``artefacts.geometry.known_geometry``."""
+    from controller.stage.artefacts.geometry import known_geometry
 
-    return read_geometry(calibrated.folder, calibrated.projectors)
+    return known_geometry(calibrated.folder, calibrated.projectors)

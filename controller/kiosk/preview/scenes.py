@@ -101,10 +101,11 @@ def _render(checked: Checked, run: Path, kept: Path, scene: str | Path) -> None:
     from controller.kiosk.preview.preview_light import preview_light
     from controller.optics.solve.targets.files import read_picture
     from controller.stage.artefacts.calibrated import Calibrated
-    from controller.stage.artefacts.geometry import read_geometry
+    from controller.stage.artefacts.geometry import read_geometry, require_shape
     from controller.stage.blender.job import RenderSettings, as_seen, write_job
     from controller.stage.blender.run import find_blender, render
 
+    require_shape(run, "A scene of Blender")
     blender = find_blender()
     light = preview_light(checked.stage.folder, run, checked.names)
     transport = Calibrated(run, checked.names).transport

@@ -16,7 +16,7 @@ from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.stage.artefacts.calibration import read_calibration
 from controller.stage.artefacts.depth_edges import edged
-from controller.stage.artefacts.geometry import camera_px, has_geometry, read_geometry
+from controller.stage.artefacts.geometry import camera_px, known_geometry
 from controller.stage.artefacts.solved import SolvedBase
 
 
@@ -64,7 +64,7 @@ class Calibrated:
     def indirect(self) -> IndirectLight | None:
         """Light by way of other surfaces; None where the run measured none that counts."""
         if not self._indirect_known:
-            geometry = read_geometry(self.folder) if has_geometry(self.folder) else None
+            geometry = known_geometry(self.folder)
             points_m, normals = (None, None) if geometry is None else (geometry.points_m, geometry.normals)
             found = fit_indirect(self.calibration, self.transport.object_mask, points_m, normals)
             self._indirect = None if found is None else found.in_files(self.folder)
@@ -112,7 +112,7 @@ class Calibrated:
     def reflectance(self) -> FloatImage:
         """The object's own pattern (rows, columns, 3), NaN where it is not known."""
         if self._reflectance is None:
-            geometry = read_geometry(self.folder, self.projectors) if has_geometry(self.folder) else None
+            geometry = known_geometry(self.folder, self.projectors)
             self._reflectance = own_reflectance(self.calibration, geometry)
         return self._reflectance
 

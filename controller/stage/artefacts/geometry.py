@@ -1,27 +1,52 @@
-"""The reconstructed stage of a run: ``geometry.npz`` and ``geometry.json``."""
+"""The shape of a run's object: ``geometry.json``, and ``geometry.npz`` where it is known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from controller.core.arrays import FloatImage, load_arrays, save_arrays
-from controller.optics.calibrate.geometry.values import Reconstruction
+from controller.core.errors import UsageError
+from controller.optics.calibrate.geometry.shape import FoundShape, Shape
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import json_path, npz_path, read_json, write_json
 
 
-def write_geometry(run: Path, projectors: Sequence[str], found: Reconstruction) -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class ShapeRecord:
+    """Which shape a run has: "surface", "plane" or "unknown". ``code`` and ``reason``: why it is no surface, or ""."""
+
+    shape: Shape = "surface"
+    code: str = ""
+    reason: str = ""
+    remedy: str = ""
+
+
+def read_shape(run: Path) -> ShapeRecord:
+    """Of a run with finished geometry; one of an earlier version has a surface."""
+    row = read_geometry_figures(run)
+    return ShapeRecord(*(row.get(field.name, field.default) for field in fields(ShapeRecord)))
+
+
+def write_geometry(run: Path, projectors: Sequence[str], shape: FoundShape) -> list[Path]:
     """Points and normals in the camera's frame, metres; poses and their uncertainty (docs/reference/report.md)."""
+    why = () if shape.why is None else (shape.why.code, shape.why.what, shape.why.remedy)
+    record = asdict(ShapeRecord(shape.shape, *why))
+    found = shape.reconstruction
+    if found is None:
+        npz_path(run, StepKind.GEOMETRY).unlink(missing_ok=True)
+        views = {"camera": {"size_px": list(shape.camera_size)}, "projectors": {name: {} for name in projectors}}
+        return [write_json(json_path(run, StepKind.GEOMETRY), {**record, **views})]
     geometry = found.geometry
     arrays = npz_path(run, StepKind.GEOMETRY)
     save_arrays(arrays, {"points_m": geometry.points_m, "normals": geometry.normals, "sigma_m": found.sigma_m})
     poses = {
+        **record,
         "camera": _pinhole(geometry.camera),
         "projectors": {name: _pinhole(pose) for name, pose in zip(projectors, geometry.projectors, strict=True)},
         "reprojection_rms_px": geometry.reprojection_rms_px,
@@ -37,12 +62,33 @@ def write_geometry(run: Path, projectors: Sequence[str], found: Reconstruction) 
 
 
 def has_geometry(run: Path) -> bool:
-    """Whether ``read_geometry`` finds both files."""
+    """Whether ``read_geometry`` finds a shape; one that is unknown has no arrays."""
     return npz_path(run, StepKind.GEOMETRY).is_file() and json_path(run, StepKind.GEOMETRY).is_file()
 
 
+def require_shape(run: Path, what: str) -> None:
+    """``what`` needs the object's shape, and begins a sentence. Raises UsageError("shape-unknown")."""
+    if has_geometry(run):
+        return
+    why = read_shape(run)
+    raise UsageError(
+        "shape-unknown",
+        what=f"{what} needs the shape of the object, and the calibration {run.name} has none. {why.reason}".rstrip(),
+        remedy=why.remedy or "Set shape under [object] in stage.toml to auto or plane, and calibrate again.",
+    )
+
+
+def known_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometry | None:
+    """As ``read_geometry``; None where the shape is not known."""
+    return read_geometry(run, projectors) if has_geometry(run) else None
+
+
 def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometry:
-    """The geometry of a finished run; ``projectors``: in this order, else as in the run."""
+    """The geometry of a finished run; ``projectors``: in this order, else as in the run.
+
+    Raises UsageError("shape-unknown").
+    """
+    require_shape(run, "This")
     arrays = load_arrays(npz_path(run, StepKind.GEOMETRY))
     poses = read_geometry_figures(run)
     geometry = Geometry(
@@ -59,15 +105,15 @@ def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometr
     return replace(geometry, projectors=tuple(by_name[name] for name in projectors))
 
 
-def read_points_m(run: Path) -> FloatImage:
-    """(camera rows, columns, 3) float32: the object's points in the camera's frame, metres, NaN where unknown."""
+def known_points_m(run: Path) -> FloatImage | None:
+    """(camera rows, columns, 3) float32: the object's points in the camera's frame, metres, NaN where unknown.
+
+    None before the geometry is known, and where it stays unknown.
+    """
+    if not npz_path(run, StepKind.GEOMETRY).exists():
+        return None
     points: FloatImage = load_arrays(npz_path(run, StepKind.GEOMETRY))["points_m"]
     return points
-
-
-def known_points_m(run: Path) -> FloatImage | None:
-    """As ``read_points_m``; None before the geometry is known."""
-    return read_points_m(run) if npz_path(run, StepKind.GEOMETRY).exists() else None
 
 
 def read_geometry_figures(run: Path) -> Any:

@@ -22,7 +22,7 @@ class Content:
     """One calibrated stage; the large parts are made when a format asks for them.
 
     ``folder`` of the run
-    ``geometry``: poses, and points in the camera's frame, metres
+    ``shape``: poses, and points in the camera's frame, metres; None for formats that need none
     ``names`` of the projectors, in the geometry's order
     ``step``: every n-th camera pixel becomes a point or a vertex
     ``picture`` (camera rows, columns, 3) uint8 sRGB: the object in white light; None if it is unknown
@@ -34,7 +34,7 @@ class Content:
     """
 
     folder: Path
-    geometry: Geometry
+    shape: Geometry | None
     names: tuple[str, ...]
     step: int
     picture: ByteImage | None
@@ -43,6 +43,22 @@ class Content:
     transport: Callable[[], LightTransport]
     black: Callable[[], FloatImage]
     crop: CameraBox | None = None
+
+    @property
+    def geometry(self) -> Geometry:
+        assert self.shape is not None, "the format says that it needs no shape"
+        return self.shape
+
+    @cached_property
+    def sizes_px(self) -> tuple[tuple[int, int], ...]:
+        """(width, height) of each projector's picture."""
+        return tuple((own.valid.shape[1], own.valid.shape[0]) for own in self.metapixels())
+
+    @cached_property
+    def camera_px(self) -> tuple[int, int]:
+        """(width, height) of the camera's picture."""
+        rows, columns = self.black().shape[:2]
+        return columns, rows
 
     @cached_property
     def mesh(self) -> Mesh:

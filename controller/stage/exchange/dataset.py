@@ -55,10 +55,10 @@ def write_dataset(content: Content, folder: Path) -> dict[str, int]:
     appearances = [_appearance(run, name, content.names, folder) for name in _solved(run)]
     index = {
         "run": run.name,
-        "camera_px": list(content.geometry.camera.size_px),
+        "camera_px": list(content.camera_px),
         "projectors": [
-            {"name": name, "projector_px": list(own.size_px), "stem": safe_name(name)}
-            for name, own in zip(content.names, content.geometry.projectors, strict=True)
+            {"name": name, "projector_px": list(size_px), "stem": safe_name(name)}
+            for name, size_px in zip(content.names, content.sizes_px, strict=True)
         ],
         "photographs": photographs,
         "calibration": [str(path.relative_to(folder)) for path in measured],

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 class Format:
     """``place``: the file, or the folder, in the run's folder if no other is named.
 
+    ``shape``: whether it needs the object's shape.
     ``writer``: MODULE:FUNCTION, called with the content and the path; it returns figures on what it wrote. It is
     imported when it is used, since most need large libraries.
     """
@@ -26,6 +27,7 @@ class Format:
     what: str
     place: str
     writer: str
+    shape: bool = True
 
     def write(self, content: Content, path: Path) -> Mapping[str, Any]:
         module, _, function = self.writer.partition(":")
@@ -43,13 +45,14 @@ FORMATS: Final = (
     Format("colmap", "a folder with COLMAP's text files", "colmap", f"{_HERE}.views:write_text"),
     Format("colmap-binary", "a folder with COLMAP's binary files", "colmap-binary", f"{_HERE}.views:write_binary"),
     Format("opencv", "views and points for OpenCV (YAML)", "stage.yml", f"{_HERE}.views:write_storage"),
-    Format("st-maps", "a folder with warps as EXR pictures", "st-maps", f"{_HERE}.warps:write_maps"),
+    Format("st-maps", "a folder with warps as EXR pictures", "st-maps", f"{_HERE}.warps:write_maps",
+           shape=False),
     Format("mpcdi", "a folder with warps and poses for media servers (MPCDI 2.0)", "mpcdi",
            f"{_HERE}.warps:write_mpcdi"),
     Format("transport", "a folder with the light transport as scipy.sparse files", "transport",
-           f"{_HERE}.sparse:write_transport"),
+           f"{_HERE}.sparse:write_transport", shape=False),
     Format("dataset", "a folder with photographs, calibration, targets and results, for research", "dataset",
-           f"{_HERE}.dataset:write_dataset"),
+           f"{_HERE}.dataset:write_dataset", shape=False),
 )  # fmt: skip
 
 

@@ -47,17 +47,16 @@ def write_maps(content: Content, folder: Path) -> dict[str, int]:
 
     Raises WorkError("no-space", "cannot-write").
     """
-    size = content.geometry.camera.size_px
     written = 0
     for n, (name, metapixels) in enumerate(zip(content.names, content.metapixels(), strict=True)):
         plain = safe_name(name)
         known = metapixels.valid & np.isfinite(metapixels.centre_px).all(axis=2)
         places = np.where(known[..., None], metapixels.centre_px, np.float32(np.nan))
-        write_atomically(folder / f"{plain}-from-camera.exr", st_map(places, size))
+        write_atomically(folder / f"{plain}-from-camera.exr", st_map(places, content.camera_px))
         written += 1
         seen = content.seen_px[n]
         if seen is not None:
-            write_atomically(folder / f"camera-from-{plain}.exr", st_map(seen, content.geometry.projectors[n].size_px))
+            write_atomically(folder / f"camera-from-{plain}.exr", st_map(seen, content.sizes_px[n]))
             written += 1
     write_atomically(folder / "README.txt", _MAPS_README.encode())
     return {"maps": written}

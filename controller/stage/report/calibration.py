@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import tzinfo
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from controller.optics.calibrate.values import Calibration
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration
-from controller.stage.artefacts.geometry import read_geometry_figures, read_points_m
+from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures, read_shape
 from controller.stage.artefacts.grade import (
     BEFORE,
     RESOLUTION,
@@ -117,6 +117,7 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "patterns": {name: patterns_figures(run, name) for name in projectors},
         "seconds": sum(steps.values()),
         "geometry": {key: geometry.get(key) for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
+        "shape": asdict(read_shape(run)),
         "metapixels": {name: None if one is None else one.fitted for name, one in pixels.items()},
         "colours_px": {name: None if one is None else one.colours_px for name, one in pixels.items()},
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
@@ -178,13 +179,21 @@ def _keep(path: Path, picture: ByteImage) -> None:
 def _goals(run: Path, figures: Mapping[str, Any], limit: float) -> tuple[Goal, ...]:
     worst = max(row["relative_rms"] for row in figures["verification"].values())
     grade = max(str(row["grade"]) for row in figures["verification"].values())
-    rms, fitted_count = figures["geometry"]["reprojection_rms_px"], figures["metapixels"].values()
+    fitted_count = figures["metapixels"].values()
     return (
         Goal("Grade", grade, note="of the worst projector"),
         Goal("Largest error of a prediction", f"{100 * worst:.2f} %", f"at most {limit:g} %", passes(run, limit)),
-        Goal("Geometry", "unknown" if rms is None else f"{rms:.3f} px", note="rms of reprojection, projector pixels"),
+        shape_goal(figures),
         Goal("Metapixels", f"{sum(count or 0 for count in fitted_count):,}", note="with position and size"),
     )
+
+
+def shape_goal(figures: Mapping[str, Any]) -> Goal:
+    """The object's shape, how well it fits, and why it is not a surface; ``figures`` as ``figures_of``."""
+    shape, rms = figures["shape"], figures["geometry"]["reprojection_rms_px"]
+    known = shape["shape"] if rms is None else f"{shape['shape']}, {rms:.3f} px"
+    fits = "as stage.toml asks" if rms is None else "rms of reprojection, projector pixels"
+    return Goal("Shape", known, note=f"{shape['reason']} {shape['remedy']}" if shape["reason"] else fits)
 
 
 def _compared(
@@ -230,8 +239,8 @@ def _maps(run: Path, calibration: Calibration, crop: Crop, fine: ByteImage) -> t
     )
     relative = 100 * light / max(usual, 1e-12)
     found.append(ReportPicture("Light", _map(relative, mask, crop, "% of the usual", least=0, most=250)))
-    depth = read_points_m(run)[..., 2]
-    found.append(ReportPicture("Depth", _map(depth, mask, crop, "metres from the camera")))
+    if (points_m := known_points_m(run)) is not None:
+        found.append(ReportPicture("Depth", _map(points_m[..., 2], mask, crop, "metres from the camera")))
     found += [
         ReportPicture(f"Error of {part.name}",
                 _map(100 * errors[part.name].error, mask, crop, "% of the light nearby", least=0, most=15))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,13 @@ from controller.optics.solve.result.metrics import Comparison, compare
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import read_geometry_figures
+from controller.stage.artefacts.geometry import read_geometry_figures, read_shape
 from controller.stage.artefacts.grade import read_grade_figures, read_troubles, trouble_row
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.stage.artefacts.published import BundleFigures, has_photograph, read_photograph_of, read_playback
 from controller.stage.artefacts.solved import Solved, is_solved, read_base_figures, read_solved
+from controller.stage.report.calibration import shape_goal
 from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.one_projector import OneProjector, as_figures, as_rows, one_projector
 from controller.stage.report.one_projector import goals as one_projector_goals
@@ -125,7 +126,8 @@ def _figures(
     bundle = BundleFigures.read(run)
     return {
         "captures": {"count": shots, "seconds": captured},
-        "geometry": {key: geometry[key] for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
+        "geometry": {key: geometry.get(key) for key in ("reprojection_rms_px", "shape_rel_sigma", "inlier_share")},
+        "shape": asdict(read_shape(run)),
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
         "metapixels": {
             "fitted": sum(one.fitted for one in pixels),
@@ -244,9 +246,7 @@ def _goals(judged: Sequence[AppearanceComparison], figures: Mapping[str, Any]) -
         # A swap that comes one tick late in some seconds of playing is no missed goal.
         Goal("Swaps", f"{swaps:.1f} a second", f"{GOAL_SWAPS_PER_S:g}", swaps >= 0.995 * GOAL_SWAPS_PER_S),
         Goal("Calibration", grades, note=f"random patterns predicted to {100 * predicted:.1f} %"),
-        Goal(
-            "Geometry", f"{figures['geometry']['reprojection_rms_px']:.3f} px", note="rms of reprojection, projector px"
-        ),
+        shape_goal(figures),
         Goal("Bundle", f"{bundle['bytes'] / 1e6:.2f} MB", note=f"{bundle['ratio']:.1f} x smaller, signed"),
     )  # fmt: skip
 

@@ -102,7 +102,8 @@ def calibrating(
     longest_s = checked.stage.tables.capture.longest_exposure_s
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     taking = photographs or PhotographOptions(checked.stage.tables.calibration.photographs)
-    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking),
+    shape = checked.stage.tables.object.shape
+    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking, shape=shape),
              *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
     return [
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),

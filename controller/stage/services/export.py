@@ -13,7 +13,7 @@ from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.transport.planes import CameraBox
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import has_geometry, projectors_of, read_geometry
+from controller.stage.artefacts.geometry import known_geometry, projectors_of, read_geometry_figures, require_shape
 from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.formats import format_of
@@ -36,25 +36,27 @@ def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: st
     if kind == "transport" and is_pairs(run):
         target = out or run / chosen.place
         return {"written": target, **write_pairs_transport(run, target, box)}
-    if not has_geometry(run):
+    if not read_geometry_figures(run):
         raise UsageError(
             "not-calibrated",
             what=f"{run} has no reconstructed geometry.",
             remedy="Give the folder of a finished calibration: STAGE/runs/...",
         )
+    if chosen.shape:
+        require_shape(run, f"The format {chosen.name}")
     target = run / chosen.place if out is None else out
     return {"written": target, **chosen.write(_content(run, step, box), target)}
 
 
 def _content(run: Path, step: int | None, crop: CameraBox | None) -> Content:
-    geometry = read_geometry(run)
+    shape = known_geometry(run)
     names = tuple(projectors_of(run))
     calibrated = Calibrated(run, names)
     return Content(
         folder=run,
-        geometry=geometry,
+        shape=shape,
         names=names,
-        step=step or _usual_step(geometry),
+        step=step or (1 if shape is None else _usual_step(shape)),
         picture=_picture(run, names),
         seen_px=tuple(_seen(run, name) for name in names),
         metapixels=lambda: tuple(part.metapixels for part in calibrated.calibration.projectors),

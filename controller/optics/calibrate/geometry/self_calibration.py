@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import Float64
+from controller.core.arrays import Float64, Mask
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
@@ -50,19 +50,31 @@ def inconsistent(own: Correspondence, what: str) -> CalibrationError:
 
 def broken_share(own: Correspondence) -> float:
     """The share of decoded camera pixels with a neighbour, right or below, that is not, or sees a far-off place."""
-    valid = own.valid
-    if not valid.any():
+    if not own.valid.any():
         return 0.0
-    beside = np.zeros(valid.shape, np.int64)
+    beside = jumps(own)
     for axis in (0, 1):
-        ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        one, other = tuple(behind), tuple(ahead)
+        one, other = _neighbours(axis)
+        beside[one] |= own.valid[one] & ~own.valid[other]
+    return float(beside[own.valid].mean())
+
+
+def jumps(own: Correspondence) -> Mask:
+    """Decoded camera pixels (rows, columns) whose neighbour, right or below, sees a far-off place: depth edges."""
+    found = np.zeros(own.valid.shape, np.bool_)
+    for axis in (0, 1):
+        one, other = _neighbours(axis)
         step = channels.length(own.projector_px[other] - own.projector_px[one])
-        both = valid[one] & valid[other]
+        both = own.valid[one] & own.valid[other]
         usual = float(np.median(step[both])) if both.any() else 0.0
-        beside[one] |= valid[one] & (~valid[other] | (np.nan_to_num(step) > usual + JUMP_PX))
-    return float(beside[valid].mean())
+        found[one] |= both & (np.nan_to_num(step) > usual + JUMP_PX)
+    return found
+
+
+def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+    ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+    return tuple(behind), tuple(ahead)
 
 
 def no_position(
@@ -178,11 +190,17 @@ def _check(
                 remedy="Decode all projectors from pictures of the same camera, one size for each projector.",
             )
     if len(correspondences) < 2:
-        raise CalibrationError(
-            "one-projector",
-            what="One projector and one camera do not determine the shape: a depth-reversed one fits as well.",
-            remedy="Use at least two projectors whose light overlaps on the object.",
-        )
+        raise one_projector()
+
+
+def one_projector() -> CalibrationError:
+    """The error where a single projector would have to show the shape."""
+    return CalibrationError(
+        "one-projector",
+        what="One projector and one camera do not determine the shape: a depth-reversed one fits as well.",
+        remedy="Use at least two projectors whose light overlaps on the object, or set shape under [object] in"
+        " stage.toml to unknown or plane.",
+    )
 
 
 def _problem(

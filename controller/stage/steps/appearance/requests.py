@@ -33,7 +33,7 @@ from controller.optics.solve.targets.values import Target, in_box, on_each, thro
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.artefacts.geometry import read_geometry, require_shape
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
@@ -51,6 +51,8 @@ TITLES: Mapping[str, str] = {
 """Title of every kind of appearance."""
 
 NEEDS_FILE = ("photograph", "picture")
+NEEDS_NO_SHAPE: Final = ("recolour", "picture")
+"""Kinds that are made in the camera's picture alone."""
 
 
 def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[AppearanceRequest]:
@@ -75,6 +77,8 @@ def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ())
 def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> AppearanceRequest:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
+    if table.kind not in NEEDS_NO_SHAPE and calibrated.camera_px is not None:
+        require_shape(calibrated.folder, f"The appearance {table.name} of kind {table.kind}")
     _ = table.hint_ms  # report its errors before an hour of solving
     wanted = _options(table.kind)
     required = ("tint",) if table.kind == "recolour" else ()
@@ -186,6 +190,8 @@ def blender_request(
     Raises UsageError with code "blender-missing", "blender-scene-unknown" or "target-missing".
     """
     scene = _scene(str(options.get("scene", "builtin:marble")), folder)
+    if calibrated.camera_px is not None:
+        require_shape(calibrated.folder, f"The scene {name}")
     blender = find_blender()
     usual = RenderSettings()
     settings = RenderSettings(int(options.get("samples", usual.samples)), int(options.get("seed", usual.seed)))

@@ -39,7 +39,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration, read_correspondence
 from controller.stage.artefacts.depth_edges import EdgeDots, read_edges, write_edges, write_terms
-from controller.stage.artefacts.geometry import read_geometry
+from controller.stage.artefacts.geometry import known_geometry
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.photographs import Developed, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import DotMetapixels, DotNotes, Light, write_dot_figures
@@ -139,8 +139,12 @@ def _fit(projector: RigProjector, context: Context) -> Sequence[Path]:
     light = Light.read(folder, name)
     spacing = DotNotes.read(folder, StepKind.DOTS, name).spacing_px
     taken = read_dots(folder, PhotographSet(StepKind.DOTS, name), dot_patterns(projector.size_px, spacing))
-    model = initial_metapixels(modelled_correspondence(read_geometry(folder, [name]), 0), projector.size_px)
-    start = where_missing(initial_metapixels(read_correspondence(folder, name), projector.size_px), model)
+    geometry = known_geometry(folder, [name])
+    start = initial_metapixels(read_correspondence(folder, name), projector.size_px)
+    model = None
+    if geometry is not None:
+        model = initial_metapixels(modelled_correspondence(geometry, 0), projector.size_px)
+        start = where_missing(start, model)
     fitted, report = fit_dots(
         Developed(taken, {"black": light.black}),
         light.white,

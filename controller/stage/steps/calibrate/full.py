@@ -23,13 +23,14 @@ from controller.optics.calibrate.correspondence.colour_alignment import (
 )
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.geometry.lenses import bent
-from controller.optics.calibrate.geometry.self_calibration import reconstruct
+from controller.optics.calibrate.geometry.self_calibration import jumps, one_projector
+from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels
 from controller.optics.calibrate.photometry.glare import spread_by_lens
 from controller.optics.calibrate.photometry.projector_glare import DarkPart, lens_veils, projector_glare
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry, white_segment
-from controller.optics.calibrate.values import Geometry
+from controller.optics.calibrate.values import Correspondence
 from controller.optics.capture.pattern_frames import frame
 from controller.optics.capture.raw import CAMERA_BLUR_PX
 from controller.optics.transport.indirect.stripes import stride_of, stripe_parts, thinned
@@ -51,9 +52,19 @@ from hal.notices import Notice
 
 
 def calibration_steps(
-    rig: Rig, prior: CameraPrior, *, longest_exposure_s: float, options: PhotographOptions | None = None
+    rig: Rig,
+    prior: CameraPrior,
+    *,
+    longest_exposure_s: float,
+    options: PhotographOptions | None = None,
+    shape: AskedShape = "auto",
 ) -> list[Step]:
-    """All steps from the first photograph to metapixels and geometry."""
+    """All steps from the first photograph to metapixels and geometry.
+
+    Raises CalibrationError("one-projector") if a surface is asked for that it can't measure.
+    """
+    if shape == "surface" and len(rig.projectors) < 2:
+        raise one_projector()
     steps = capture_steps(rig, longest_exposure_s=longest_exposure_s)
     # The camera and all responses are measured beside photographs, so that no photograph waits for them.
     steps.append(camera_step(rig))
@@ -68,8 +79,8 @@ def calibration_steps(
     steps.append(
         Step(
             StepId(StepKind.GEOMETRY),
-            lambda context: _reconstruct(rig, prior, context),
-            inputs={"prior": repr(prior)},
+            lambda context: _reconstruct(rig, prior, shape, context),
+            inputs={"prior": repr(prior), "shape": shape},
             after=of_projectors(names, StepKind.PIXELS),
             title="Reconstructing the object and the poses",
             weight=costs.geometry_s(costs.scale(projector.size_px for projector in rig.projectors)),
@@ -189,10 +200,11 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name), said]
 
 
-def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Path]:
+def _reconstruct(rig: Rig, prior: CameraPrior, shape: AskedShape, context: Context) -> Sequence[Path]:
     correspondences = [read_correspondence(context.folder, projector.name) for projector in rig.projectors]
     rows, columns = correspondences[0].valid.shape
-    found = reconstruct(
+    found = find_shape(
+        shape,
         correspondences,
         (columns, rows),
         [projector.size_px for projector in rig.projectors],
@@ -200,28 +212,47 @@ def _reconstruct(rig: Rig, prior: CameraPrior, context: Context) -> Sequence[Pat
         progress=lambda fraction: context.advance(fraction, "geometry"),
     )
     names = [projector.name for projector in rig.projectors]
-    troubles = lens_troubles(context, rig.projectors, found.geometry)
-    for name, lens in zip(names, found.geometry.projectors, strict=True):
-        if (text := bent(name, lens)) is not None:
-            troubles.append(Notice.warning(TroubleCode.LENS_DISTORTION, text, about=name))
+    stride = stride_of((rows, columns))
+    troubles = lens_troubles(context, rig.projectors, _depth_m(found, correspondences)[::stride, ::stride])
+    if found.shape == "surface" and found.reconstruction is not None:
+        for name, lens in zip(names, found.reconstruction.geometry.projectors, strict=True):
+            if (text := bent(name, lens)) is not None:
+                troubles.append(Notice.warning(TroubleCode.LENS_DISTORTION, text, about=name))
+    if found.shape == "unknown" and found.why is not None:
+        text = f"The calibration has no shape of the object. {found.why.what} {NO_SHAPE}"
+        troubles.append(Notice.warning(TroubleCode.SHAPE_UNKNOWN, text))
     said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
     return [*write_geometry(context.folder, names, found), said]
+
+
+NO_SHAPE: Final = "Only what needs one is missing: wrapping, patterns, gloss, Blender and exports of the surface."
+
+
+def _depth_m(found: FoundShape, correspondences: Sequence[Correspondence]) -> FloatImage:
+    """(camera rows, columns), NaN where not known; without a shape 1 and 2 at both sides of a depth edge."""
+    if found.reconstruction is not None:
+        return found.reconstruction.geometry.points_m[..., 2]
+    seen = np.logical_or.reduce([own.valid for own in correspondences])
+    edge = np.logical_or.reduce([jumps(own) for own in correspondences])
+    return np.where(seen, np.where(edge, np.float32(2), np.float32(1)), np.float32(np.nan))
 
 
 COARSE_BITS: Final = 4
 """Of each axis of the code; finer stripes leave few places dark."""
 
 
-def lens_troubles(context: Context, projectors: Sequence[RigProjector], geometry: Geometry) -> list[Notice]:
-    """A trouble for each projector that has a veil; none where the code was shown in colours, or not at all."""
-    stride = stride_of(geometry.points_m.shape)
+def lens_troubles(context: Context, projectors: Sequence[RigProjector], depth_m: FloatImage) -> list[Notice]:
+    """A trouble for each projector that has a veil; none where the code was shown in colours, or not at all.
+
+    ``depth_m`` (rows, columns) float32: every so many camera pixels as ``stride_of`` says
+    """
     lights = [Light.read(context.folder, projector.name) for projector in projectors]
+    stride = stride_of(lights[0].white.shape)
     whites = [thinned(light.white, stride) for light in lights]
-    depth_m = np.ascontiguousarray(geometry.points_m[::stride, ::stride, 2])
     found = []
     for n, projector in enumerate(projectors):
         parts = list(_dark_parts(context, projector, thinned(lights[n].black, stride), stride))
-        glare = projector_glare(whites, n, parts, depth_m)
+        glare = projector_glare(whites, n, parts, np.ascontiguousarray(depth_m))
         if (said := lens_veils(projector.name, glare.sure)) is not None:
             found.append(Notice.warning(TroubleCode.PROJECTOR_GLARE, said, about=projector.name))
     return found

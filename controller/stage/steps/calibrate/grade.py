@@ -29,7 +29,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import Exposures
-from controller.stage.artefacts.geometry import has_geometry, read_geometry
+from controller.stage.artefacts.geometry import known_geometry
 from controller.stage.artefacts.grade import ErrorMaps, in_rows, write_grade
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of
@@ -101,7 +101,7 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
         context.advance((n + 1) / (count + 1), part.name)
         figures[part.name], maps[part.name], picture = one
         pictures.append(picture)
-    geometry = read_geometry(context.folder, calibrated.projectors) if has_geometry(context.folder) else None
+    geometry = known_geometry(context.folder, calibrated.projectors)
     troubles = {
         TroubleCode.GLOSS: glossy(gloss_strength(calibration, geometry)),
         TroubleCode.CAMERA_GLARE: veiled(veiling_glare(calibration, geometry)),

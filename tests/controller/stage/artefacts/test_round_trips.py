@@ -14,13 +14,26 @@ from hypothesis import given, settings
 from scipy.sparse import csr_matrix
 
 from controller.core.arrays import load_arrays, save_arrays
+from controller.core.errors import CalibrationError, UsageError
+from controller.optics.calibrate.geometry.shape import FoundShape
 from controller.optics.calibrate.geometry.values import Reconstruction
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.bounded.equations import Solution
 from controller.optics.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.depth_edges import edged, write_terms
-from controller.stage.artefacts.geometry import projectors_of, read_geometry, write_geometry
+from controller.stage.artefacts.geometry import (
+    ShapeRecord,
+    camera_px,
+    has_geometry,
+    known_geometry,
+    known_points_m,
+    projectors_of,
+    read_geometry,
+    read_shape,
+    require_shape,
+    write_geometry,
+)
 from controller.stage.artefacts.grade import ErrorMaps, graded, read_error_maps, write_grade
 from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels
@@ -137,7 +150,7 @@ def test_poses_are_found_by_projector_in_any_order(names: list[str]) -> None:
         poses = tuple(pinhole(n) for n in range(len(names)))
         geometry = Geometry(pinhole(9), poses, image(1), image(2), 0.1, True)
         sure = Reconstruction(geometry, np.eye(1), ("x",), 0.1, 0.1, 0.1, 1.0, 0.9, np.ones((2, 3), np.float32))
-        write_geometry(run, names, sure)
+        write_geometry(run, names, FoundShape("surface", (30, 20), sure))
         assert projectors_of(run) == names
         found = read_geometry(run, names[::-1])
         assert [one.translation_m[0] for one in found.projectors] == [float(n) for n in range(len(names))][::-1]
@@ -179,3 +192,23 @@ def test_arrays_whose_names_end_like_files_are_told_apart(tmp_path: Path) -> Non
     save_arrays(tmp_path / "a.npz", {"x": image(1), "x.npy": image(2)})
     found = load_arrays(tmp_path / "a.npz")
     assert {name: float(array[0, 0, 0]) for name, array in found.items()} == {"x": 1.0, "x.npy": 2.0}
+
+
+def test_a_run_without_a_shape_says_so_and_keeps_its_names_and_the_cameras_size(tmp_path: Path) -> None:
+    sure = Reconstruction(
+        Geometry(pinhole(9), (pinhole(1),), image(1), image(2), 0.1, True),
+        np.eye(1), ("x",), 0.1, 0.1, 0.1, 1.0, 0.9, np.ones((2, 3), np.float32),
+    )  # fmt: skip
+    write_geometry(tmp_path, ["camera"], FoundShape("surface", (30, 20), sure))
+    assert read_shape(tmp_path) == ShapeRecord("surface")
+    assert has_geometry(tmp_path)
+    flat = CalibrationError("scene-flat", what="It is flat.", remedy="Add depth.")
+    write_geometry(tmp_path, ["camera"], FoundShape("unknown", (30, 20), why=flat))
+    assert read_shape(tmp_path) == ShapeRecord("unknown", "scene-flat", "It is flat.", "Add depth.")
+    assert not has_geometry(tmp_path)
+    assert known_points_m(tmp_path) is None
+    assert known_geometry(tmp_path) is None
+    assert (projectors_of(tmp_path), camera_px(tmp_path)) == (["camera"], (30, 20))
+    with pytest.raises(UsageError, match=r"A gloss needs the shape of the object.*It is flat") as refused:
+        require_shape(tmp_path, "A gloss")
+    assert (refused.value.code, refused.value.remedy) == ("shape-unknown", "Add depth.")

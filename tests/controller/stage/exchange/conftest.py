@@ -63,7 +63,7 @@ def content(transport: LightTransport) -> Content:
         metapixels.append(Metapixels(centre, np.ones((*valid.shape, 3), np.float32), valid))
     return Content(
         folder=Path("unused"),
-        geometry=geometry,
+        shape=geometry,
         names=NAMES,
         step=1,
         picture=random.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8),
