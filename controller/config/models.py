@@ -263,8 +263,8 @@ class SolveTable(ConfigTable):
         default=REFINE,
         ge=0,
         le=9,
-        description="how many photographs of each result are taken to correct it, 0 to 9; with 0 the projectors stay "
-        "off while appearances are made",
+        description="how many photographs of each result are taken to correct it, 0 to 9, before one that confirms "
+        "it; with 0 the projectors stay off while appearances are made",
     )
 
 

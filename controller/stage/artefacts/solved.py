@@ -250,6 +250,18 @@ class Refining:
     equations: Float64 | None = None
     seen: ModelError | None = None
 
+    @property
+    def promised(self) -> float:
+        """By how much the last correction was expected to make the median error smaller (CIEDE2000); 0 before it."""
+        row = next((row for row in reversed(self.photographs) if "expected_median" in row), None)
+        return 0.0 if row is None else float(row["delta_e00_median"] - row["expected_median"])
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether ``frames`` are corrected ones that no photograph has confirmed."""
+        best = self.best
+        return best is not None and any(not np.array_equal(one, best[name]) for name, one in self.frames.items())
+
     def write(self, run: Path, name: str, number: int) -> list[Path]:
         arrays = _named("frame", self.frames)
         if self.best is not None and self.error is not None:

@@ -116,9 +116,8 @@ def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
     """What refining an appearance achieved, as a row of its figures; none where it was not refined."""
     if figures is None or figures["before"] is None:
         return ()
-    expected = " (expected)" if figures["expected"] else ""
     count = len(figures["photographs"])
-    change = f"{figures['before']:.2f} to {figures['after']:.2f}{expected}{of_asked(figures).removesuffix(',')}"
+    change = f"{figures['before']:.2f} to {figures['after']:.2f}{of_asked(figures).removesuffix(',')}"
     text = f"{change}, {count} photograph{'s' * (count != 1)}"
     return (("refined", text),)
 

@@ -38,6 +38,14 @@ LEAST_OUTLIER: Final = 0.15
 """An error is never an outlier below this share of the pixel's light and ``FLOOR``."""
 OUTLIER_SPREADS: Final = 6.0
 """An error is an outlier beyond this many spreads of the errors around the median."""
+MOST_OUTLIER: Final = 0.35
+"""An error beyond this is an outlier whatever the spread is: where a person stands before more than half of the object,
+median and spread are the person's."""
+GONE: Final = 0.6
+"""Somebody stands in a projector's light where more than this of it is missing; lamps lose less, and everywhere."""
+EVEN_LOSS: Final = 0.5
+UNEVEN: Final = 0.2
+"""Lamps explain an error if they lost less than ``EVEN_LOSS``, and ``UNEVEN`` of the squared error is left at most."""
 OUTLIER_PX: Final = 9
 """Side in camera pixels of the smallest area of outliers. Edges of shadows are thinner; a hand is larger."""
 MARGIN_PX: Final = 12
@@ -93,11 +101,18 @@ def _counted_over(predicted: FloatImage, stage: RefinedStage, at: Mask | None = 
     return np.asarray(counted, np.float32)
 
 
-def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: RefinedStage, mask: Mask) -> Mask:
+def trusted_pixels(
+    photograph: ResultPhotograph,
+    predicted: FloatImage,
+    stage: RefinedStage,
+    mask: Mask,
+    parts: Sequence[FloatImage] = (),
+) -> Mask:
     """The pixels of ``mask`` on which the photograph shows the result and nothing else, such as a hand or its shadow.
 
-    Left out is what was not measured, what changed while the photograph was taken, and areas whose error has nothing to
-    do with that of the others.
+    Left out is what was not measured, what changed while the photograph was taken, areas whose error has nothing to do
+    with that of the others or is larger than any model's, and areas that one projector's light does not reach.
+    ``parts`` (rows, columns, 3): the light of each projector in ``predicted``
     """
     measured = mask & channels.finite(photograph.radiance)
     if not measured.any():
@@ -107,8 +122,13 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     inside = error[measured]
     middle = np.median(inside, axis=0)
     spread = 1.4826 * np.median(np.abs(inside - middle), axis=0)
-    limit = np.maximum(LEAST_OUTLIER, OUTLIER_SPREADS * spread)
+    limit = np.clip(OUTLIER_SPREADS * spread, LEAST_OUTLIER, MOST_OUTLIER)
+    middle = np.clip(middle, -LEAST_OUTLIER, LEAST_OUTLIER)
     strange = measured & channels.some(np.abs(error - middle) > limit)
+    shares = [masked_blur(part, measured, EDGE_PX) / scale for part in parts]
+    if shares and not _even(error, shares, measured):
+        for share in shares:
+            strange |= measured & _shadowed(error, share)
     both = measured & channels.finite(photograph.first) & channels.finite(photograph.last)
     moved = masked_blur(np.abs(masked_blur(photograph.last - photograph.first, both, EDGE_PX)), both, EDGE_PX)
     noise = 4 * np.sqrt(2 * noise_variance(photograph.sigma, both, EDGE_PX))
@@ -117,6 +137,26 @@ def trusted_pixels(photograph: ResultPhotograph, predicted: FloatImage, stage: R
     side = 2 * MARGIN_PX + 1
     around = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
     return np.asarray(measured & ~around)
+
+
+def _even(error: FloatImage, parts: Sequence[FloatImage], measured: Mask) -> bool:
+    """Whether an ``error`` is mostly that lamps, whose light is ``parts``, are brighter or darker everywhere."""
+    few = np.s_[::STEADY_STEP_PX, ::STEADY_STEP_PX]
+    at = measured[few]
+    columns = np.stack([part[few][at].ravel() for part in parts], axis=1).astype(np.float64)
+    values = error[few][at].ravel().astype(np.float64)
+    gains = np.linalg.lstsq(columns, values, rcond=None)[0]
+    left = float(np.sum((values - columns @ gains) ** 2))
+    return bool(gains.min() > -EVEN_LOSS and left < UNEVEN * float(np.sum(values**2)))
+
+
+def _shadowed(error: FloatImage, part: FloatImage) -> Mask:
+    """(rows, columns): where an ``error`` is that most of a projector's light, ``part``, is missing."""
+    size = channels.total(part**2)
+    gone = -channels.total(error * part) / np.maximum(size, np.finfo(np.float32).tiny)
+    rest = channels.total((error + gone[..., None] * part) ** 2)
+    seen = size > 3 * LEAST_OUTLIER**2
+    return np.asarray(seen & (gone > GONE) & (rest < channels.total(error**2) / 4))
 
 
 def refusal(
@@ -298,7 +338,7 @@ def photographed_error(
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """By how much the mean CIEDE2000 fell, and from which change on that says anything."""
+    """By how much the mean CIEDE2000 fell, or the median if less, and from which change on that says anything."""
 
     mean: float
     noise: float
@@ -315,7 +355,8 @@ def gain(before: FloatImage, after: FloatImage) -> Gain:
         return Gain(0.0, LEAST_GAIN)
     change = (before[both] - after[both]).astype(np.float64)
     uncertain = 2 * float(change.std()) / max(change.size / CORRELATED_PX, 1.0) ** 0.5
-    return Gain(float(change.mean()), max(LEAST_GAIN, uncertain))
+    of_medians = float(np.median(before[both])) - float(np.median(after[both]))
+    return Gain(min(float(change.mean()), of_medians + LEAST_GAIN), max(LEAST_GAIN, uncertain))
 
 
 def solve_again(

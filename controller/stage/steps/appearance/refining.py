@@ -57,15 +57,22 @@ from hal.runtime.compute import free_bytes
 
 WORSE: Final = "the last correction was no better"
 ENOUGH: Final = "the rest is noise"
+CONFIRMED: Final = 0.25
+"""A photograph confirms a correction that reaches more than this share of what it promised."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefineOptions:
-    """``photographs``: at most so many of results, 0 to 9; ``smoothness`` of eq. 3; ``longest_exposure_s``."""
+    """``photographs``: so many correct results at most, 0 to 9; ``smoothness`` of eq. 3; ``longest_exposure_s``."""
 
     photographs: int
     smoothness: float
     longest_exposure_s: float
+
+    @property
+    def last(self) -> int:
+        """The number of the photograph that corrects nothing and confirms what the others made."""
+        return self.photographs + 1
 
     def inputs(self) -> dict[str, str]:
         """What a correction depends on, as the journal compares it."""
@@ -93,7 +100,7 @@ def refine_steps(
         inputs = {"calibration": calibrated.folder.name, **options.inputs()}
         if after is None:
             inputs |= {"day": time.strftime("%Y-%m-%d"), "solved": solving_digest(calibrated.folder, name)}
-        for number in range(1, options.photographs + 1):
+        for number in range(1, options.last + 1):
             one = StepId(StepKind.REFINE, item=f"{number}-{name}")
             steps.append(
                 Step(
@@ -110,7 +117,7 @@ def refine_steps(
         steps.append(
             Step(
                 StepId(StepKind.REFINED, item=name),
-                partial(_keep, calibrated, name, options.photographs),
+                partial(_keep, calibrated, name, options),
                 inputs=inputs,
                 after=before,
                 title=f"Keeping the better frames of {title}",
@@ -118,7 +125,7 @@ def refine_steps(
             )
         )
     if len(last) > 1:
-        steps.append(causes_step(calibrated, tuple(titles), options.photographs, after=last))
+        steps.append(causes_step(calibrated, tuple(titles), options.last, after=last))
     return steps
 
 
@@ -133,7 +140,7 @@ def _refine(
         state = Refining(solved.linear, None, None)
     else:
         state = Refining.read(context.folder, name, number - 1, calibrated.projectors)
-    if not state.ended:
+    if not state.ended and (number < options.last or state.is_corrected):
         refinement = _Refinement(rig, calibrated, solved, name, options, context)
         state = refinement.photograph_and_correct(state, number)
     return state.write(context.folder, name, number)
@@ -153,46 +160,58 @@ class _Refinement:
     def photograph_and_correct(self, state: Refining, number: int) -> Refining:
         """Take photograph ``number``, of ``state.frames``; judge it, and solve again if that is worth it.
 
-        Returns the state after it: with only one more row of figures if the photograph was refused; ended if the
-        frames are no better than those before, or if what is left is noise; else with corrected frames.
+        Returns the state after it: with only one more row of figures if the photograph was refused, or, after the last
+        one, with the frames that were confirmed; ended if the frames are no better than those before, or if what is
+        left is noise; else with corrected frames.
         """
+        is_last = number == self.options.last
         predicted = self._predicted(state.frames)
         mask = self.solved.reachable & self.calibrated.calibration.object_mask
         light = predicted[mask] if mask.any() else predicted.reshape(-1, 3)
         photograph = self._photograph(state.frames, light, number)
-        trusted = trusted_pixels(photograph, predicted, self._stage, mask)
+        parts = self._parts(state.frames)
+        trusted = trusted_pixels(photograph, predicted, self._stage, mask, parts)
         reason = refusal(photograph, predicted, self._stage, mask, trusted)
         if reason is not None:
             self.context.reporter.say(f"A photograph of {self.name} was not used: {reason}.", Level.WARNING)
-            return replace(state, photographs=(*state.photographs, {"refused": reason}))
+            frames = state.best if is_last and state.best is not None else state.frames
+            return replace(state, frames=frames, photographs=(*state.photographs, {"refused": reason}))
         causes = self._equations(state, photograph, predicted, trusted)
-        parts = self._parts(state.frames)
         photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
         error = self._error(photograph.radiance, trusted)
         row = {"delta_e00_median": error.median, "delta_e00_p95": error.p95, "delta_e00_mean": error.mean,
                "asked_median": self._of_asked(photograph.radiance, trusted),
                "left_out_share": 1 - float(trusted.sum()) / max(int(mask.sum()), 1)}  # fmt: skip
         state = replace(state, photographs=(*state.photographs, row), equations=causes)
-        judged = self._judge(state, error)
-        if judged.ended:
-            return judged
         seen, left = model_error(photograph, predicted, trusted), error.map
+        judged = self._judge(state, error, seen)
+        if judged.ended or is_last:
+            return judged
         if state.seen is not None:
             seen = state.seen.then(seen)
             left = self._error(predicted + seen.light, seen.known).map
-        is_last = number == self.options.photographs
-        return self._solve_again(replace(judged, seen=None if is_last else seen), seen, left, predicted)
+        return self._solve_again(replace(judged, seen=seen), seen, left, predicted)
 
-    def _judge(self, state: Refining, error: PhotographedError) -> Refining:
-        """Keep the frames just photographed, or the better ones before them; ``error``: of the photograph."""
-        if state.best is not None and state.error is not None:
-            better = gain(state.error, error.map)
-            if better.mean <= 0:
-                rows = (*state.photographs[:-1], {**state.photographs[-1], "kept": False})
-                return replace(state, frames=state.best, photographs=rows, ended=WORSE, seen=None)
-            if not better.worth_it:
-                return replace(state, best=state.frames, error=error.map, ended=ENOUGH, seen=None)
-        return replace(state, best=state.frames, error=error.map)
+    def _judge(self, state: Refining, error: PhotographedError, seen: ModelError) -> Refining:
+        """Keep the frames just photographed, or the better ones before them.
+
+        ``error``: of the photograph; ``seen``: of the model by it. Frames are better only if their photograph is, and
+        if it says so of the frames before them, too: light that has passed by speaks for its correction. With a
+        projector that was moved, a correction promises much and reaches little.
+        """
+        if state.best is None or state.error is None:
+            return replace(state, best=state.frames, error=error.map, seen=None)
+        earlier = [self._error(self._predicted(frames) + seen.light, seen.known).map
+                   for frames in (state.best, self.solved.linear)]  # fmt: skip
+        better = min((gain(one, error.map) for one in (state.error, *earlier)), key=lambda one: one.mean)
+        if better.mean > CONFIRMED * state.promised:
+            ended = "" if better.worth_it else ENOUGH
+            return replace(state, best=state.frames, error=error.map, ended=ended, seen=None)
+        first = gain(*earlier).mean > 0
+        rows = [{**row, "kept": False} if "refused" not in row and (n == len(state.photographs) - 1 or (first and n))
+                else row for n, row in enumerate(state.photographs)]  # fmt: skip
+        frames = self.solved.linear if first else state.best
+        return replace(state, frames=frames, photographs=tuple(rows), ended=WORSE, seen=None)
 
     def _equations(
         self, state: Refining, photograph: ResultPhotograph, predicted: FloatImage, trusted: Mask
@@ -224,12 +243,10 @@ class _Refinement:
             exposure=self.solved.exposure,
         )
         new = dict(zip(self.calibrated.projectors, frames, strict=True))
-        light = self._predicted(new) + seen.light
-        expected = self._error(light, seen.known)
+        expected = self._error(self._predicted(new) + seen.light, seen.known)
         if not gain(left, expected.map).worth_it:
             return replace(state, ended=ENOUGH)
-        row = {**state.photographs[-1], "expected_median": expected.median,
-               "expected_asked_median": self._of_asked(light, seen.known)}  # fmt: skip
+        row = {**state.photographs[-1], "expected_median": expected.median}
         return replace(state, frames=new, photographs=(*state.photographs[:-1], row))
 
     @property
@@ -292,9 +309,9 @@ class _Refinement:
         return ResultPhotograph(merged.radiance, merged.sigma, first, last)
 
 
-def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context) -> Sequence[Path]:
-    found = Refining.read(context.folder, name, photographs, calibrated.projectors)
-    figures = _figures(found, photographs)
+def _keep(calibrated: Calibrated, name: str, options: RefineOptions, context: Context) -> Sequence[Path]:
+    found = Refining.read(context.folder, name, options.last, calibrated.projectors)
+    figures = _figures(found, options.photographs)
     linear = [found.frames[projector] for projector in calibrated.projectors]
     frames = device_frames(calibrated.calibration, linear)
     context.reporter.say(sentence(name, figures), Level.INFO if figures["before"] is not None else Level.WARNING)
@@ -302,22 +319,15 @@ def _keep(calibrated: Calibrated, name: str, photographs: int, context: Context)
 
 
 def _figures(found: Refining, asked: int) -> dict[str, Any]:
-    """What is reported: ``before`` and ``after``, medians of CIEDE2000; the latter is ``expected`` or photographed.
+    """What is reported: ``before`` and ``after``, medians of CIEDE2000 in the first and the last photograph kept.
 
     They are against what was aimed at; ``asked_before`` and ``asked_after`` against what was asked for.
     """
-    counted = [row for row in found.photographs if "refused" not in row]
-    kept = [row for row in counted if row.get("kept", True)]
-    before = kept[0]["delta_e00_median"] if kept else None
-    last = kept[-1] if kept else {}
-    expected = "expected_median" in last and not found.ended
-    after, asked_after = (
-        last.get(f"expected_{name}" if expected else photographed)
-        for name, photographed in (("median", "delta_e00_median"), ("asked_median", "asked_median"))
-    )
-    asked_before = kept[0].get("asked_median") if kept else None
-    return {"asked": asked, "before": before, "after": after, "asked_before": asked_before, "asked_after": asked_after,
-            "expected": expected, "ended": found.ended, "photographs": list(found.photographs)}  # fmt: skip
+    kept = [row for row in found.photographs if "refused" not in row and row.get("kept", True)] or [{}]
+    medians = {name: kept[n].get(key) for n, key, name in (
+        (0, "delta_e00_median", "before"), (-1, "delta_e00_median", "after"),
+        (0, "asked_median", "asked_before"), (-1, "asked_median", "asked_after"))}  # fmt: skip
+    return {"asked": asked, **medians, "ended": found.ended, "photographs": list(found.photographs)}
 
 
 def sentence(name: str, figures: Mapping[str, Any]) -> str:
@@ -326,10 +336,11 @@ def sentence(name: str, figures: Mapping[str, Any]) -> str:
     photographs = f"{count} photograph{'s' * (count != 1)}"
     if figures["before"] is None:
         return f"{name} was not refined: no photograph could be used ({photographs})."
-    if len(figures["photographs"]) == 1 and figures["ended"]:
+    if count == 1 and figures["ended"]:
         return f"{name} needed no refinement: {figures['before']:.2f} (CIEDE2000 median), {photographs}."
-    expected = "an expected " if figures["expected"] else ""
-    change = f"{figures['before']:.2f} to {expected}{figures['after']:.2f} (CIEDE2000 median)"
+    if count > 1 and all("refused" in row or not row.get("kept", True) for row in figures["photographs"][1:]):
+        return f"{name} stays as it was: no photograph confirmed a correction ({photographs})."
+    change = f"{figures['before']:.2f} to {figures['after']:.2f} (CIEDE2000 median)"
     return f"Refined {name}: {change}{of_asked(figures)} with {photographs}."
 
 

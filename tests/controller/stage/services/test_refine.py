@@ -80,7 +80,7 @@ class Stage:
     def refined(self, name: str, asked: int) -> None:
         frames = {p: np.zeros((rows, columns, 3), np.uint8) for p, (_, (columns, rows)) in OUTPUTS.items()}
         linear = {projector: frame.astype(np.float32) for projector, frame in frames.items()}
-        figures = {"asked": asked, "before": 1.5, "after": 0.5, "expected": False, "ended": "", "photographs": [{}]}
+        figures = {"asked": asked, "before": 1.5, "after": 0.5, "ended": "", "photographs": [{}]}
         write_refined(self.run, name, frames, linear, figures)
 
 
@@ -108,17 +108,17 @@ def test_each_photograph_is_a_step_and_the_better_frames_are_the_last(stage: Sta
     session, _ = stage.refine(Refinement(2))
     ((name, steps),) = session.asked
     assert name == "refine"
-    assert steps == ["refine-1-gold", "refine-2-gold", "refined-gold",
-                     "refine-1-marble", "refine-2-marble", "refined-marble", "causes"]  # fmt: skip
+    assert steps == ["refine-1-gold", "refine-2-gold", "refine-3-gold", "refined-gold",
+                     "refine-1-marble", "refine-2-marble", "refine-3-marble", "refined-marble", "causes"]  # fmt: skip
 
 
 def test_what_is_refined_already_is_refined_again_only_when_asked(stage: Stage) -> None:
     stage.refined("gold", 1)
     session, result = stage.refine(Refinement(1, asked=False))
-    assert session.asked[0][1] == ["refine-1-marble", "refined-marble"]
+    assert session.asked[0][1] == ["refine-1-marble", "refine-2-marble", "refined-marble"]
     assert result["refined"] == "Refined gold: 1.50 to 0.50 (CIEDE2000 median) with 1 photograph."
-    assert len(stage.refine(Refinement(1))[0].asked[0][1]) == 5
-    assert len(stage.refine(Refinement(2, asked=False))[0].asked[0][1]) == 7
+    assert len(stage.refine(Refinement(1))[0].asked[0][1]) == 7
+    assert len(stage.refine(Refinement(2, asked=False))[0].asked[0][1]) == 9
     stage.refined("marble", 1)
     assert stage.refine(Refinement(1, asked=False))[0].asked == [], "no lamp is lit for nothing"
 
