@@ -33,11 +33,15 @@ RIDGE: Final = 1e-6
 SURE: Final = 4.0
 """Standard errors from which an amount is reported."""
 LEAST: Final[dict[Kind, float]] = {
-    "brightness": 0.02, "response": 0.015, "indirect": 0.01, "ambient": 0.003, "focus": 0.15,
+    "brightness": 0.02, "response": 0.015, "indirect": 0.01, "ambient": 0.01, "focus": 0.15,
 }  # fmt: skip
 """Amounts from which a cause is reported: below, a calibration is as good as it gets."""
 LEAST_SHARE: Final = 0.03
 """Of the squared error: what explains less is left out, since it may stand for something that no cause describes."""
+FITS: Final = 0.85
+"""Causes that explain this much of what more of them explain are enough: the others mop up what is not quite so."""
+MOSTLY: Final = 0.5
+"""Of the squared error: where all causes explain less, something else is wrong, and none is named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +111,8 @@ def common_causes(photographs: Sequence[Float64], projectors: int) -> CommonCaus
     """What ``equations`` of several photographs say together.
 
     The fewest causes: the one that explains most is added until none explains ``LEAST_SHARE`` more, and what the others
-    have made needless is taken out again.
+    have made needless is taken out again, and so is what came after a few that fit. Each photograph by itself has to
+    say that of a cause, too: darker, or brighter.
     """
     summed = np.sum(photographs, axis=0)
     products, values = summed[:-1], float(summed[-1, 0])
@@ -122,16 +127,26 @@ def common_causes(photographs: Sequence[Float64], projectors: int) -> CommonCaus
         chosen.append(best)
         now = left[best]
         left = {group: _left(products, (*chosen, group), projectors) for group in left if group != best}
+    explained = energy - now
+    enough = (n for n in range(1, len(chosen)) if energy - _left(products, chosen[:n], projectors) > FITS * explained)
+    del chosen[next(enough, len(chosen)) :]
+    now = _left(products, chosen, projectors)
     for group in tuple(chosen):
         if _without(products, chosen, group, projectors) - now < LEAST_SHARE * energy:
             chosen.remove(group)
             now = _left(products, chosen, projectors)
-    found = [
-        replace(cause, share=(_without(products, chosen, group, projectors) - now) / energy)
-        for group in chosen
-        for cause in _amounts(products, chosen, group, values, projectors)
-        if abs(cause.amount) > max(LEAST[cause.kind], SURE * cause.sigma)
-    ]
+    if now > (1 - MOSTLY) * energy:
+        return CommonCauses((), 1 - now / energy)
+    each = [one[:-1] for one in photographs]
+    found = []
+    for group in chosen:
+        share = (_without(products, chosen, group, projectors) - now) / energy
+        amounts = _amounts(products, chosen, group, values, projectors)
+        alone = [_amounts(one, chosen, group, values, projectors) for one in each]
+        for cause, *single in zip(amounts, *alone, strict=True):
+            sure = abs(cause.amount) > max(LEAST[cause.kind], SURE * cause.sigma)
+            if sure and all(one.amount * cause.amount > 0 for one in single):
+                found.append(replace(cause, share=share))
     return CommonCauses(tuple(found), 1 - now / energy)
 
 

@@ -378,8 +378,12 @@ def sentences(found: CommonCauses, projectors: Sequence[str]) -> list[str]:
         of = [cause for cause in found.causes if cause.projector == n]
         colours = [cause for cause in of if cause.kind == "brightness"]
         if colours:
+            darker, brighter = ([one for one in colours if (one.amount > 0) is up] for up in (False, True))
+            changed = [
+                f"{how} ({_by_colour(some)})" for how, some in (("darker", darker), ("brighter", brighter)) if some
+            ]
             lines.append(
-                f"Projector {name} is not as bright as calibrated: {_by_colour(colours)}. `velatura calibrate STAGE "
+                f"Projector {name} is {' and '.join(changed)} than when it was calibrated. `velatura calibrate STAGE "
                 "--quick` measures it again."
             )
         lines += [
@@ -394,25 +398,35 @@ def sentences(found: CommonCauses, projectors: Sequence[str]) -> list[str]:
 def _of_all(causes: Sequence[Cause]) -> list[str]:
     lines = []
     for cause in causes:
-        if cause.kind == "indirect":
-            more = (
-                "comes back from the object and the room" if cause.amount > 0 else "no longer comes back from the room"
-            )
+        if cause.kind == "indirect" and cause.amount > 0:
             lines.append(
-                f"{100 * abs(cause.amount):.0f} % of the projectors' light {more}. Cover pale surfaces; photographs of "
-                "the results correct the rest."
+                f"{100 * cause.amount:.0f} % of the projectors' light comes back from the object and the room. Cover "
+                "pale surfaces; photographs of the results correct the rest."
+            )
+        elif cause.kind == "indirect":
+            lines.append(
+                f"{-100 * cause.amount:.0f} % of the projectors' light no longer comes back from the object and the "
+                "room. If something pale was taken away or covered, run `velatura calibrate STAGE`."
+            )
+        elif cause.kind == "focus" and cause.amount > 0:
+            lines.append(
+                "The pictures are less sharp than the calibration expects. See whether projectors and camera are in "
+                "focus, and whether they were when the stage was calibrated; then run `velatura calibrate STAGE`."
             )
         elif cause.kind == "focus":
-            sharper = "less sharp" if cause.amount > 0 else "sharper"
             lines.append(
-                f"The pictures are {sharper} than when they were calibrated. Check the focus of projectors and camera, "
-                "then run `velatura calibrate STAGE`."
+                "The pictures are sharper than the calibration expects: something was out of focus when the stage was "
+                "calibrated. Run `velatura calibrate STAGE`."
             )
     ambient = [cause for cause in causes if cause.kind == "ambient"]
     if ambient:
+        advice = (
+            "Make the room as dark as it was, or run `velatura calibrate STAGE`."
+            if max(cause.amount for cause in ambient) > 0
+            else "Keep the room so dark, and run `velatura calibrate STAGE`."
+        )
         lines.append(
-            f"The light in the room has changed, in parts of the projectors' light: {_by_colour(ambient)}. Make the "
-            "room as dark as it was, or run `velatura calibrate STAGE`."
+            f"The light in the room has changed, in parts of the projectors' light: {_by_colour(ambient)}. {advice}"
         )
     return lines
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -109,3 +110,42 @@ def test_an_error_that_no_cause_explains_is_not_explained() -> None:
     pattern = rng.normal(0, 0.02, (9, 12, 3)).repeat(10, axis=0).repeat(10, axis=1)
     causes = found(lambda frames: np.asarray(light(frames) + pattern, np.float32))
     assert causes.share < 0.5
+
+
+def test_room_light_from_one_side_is_room_light_and_no_projector_is_brighter() -> None:
+    """The model's room light falls as the projectors' does; a window's falls otherwise."""
+    white = np.sum([part.white for part in STAGE.projectors], axis=0)
+    across = np.linspace(0.5, 1.5, CAMERA[1], dtype=np.float32)[None, :, None]
+    causes = found(lambda frames: np.asarray(light(frames) + 0.04 * across * white, np.float32))
+    assert {cause.kind for cause in causes.causes} == {"ambient"}
+    assert all(0.02 < cause.amount < 0.06 for cause in causes.causes)
+
+
+def test_light_that_comes_back_from_near_by_makes_no_projector_brighter() -> None:
+    """The model's comes back evenly. Light of neighbours is nearly that; two causes fit a little better."""
+
+    def near(frames: Frames) -> FloatImage:
+        whole, white = light(frames), np.sum([part.white for part in STAGE.projectors], axis=0)
+        around = cv2.GaussianBlur(whole, (0, 0), 12)
+        return np.asarray(whole + 0.08 * white / white.mean(axis=(0, 1)) * around, np.float32)
+
+    assert {cause.kind for cause in found(near).causes} == {"indirect"}
+
+
+def test_a_room_that_is_darker_by_less_than_matters_is_not_named() -> None:
+    white = np.sum([part.white for part in STAGE.projectors], axis=0)
+    assert found(lambda frames: np.asarray(light(frames) - 0.003 * white, np.float32)).causes == ()
+
+
+def test_what_one_photograph_says_and_another_denies_is_no_common_cause() -> None:
+    """A lamp that flickers: darker in one photograph, brighter in the next."""
+    gains = {id(frames): gain for frames, gain in zip(appearances(), (0.8, 1.02, 0.8), strict=True)}
+    causes = found(lambda frames: light((frames[0] * np.float32(gains[id(frames)]), frames[1])))
+    assert causes.causes == ()
+
+
+def test_a_cause_beside_a_larger_error_that_none_explains_is_not_named() -> None:
+    rng = np.random.default_rng(1)
+    pattern = rng.normal(0, 0.04, (9, 12, 3)).repeat(10, axis=0).repeat(10, axis=1)
+    causes = found(lambda frames: np.asarray(dimmer(frames) + pattern, np.float32))
+    assert causes.causes == ()
