@@ -45,7 +45,7 @@ class World:
         self.photographs = int(rng.choice([1, 1, 2, 3]))
         self.first = int(rng.choice([0, 0, 0, int(rng.integers(3 * SHOTS))]))
         if self.kind in ("lamp", "bump"):
-            # what changes for good during the very last photograph is no result of the loop
+            # what changes for good during the very last photograph can't be blamed on the loop
             self.first -= self.first % SHOTS
         self.last = self.first + int(rng.choice([1, SHOTS, SHOTS, 2 * SHOTS, 4 * SHOTS]))
         self.area = self._area(0.1 if self.kind == "hand" else rng.uniform(0.15, 0.95))
