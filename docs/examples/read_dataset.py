@@ -32,8 +32,9 @@ for projector in index["projectors"]:
     view = {key: np.array(value) for key, value in views[projector["name"]].items()}
     local = geometry["points_m"] @ view["rotation"].T + view["translation_m"]
     flat = local[..., :2] / local[..., 2:]
-    r2 = np.sum(flat**2, axis=-1, keepdims=True)
-    bent = flat * (1 + view["distortion"][0] * r2 + view["distortion"][1] * r2**2)
+    k1, k2, p1, p2 = (*view["distortion"], 0, 0)[:4]
+    r2, product = np.sum(flat**2, axis=-1, keepdims=True), 2 * np.prod(flat, axis=-1, keepdims=True)
+    bent = flat * (1 + k1 * r2 + k2 * r2**2) + product * (p1, p2) + (r2 + 2 * flat**2) * (p2, p1)
     px = bent @ view["matrix"][:2, :2].T + view["matrix"][:2, 2]
     off = np.linalg.norm(px - pixels["projector_px"], axis=-1)[pixels["seen"]]
     print(f"{projector['name']}: the median distance is {np.nanmedian(off):.3f} px")

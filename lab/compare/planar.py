@@ -145,7 +145,7 @@ def _near(points: Float64, of_plane: Float64) -> Mask:
 
 def _straight(lens: Pinhole, places_px: Float64) -> Float64:
     """(n, 2) places in a picture as slopes of rays, without the lens's distortion."""
-    found = cv2.undistortPoints(places_px.reshape(-1, 1, 2), lens.matrix, np.array([*lens.distortion, 0, 0]))
+    found = cv2.undistortPoints(places_px.reshape(-1, 1, 2), lens.matrix, lens.distortion)
     return np.asarray(found, np.float64).reshape(-1, 2)
 
 
@@ -153,7 +153,7 @@ def _through(projector: Pinhole, matrix: Float64, camera: Pinhole, places_px: Fl
     """Where the camera sees (n, 2) places of the projector's picture by the homography."""
     slopes = cv2.perspectiveTransform(_straight(projector, places_px).reshape(-1, 1, 2), matrix).reshape(-1, 2)
     rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
-    found, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, np.array([*camera.distortion, 0, 0]))
+    found, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
     return np.asarray(found, np.float64).reshape(-1, 2)
 
 

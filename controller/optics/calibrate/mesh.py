@@ -188,7 +188,7 @@ def margin_px(camera: Pinhole) -> int:
     width, height = camera.size_px
     edge_x = np.concatenate([np.arange(width), np.arange(width), np.zeros(height), np.full(height, width - 1)])
     edge_y = np.concatenate([np.zeros(width), np.full(width, height - 1), np.arange(height), np.arange(height)])
-    straight = _straightened(camera, np.stack([edge_x, edge_y], axis=1).astype(np.float64))
+    straight = camera.straightened(np.stack([edge_x, edge_y], axis=1).astype(np.float64))
     beyond = np.max([-straight.min(), *(straight.max(axis=0) - (width - 1, height - 1))])
     return max(0, math.ceil(float(beyond)) + 1)
 
@@ -213,7 +213,7 @@ def places_in_rendering(camera: Pinhole) -> Float64:
     """(rows, columns, 2) float64: x and y, in a rendering with its margin, of what each camera pixel sees."""
     width, height = camera.size_px
     column, row = np.meshgrid(np.arange(width), np.arange(height))
-    straight = _straightened(camera, np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64))
+    straight = camera.straightened(np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64))
     return (straight + margin_px(camera)).reshape(height, width, 2)
 
 
@@ -227,23 +227,13 @@ def scene_script(geometry: Geometry, names: Sequence[str], mesh_file: str) -> st
     return _SCRIPT.replace("@MESH@", json.dumps(mesh_file)).replace("@VIEWS@", json.dumps(views, indent=4))
 
 
-def _straightened(camera: Pinhole, px: Float64) -> Float64:
-    """Where (points, 2) of the camera's picture lie in one without distortion."""
-    middle, focal = camera.matrix[:2, 2], np.diag(camera.matrix)[:2]
-    bent = (px - middle) / focal
-    flat = bent
-    for _ in range(20):
-        r2 = np.sum(flat * flat, axis=1, keepdims=True)
-        flat = bent / (1.0 + r2 * (camera.distortion[0] + r2 * camera.distortion[1]))
-    return np.asarray(flat * focal + middle)
-
-
 def _view(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:
     """A Blender camera: focal length and shift in widths of the rendered picture, and its matrix in the world."""
     width, height = own.size_px
     whole_width, whole_height = width + 2 * margin, height + 2 * margin
     # Blender measures focal length and shift in the larger side, where the sensor's fit is automatic; the script fixes
     # the fit to the width
+    tall = float(own.matrix[0, 0] / own.matrix[1, 1])
     matrix = np.eye(4)
     matrix[:3, :3] = TO_BLENDER @ own.rotation.T @ _LOOKING
     matrix[:3, 3] = TO_BLENDER @ (-own.rotation.T @ own.translation_m)
@@ -251,9 +241,10 @@ def _view(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:
         "name": name,
         "resolution": [whole_width, whole_height],
         "margin_px": margin,
+        "pixel_aspect": tall,
         "focal_widths": float(own.matrix[0, 0]) / whole_width,
         "shift_x": ((width - 1) / 2 - float(own.matrix[0, 2])) / whole_width,
-        "shift_y": (float(own.matrix[1, 2]) - (height - 1) / 2) / whole_width,
+        "shift_y": (float(own.matrix[1, 2]) - (height - 1) / 2) * tall / whole_width,
         "matrix_world": matrix.tolist(),
     }
 
@@ -302,7 +293,8 @@ def set_up(folder):
     scene.camera = cameras[0]
     scene.render.resolution_x, scene.render.resolution_y = VIEWS[0]["resolution"]
     scene.render.resolution_percentage = 100
-    scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
+    scene.render.pixel_aspect_x = max(1.0, 1.0 / VIEWS[0]["pixel_aspect"])
+    scene.render.pixel_aspect_y = max(1.0, VIEWS[0]["pixel_aspect"])
     scene.unit_settings.system = "METRIC"
     scene.view_settings.view_transform = "Standard"
     scene.render.engine = "CYCLES"

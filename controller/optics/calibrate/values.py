@@ -130,9 +130,10 @@ class ProjectorCalibration:
 
 @dataclass(frozen=True, slots=True)
 class Pinhole:
-    """A camera or projector: x_px ~ K [R | t] X, with two radial distortion terms in normalised coordinates.
+    """A camera or projector: x_px ~ K [R | t] X, with OpenCV's distortion in normalised coordinates.
 
-    ``matrix`` (3, 3) K; ``distortion`` (2,) k1, k2; ``rotation`` (3, 3); ``translation_m`` (3,)
+    ``matrix`` (3, 3) K; ``distortion`` (4,) k1, k2, p1, p2, or the first two of them; ``rotation`` (3, 3);
+    ``translation_m`` (3,)
     """
 
     matrix: Float64
@@ -141,6 +142,23 @@ class Pinhole:
     translation_m: Float64
     size_px: tuple[int, int]
     """(width, height)"""
+
+    def __post_init__(self) -> None:
+        terms = np.append(self.distortion, np.zeros(max(4 - len(self.distortion), 0)))
+        object.__setattr__(self, "distortion", terms)
+
+    def rays(self, px: Float64) -> Float64:
+        """(points, 2) x, y at depth 1 of what (points, 2) of the picture see."""
+        import cv2
+
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        points, same = np.ascontiguousarray(px).reshape(-1, 1, 2), np.eye(3)
+        found = cv2.undistortPointsIter(points, self.matrix, self.distortion, same, same, until)
+        return np.asarray(found, np.float64).reshape(-1, 2)
+
+    def straightened(self, px: Float64) -> Float64:
+        """Where (points, 2) of the picture lie in one without distortion."""
+        return self.rays(px) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
 
 @dataclass(frozen=True, slots=True)

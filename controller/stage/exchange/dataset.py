@@ -178,7 +178,7 @@ A projector's name stands for NAME.
 | file | arrays |
 |---|---|
 | `geometry.npz` | `points_m`, `normals` (camera rows, columns, 3), NaN unknown; `sigma_m` along the camera's ray |
-| `geometry.json` | `camera` and `projectors`: `matrix`, `distortion` (k1, k2), `rotation`, `translation_m`, `size_px` |
+| `geometry.json` | each view: `matrix`, `distortion` (k1, k2, p1, p2), `rotation`, `translation_m`, `size_px` |
 | `radiometry-NAME.npz` | `white` of this projector alone, `black`; `response` (3, 256); `mixing` |
 | `pixels-NAME.npz` | `projector_px` of camera pixels where `seen`; of projector pixels `centre_px`, `covariance_px2` |
 | | `colours_px` (3, 2): how far red, green and blue lie to the right and below, where they do not lie on each other |
@@ -188,7 +188,7 @@ A projector's name stands for NAME.
 | `exposure.json`, `delay.json` | seconds: exposures of the photographs, delay of the projectors' pictures |
 | `verification.json`, `verification.npz` | the grade: the error of a prediction for pictures that were not used |
 
-A point X of the object lies in a view at K d([R | t] X), with d(x) = x (1 + k1 r^2 + k2 r^4) in normalised coordinates.
+A point X of the object lies in a view at K d([R | t] X), with OpenCV's d in normalised coordinates.
 
 ## Appearances
 

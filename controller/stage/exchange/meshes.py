@@ -29,7 +29,8 @@ def write_glb_file(content: Content, path: Path) -> dict[str, int]:
     """As ``write_glb``, with a node for the camera and for each projector.
 
     A camera of glTF can't hold a principal point or a lens. So each node has the pose of a glTF camera (y up, looking
-    along -z), and its ``extras`` have ``camera_matrix``, ``distortion`` (k1, k2) and ``size_px`` (width, height).
+    along -z), and its ``extras`` have ``camera_matrix``, ``distortion`` (k1, k2, p1, p2) and ``size_px`` (width,
+    height).
     """
     views = [
         View(
@@ -75,7 +76,7 @@ def pose_matrix(own: Pinhole) -> npt.NDArray[np.float64]:
 def write_usd(content: Content, path: Path) -> dict[str, int]:
     """Write a mesh with normals, texture coordinates and colours, and one Camera for each view; metres, y up.
 
-    A Camera of USD has no lens distortion: ``velatura:distortion`` holds k1 and k2, and a rendering has to be bent.
+    A Camera of USD has no lens distortion: ``velatura:distortion`` holds k1, k2, p1 and p2; a rendering has to be bent.
 
     Raises WorkError("no-space", "cannot-write").
     """
@@ -150,7 +151,7 @@ def _camera(prim: str, name: str, own: Pinhole) -> list[str]:
         '        token projection = "perspective"',
         f"        float verticalAperture = {focal * height / focal_y:.9g}",
         f"        float verticalApertureOffset = {shift_y:.9g}",
-        f"        custom double2 velatura:distortion = {_tuple(own.distortion[:2].tolist())}",
+        f"        custom double4 velatura:distortion = {_tuple(own.distortion.tolist())}",
         f"        custom string velatura:name = {json.dumps(name, ensure_ascii=False)}",
         f"        custom int2 velatura:size = ({width}, {height})",
         f"        matrix4d xformOp:transform = ( {rows} )",

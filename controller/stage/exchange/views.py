@@ -41,7 +41,7 @@ class _View:
     def parameters(self) -> list[float]:
         matrix, lens = self.pinhole.matrix, self.pinhole.distortion
         middle = matrix[:2, 2] + HALF
-        return [float(one) for one in (matrix[0, 0], matrix[1, 1], *middle, *lens[:2], 0, 0)]
+        return [float(one) for one in (matrix[0, 0], matrix[1, 1], *middle, *lens)]
 
     @property
     def pose(self) -> list[float]:
@@ -169,6 +169,6 @@ def _write_view(storage: cv2.FileStorage, own: Pinhole) -> None:
     storage.write("image_width", width)
     storage.write("image_height", height)
     storage.write("camera_matrix", own.matrix)
-    storage.write("distortion_coefficients", np.array([[*own.distortion[:2], 0.0, 0.0]]))
+    storage.write("distortion_coefficients", own.distortion[None])
     storage.write("rvec", np.asarray(cv2.Rodrigues(own.rotation)[0]))
     storage.write("tvec", own.translation_m.reshape(3, 1))

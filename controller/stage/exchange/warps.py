@@ -178,11 +178,7 @@ def _in_frustum(places_px: FloatImage, own: Pinhole) -> FloatImage:
     """As ``_in_picture``, in the picture that the lens would make without its distortion."""
     known = np.isfinite(places_px).all(axis=2)
     straight = np.full(places_px.shape, np.nan, np.float64)
-    found = cv2.undistortPointsIter(
-        places_px[known].astype(np.float64).reshape(-1, 1, 2), own.matrix, np.array([*own.distortion, 0, 0]),
-        np.eye(3), own.matrix, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9),
-    )  # fmt: skip
-    straight[known] = np.asarray(found).reshape(-1, 2)
+    straight[known] = own.straightened(places_px[known].astype(np.float64))
     return _in_picture(straight.astype(np.float32), own.size_px)
 
 

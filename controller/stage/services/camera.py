@@ -15,7 +15,7 @@ from controller.core.colour import Unsuitable
 from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.core.pictures import read_picture_file
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.geometry.intrinsics import CameraIntrinsics, write_intrinsics
+from controller.optics.calibrate.geometry.intrinsics import OTHER_KEYS, CameraIntrinsics, write_intrinsics
 from controller.optics.calibrate.geometry.lenses import (
     board_picture,
     calibrate_views,
@@ -90,12 +90,14 @@ def read_grey(path: Path) -> ByteImage:
 
 def _kept(found: CameraIntrinsics, out: Path) -> dict[str, Any]:
     write_intrinsics(out, found)
-    focal, cx, cy, k1 = found.sigmas
+    focal, cx, cy, k1, *more = found.sigmas
+    others = zip(OTHER_KEYS, found.other_terms, more, strict=False)
     return {
         "file": out,
         "focal_length_px": f"{found.focal_px:.1f} +- {100 * focal:.2g} %",
         "principal_point_px": f"{found.centre_px[0]:.1f} +- {cx:.1f}, {found.centre_px[1]:.1f} +- {cy:.1f}",
         "distortion_k1": f"{found.k1:.4f} +- {k1:.2g}",
+        **{key: f"{value:.5f} +- {sigma:.2g}" for key, value, sigma in others},
         "rms_px": round(found.rms_px, 3),
         "views": found.views,
     }

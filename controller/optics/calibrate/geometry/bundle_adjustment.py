@@ -3,7 +3,8 @@
 Correspondences are measured at whole camera pixels, so all noise is in the projector coordinates: a point is one
 number, its inverse depth along the camera ray. The Schur complement over the points is therefore a division.
 
-Camera parameters: log f, cx, cy, k1. Projector parameters: log f, cx, cy, k1, rotation (3), centre (3). Square pixels.
+Camera parameters: log f, cx, cy, k1. Projector parameters: log f, cx, cy, k1, rotation (3), centre (3). What else a
+camera's lens has (k2, p1, p2, pixels that are not square) stays as it was measured. Projectors have square pixels.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from controller.optics.calibrate.geometry.normal_equations import LENS as LENS_P
 from controller.optics.calibrate.geometry.normal_equations import PROJECTOR as PROJECTOR_PARAMETERS
 from controller.optics.calibrate.geometry.normal_equations import (
     accumulate,
+    bending,
     differentiate,
     project,
     reduced,
@@ -45,7 +47,8 @@ class AdjustmentProblem:
     """What was seen, and what is known in advance.
 
     ``camera_px`` (points, 2); ``projector_px`` (points, N, 2), any value where not ``seen`` (points, N) bool;
-    ``camera_prior``, ``camera_sigma`` (4,); ``projector_prior``, ``projector_sigma`` (N, 4) of log f, cx, cy, k1;
+    ``camera_prior`` (4,) or (8,) as in ``undistort``, ``camera_sigma`` (4,); ``projector_prior``, ``projector_sigma``
+    (N, 4) of log f, cx, cy, k1;
     ``noise_px``: standard deviation of one projector coordinate, beyond 2.4 of which the Cauchy loss turns flat
     """
 
@@ -61,8 +64,8 @@ class AdjustmentProblem:
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentState:
-    """``camera`` (4,); ``intrinsics`` (N, 4); ``rotations`` (N, 3, 3) camera to projector; ``centres`` (N, 3);
-    ``inverse_depth`` (points,)."""
+    """``camera`` as in the problem; ``intrinsics`` (N, 4); ``rotations`` (N, 3, 3) camera to projector;
+    ``centres`` (N, 3); ``inverse_depth`` (points,)."""
 
     camera: Float64
     intrinsics: Float64
@@ -94,23 +97,21 @@ class Adjusted:
 
 
 def undistorted(lens: Float64, px: Float64) -> Float64:
-    """(points, 2) x, y at depth 1 of pixels (points, 2) of the camera or a projector; ``lens``: log f, cx, cy, k1."""
+    """(points, 2) x, y at depth 1 of pixels (points, 2) of the camera or a projector; ``lens`` as in ``undistort``."""
     return undistort(np.ascontiguousarray(lens), np.ascontiguousarray(px))
 
 
 def camera_rays(camera: Float64, px: Float64) -> tuple[Float64, Float64]:
     """Undistorted x, y at depth 1 of (points, 2) camera pixels, and their derivatives (points, 2, 4) by the camera."""
-    f, k1 = float(np.exp(camera[0])), float(camera[3])
-    distorted = (px - camera[1:3]) / f
+    k1, k2, p1, p2, log_aspect = np.append(camera[3:], np.zeros(8 - len(camera)))
+    focal = np.exp(camera[0] + np.array([0.0, log_aspect]))
     xy = undistorted(camera, px)
-    r2 = np.sum(xy * xy, axis=1)
-    # the inverse of (1 + k1 r2) I + 2 k1 xy xy', by Sherman and Morrison
-    along = 2.0 * k1 / (1.0 + 3.0 * k1 * r2)
-    backward = (np.eye(2) - along[:, None, None] * xy[:, :, None] * xy[:, None, :]) / (1.0 + k1 * r2)[:, None, None]
-    by_camera = np.empty((len(px), 2, 4))
-    by_camera[:, :, 0] = -np.einsum("pij,pj->pi", backward, distorted)
-    by_camera[:, :, 1:3] = -backward / f
-    by_camera[:, :, 3] = -np.einsum("pij,pj->pi", backward, xy) * r2[:, None]
+    _, _, a, b, c = bending(xy[:, 0], xy[:, 1], k1, k2, p1, p2)
+    backward = np.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
+    by_camera = np.empty((len(px), 2, CAMERA_PARAMETERS))
+    by_camera[:, :, 0] = -np.einsum("pij,pj->pi", backward, (px - camera[1:3]) / focal)
+    by_camera[:, :, 1:3] = -backward / focal
+    by_camera[:, :, 3] = -np.einsum("pij,pj->pi", backward, xy) * np.sum(xy * xy, axis=1)[:, None]
     return xy, by_camera
 
 
@@ -144,9 +145,11 @@ def stepped(state: AdjustmentState, parameters: Float64, inverse_depth: Float64)
     import cv2
 
     own = parameters[CAMERA_PARAMETERS:].reshape(-1, PROJECTOR_PARAMETERS)
+    camera = state.camera.copy()
+    camera[:CAMERA_PARAMETERS] += parameters[:CAMERA_PARAMETERS]
     turns = np.array([cv2.Rodrigues(row[LENS_PARAMETERS : LENS_PARAMETERS + 3].copy())[0] for row in own])
     return AdjustmentState(
-        state.camera + parameters[:CAMERA_PARAMETERS],
+        camera,
         state.intrinsics + own[:, :LENS_PARAMETERS],
         turns @ state.rotations,
         state.centres + own[:, LENS_PARAMETERS + 3 :],
@@ -215,7 +218,7 @@ class _Normal:
 
 def _prior_terms(problem: AdjustmentProblem, state: AdjustmentState) -> Float64:
     """Residuals in sigmas of priors and gauge."""
-    camera = (state.camera - problem.camera_prior) / problem.camera_sigma
+    camera = (state.camera - problem.camera_prior)[:CAMERA_PARAMETERS] / problem.camera_sigma
     own = (state.intrinsics - problem.projector_prior) / problem.projector_sigma
     gauge = (np.vdot(state.centres, state.centres) / len(state.centres) - 1.0) / _GAUGE_SIGMA
     return np.concatenate([camera, own.ravel(), [gauge]])

@@ -17,19 +17,22 @@ from controller.core.errors import UsageError
 from controller.core.files import read_bytes
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.geometry.values import CameraPrior, MeasuredDistance
+from controller.optics.calibrate.values import Pinhole
 
 FILE: Final = "camera-intrinsics.toml"
-PARAMETERS: Final = ("log_focal", "cx_px", "cy_px", "k1")
+PARAMETERS: Final = ("log_focal", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "log_fy_by_fx")
+OTHER_KEYS: Final = ("distortion_k2", "distortion_p1", "distortion_p2", "log_fy_by_fx")
 LARGEST_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class CameraIntrinsics:
-    """A camera's lens in pixels of its full picture, square pixels.
+    """A camera's lens in pixels of its full picture.
 
     ``size_px`` (width, height); ``focal_px``; ``centre_px`` (x, y) of the principal point; ``k1`` radial distortion
-    ``covariance`` (4, 4) of ``PARAMETERS``: log focal length, principal point in pixels, k1
+    ``covariance`` (4, 4) or (8, 8) of the first ``PARAMETERS``, the principal point in pixels
     ``method`` "charuco" or "exif"; ``rms_px`` of a session's corners, 0 for EXIF; ``views``: photographs that count
+    ``other_terms``: k2, p1, p2 as OpenCV counts them, and log fy/fx; all 0 where one focal length and k1 suffice
     """
 
     size_px: tuple[int, int]
@@ -40,10 +43,11 @@ class CameraIntrinsics:
     method: Literal["charuco", "exif"]
     rms_px: float = 0.0
     views: int = 0
+    other_terms: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def sigmas(self) -> Float64:
-        """(4,) standard deviations of ``PARAMETERS``."""
+        """(4,) or (8,) standard deviations of ``PARAMETERS``."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def prior(
@@ -54,7 +58,7 @@ class CameraIntrinsics:
         distances: tuple[MeasuredDistance, ...] = (),
     ) -> CameraPrior:
         """What the geometry starts from, and what else was measured."""
-        focal, cx, cy, k1 = (float(sigma) for sigma in self.sigmas)
+        focal, cx, cy, k1 = (float(sigma) for sigma in self.sigmas[:4])
         return CameraPrior(
             focal_length_px=self.focal_px,
             focal_length_rel_sigma=focal,
@@ -66,13 +70,17 @@ class CameraIntrinsics:
             distance_rel_sigma=distance_rel_sigma,
             distances=distances,
             size_px=self.size_px,
+            other_terms=self.other_terms,
         )
 
 
 def write_intrinsics(path: Path, found: CameraIntrinsics) -> None:
     """Write as TOML, atomically. Raises WorkError("no-space", "cannot-write")."""
     rows = ",\n".join("    [" + ", ".join(f"{value!r}" for value in row) + "]" for row in found.covariance.tolist())
-    sigmas = found.sigmas
+    sigmas, more = found.sigmas, ""
+    if len(sigmas) == len(PARAMETERS):
+        values = zip(OTHER_KEYS, found.other_terms, sigmas[4:], strict=True)
+        more = "".join(f"{key} = {value!r}  # +- {sigma:.2g}\n" for key, value, sigma in values)
     text = f"""\
 # A camera's lens, as Velatura measured it; stage.toml names this file in [camera] as intrinsics.
 method = "{found.method}"
@@ -81,9 +89,9 @@ height_px = {found.size_px[1]}
 focal_length_px = {found.focal_px!r}  # +- {100 * sigmas[0]:.2g} %
 principal_point_px = [{found.centre_px[0]!r}, {found.centre_px[1]!r}]  # +- {sigmas[1]:.2g}, {sigmas[2]:.2g} px
 distortion_k1 = {found.k1!r}  # +- {sigmas[3]:.2g}
-rms_px = {found.rms_px!r}
+{more}rms_px = {found.rms_px!r}
 views = {found.views}
-# of the focal length's logarithm, the principal point in pixels, and k1
+# of {", ".join(PARAMETERS[: len(sigmas)])}
 covariance = [
 {rows},
 ]
@@ -94,8 +102,8 @@ covariance = [
 def read_intrinsics(path: Path) -> CameraIntrinsics:
     """Read what ``write_intrinsics`` wrote, or a person or another program did.
 
-    OpenCV's YAML, XML and JSON, ROS's YAML and COLMAP's cameras.txt are read. Such a lens is replaced by the focal
-    length, centre and k1 that come nearest to it over the picture, and what is left over widens their covariance.
+    OpenCV's YAML, XML and JSON, ROS's YAML and COLMAP's cameras.txt are read. A lens with a k3 is replaced by the one
+    without it that comes nearest over the picture, and what is left over widens the covariance.
 
     Raises UsageError("camera-intrinsics-missing", "camera-intrinsics-unreadable", "camera-intrinsics-invalid").
     """
@@ -174,40 +182,39 @@ def _of_colmap(text: str) -> tuple[tuple[int, int], Float64, Float64]:
 
 
 LARGEST_MISFIT_PX: Final = 2.0
-LEAST_SIGMAS: Final = (2e-3, 2.0, 2.0, 5e-3)
+LEAST_SIGMAS: Final = (2e-3, 2.0, 2.0, 5e-3, 5e-3, 5e-4, 5e-4, 1e-4)
 """Of ``PARAMETERS``, where another program does not say how sure it is."""
 
 
 def _simplified(path: Path, size_px: tuple[int, int], matrix: Float64, bent: Float64) -> CameraIntrinsics:
-    """The nearest lens of one focal length and k1, by linear least squares over the picture."""
+    """The nearest lens without k3, by linear least squares over the picture."""
     width, height = size_px
     seen = np.stack(np.meshgrid(np.linspace(0, width - 1, 17), np.linspace(0, height - 1, 13)), axis=2).reshape(-1, 2)
     if min(width, height, matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite([*matrix.ravel(), *bent]).all():
         raise ValueError("its size or focal length is not above zero")
-    rays = cv2.undistortPoints(seen[:, None], matrix, bent)[:, 0]
-    cubic = rays * np.sum(rays**2, axis=1, keepdims=True)
-    one, zero = np.ones(len(rays)), np.zeros(len(rays))
-    across = np.stack([rays[:, 0], cubic[:, 0], one, zero], axis=1)
-    down = np.stack([rays[:, 1], cubic[:, 1], zero, one], axis=1)
-    rows, wanted = np.concatenate([across, down]), seen.T.ravel()
-    focal, bend, cx, cy = np.linalg.lstsq(rows, wanted, rcond=None)[0]
-    misfit = float(np.sqrt(np.mean((rows @ [focal, bend, cx, cy] - wanted) ** 2)))
+    aspect = matrix[1, 1] / matrix[0, 0]
+    x, y = Pinhole(matrix, bent, np.eye(3), np.zeros(3), size_px).rays(seen).T
+    r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
+    across = np.stack([x, one, zero, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2], axis=1)
+    down = np.stack([y, zero, one, y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y], axis=1)
+    rows, wanted = np.concatenate([across, down]), np.concatenate([seen[:, 0], seen[:, 1] / aspect])
+    solved = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    misfit = float(np.sqrt(np.mean((rows @ solved - wanted) ** 2)))
     if not misfit < LARGEST_MISFIT_PX:
         raise UsageError(
             "camera-lens-unlike",
-            what=f"One focal length and one distortion term do not explain the lens in {path.name}: they are off by "
+            what=f"k1, k2 and tangential distortion do not explain the lens in {path.name}: they are off by "
             f"{misfit:.1f} px.",
             remedy="Measure the lens with `velatura camera calibrate`, or write focal_length_px into stage.toml.",
         )
-    spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * misfit * np.sqrt(len(rows))
-    spread[:2] /= focal
-    sigmas = np.hypot(spread[[0, 2, 3, 1]], LEAST_SIGMAS)
-    return _in_picture(
-        path,
-        CameraIntrinsics(
-            size_px, float(focal), (float(cx), float(cy)), float(bend / focal), np.diag(sigmas**2), "charuco"
-        ),
-    )
+    focal, cx, cy = (float(value) for value in solved[:3])
+    k1, k2, p1, p2 = (float(value) for value in solved[3:] / focal)
+    spread = np.append(np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * misfit * np.sqrt(len(rows)), 0.0)
+    spread[[0, 3, 4, 5, 6]] /= focal
+    other = (k2, p1, p2, float(np.log(aspect)))
+    covariance = np.diag(np.hypot(spread, LEAST_SIGMAS) ** 2)
+    lens = CameraIntrinsics(size_px, focal, (cx, cy * aspect), k1, covariance, "charuco", other_terms=other)
+    return _in_picture(path, lens)
 
 
 def _in_picture(path: Path, lens: CameraIntrinsics) -> CameraIntrinsics:
@@ -224,7 +231,7 @@ def _in_picture(path: Path, lens: CameraIntrinsics) -> CameraIntrinsics:
 
 KEYS: Final = (
     "method", "width_px", "height_px", "focal_length_px", "principal_point_px", "distortion_k1", "rms_px", "views",
-    "covariance",
+    "covariance", *OTHER_KEYS,
 )  # fmt: skip
 
 
@@ -253,9 +260,9 @@ def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
     width, height = (number(key, content.get(key), 0.0) for key in ("width_px", "height_px"))
     x, y = numbers("principal_point_px", 2, content.get("principal_point_px"))
     rows = content.get("covariance")
-    if not (isinstance(rows, list) and len(rows) == len(PARAMETERS)):
-        raise invalid("covariance", "four lists of four numbers")
-    covariance = np.array([numbers("covariance", len(PARAMETERS), row) for row in rows])
+    if not (isinstance(rows, list) and len(rows) in (4, len(PARAMETERS))):
+        raise invalid("covariance", "four lists of four numbers, or eight of eight")
+    covariance = np.array([numbers("covariance", len(rows), row) for row in rows])
     if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0:
         raise invalid("covariance", "symmetric and positive definite")
     method: Literal["charuco", "exif"] = "exif" if content.get("method") == "exif" else "charuco"
@@ -268,5 +275,6 @@ def _checked(path: Path, content: Mapping[str, Any]) -> CameraIntrinsics:
         method=method,
         rms_px=number("rms_px", content.get("rms_px", 0.0)),
         views=int(number("views", content.get("views", 0))),
+        other_terms=tuple(number(key, content.get(key, 0.0)) for key in OTHER_KEYS),
     )
     return _in_picture(path, lens)

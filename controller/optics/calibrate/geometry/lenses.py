@@ -39,11 +39,20 @@ LARGEST_RMS_PX: Final = 2.0
 LARGEST_BEND_PX: Final = 0.3
 """Rms of what is off alike in neighbouring corners: paper and detector stay below, another lens model explains it."""
 MOST_SIGMAS: Final = 4.0
-LEAST_SIGMAS: Final = np.array([3e-4, 0.3, 0.3, 1e-3])
-"""What a printed board that is not quite flat leaves uncertain, however many corners there are (log f, cx, cy, k1)."""
-FLAGS: Final = (
-    cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-)  # the bundle adjustment has k1 alone, and must get the k1 that stands for all of them
+LEAST_SIGMAS: Final = np.array([3e-4, 0.3, 0.3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+"""What a printed board that is not quite flat leaves uncertain of ``PARAMETERS``, however many corners there are."""
+TERMS: Final = {
+    "stretch": ((8,), 0),
+    "aspect": ((7,), cv2.CALIB_FIX_ASPECT_RATIO),
+    "tangential": ((5, 6), cv2.CALIB_ZERO_TANGENT_DIST),
+    "k2": ((4,), cv2.CALIB_FIX_K2),
+}
+"""What a fit can have beside focal length, centre and k1: columns of ``_LensFit.columns``, OpenCV's flag without it.
+
+Stretch is the board's: a printer that makes one side longer.
+"""
+UNDECIDED: Final = 10.0
+"""Difference of two information criteria below which the corners do not choose between two causes."""
 
 Grey = npt.NDArray[np.uint8]
 
@@ -73,20 +82,20 @@ def find_corners(photograph: Grey) -> BoardView | None:
 
 
 def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> CameraIntrinsics:
-    """Focal length, principal point and k1 with their covariance, from the board's corners in several photographs.
+    """Focal length, centre and distortion with their covariance, from the board's corners in several photographs.
 
     ``size_px``: (width, height) of the photographs, which were taken with the zoom and focus of the stage
 
     Raises CalibrationError("camera-too-few-views", "camera-views-parallel", "camera-fit-poor": no lens explains the
-    corners, or "camera-lens-unlike": one focal length and k1 do not).
+    corners, or "camera-lens-unlike": they are off in whole areas, or two causes explain them alike).
     """
     _require_enough(views)
-    fit = _fit(views, size_px)
+    fit = _fit_lens(views, size_px, ("aspect", "tangential", "k2"))
     scatter = float(np.sqrt(np.mean([np.mean(off**2) for off in fit.off_px])))
     kept = [_trimmed(view, off, MOST_SIGMAS * max(scatter, 0.02)) for view, off in zip(views, fit.off_px, strict=True)]
     kept = [view for view in kept if len(view.board) >= FEWEST_CORNERS]
     _require_enough(kept)
-    fit = _fit(kept, size_px)
+    fit = _simplest(kept, size_px)
     covariance = fit.covariance()
     rms_px = float(np.sqrt(np.mean(np.concatenate([off.ravel() ** 2 for off in fit.off_px]))))
     if rms_px > LARGEST_RMS_PX:
@@ -95,8 +104,7 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
             what=f"No lens model explains the corners of the board: they are off by {rms_px:.1f} px rms.",
             remedy="Do not change zoom and focus between photographs, and mount the board flat on something stiff.",
         )
-    factor, other = _require_alike(fit, size_px)
-    covariance = covariance * factor + np.diag((other - fit.lens()) ** 2)
+    covariance = covariance * _growth(fit)
     if _tilt_degrees(fit.turns) < LEAST_TILT_DEGREES or covariance[0, 0] > LARGEST_FOCAL_REL_SIGMA**2:
         raise CalibrationError(
             "camera-views-parallel",
@@ -104,12 +112,14 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
             "separated.",
             remedy="Turn the board by 20 to 45 degrees to the left, right, up and down between photographs.",
         )
+    used = 8 if set(fit.terms) - {"stretch"} else 4
     return CameraIntrinsics(
         size_px=size_px,
         focal_px=float(fit.matrix[0, 0]),
         centre_px=(float(fit.matrix[0, 2]), float(fit.matrix[1, 2])),
         k1=float(fit.distortion[0]),
-        covariance=covariance + np.diag(LEAST_SIGMAS**2),
+        other_terms=(*map(float, fit.distortion[1:4]), float(np.log(fit.matrix[1, 1] / fit.matrix[0, 0]))),
+        covariance=(covariance + np.diag(LEAST_SIGMAS**2))[:used, :used],
         method="charuco",
         rms_px=rms_px,
         views=len(kept),
@@ -118,42 +128,104 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
 
 @dataclass(frozen=True, slots=True)
 class _LensFit:
-    """A lens and the board's poses; ``off_px`` (corners, 2) of each view, found less seen."""
+    """A lens and the board's poses; ``off_px`` (corners, 2) of each view, found less seen; ``terms``: some of TERMS."""
 
     views: Sequence[BoardView]
+    terms: tuple[str, ...]
     matrix: Float64
     distortion: Float64
     turns: list[Float64]
     moves: list[Float64]
     off_px: list[Float64]
 
-    def lens(self) -> Float64:
-        """(4,) log f, cx, cy, k1."""
-        return np.array([np.log(self.matrix[0, 0]), self.matrix[0, 2], self.matrix[1, 2], self.distortion[0]])
+    @property
+    def free(self) -> list[int]:
+        """Columns that were fitted."""
+        return [0, 1, 2, 3, *sorted(column for name in self.terms for column in TERMS[name][0])]
 
-    def covariance(self) -> Float64:
-        """(4, 4) of log f, cx, cy, k1, the poses eliminated, with the corners' own scatter as their noise."""
-        information = np.zeros((4, 4))
-        squares, free = 0.0, -4
+    @property
+    def criterion(self) -> float:
+        """Schwarz's information criterion: of two fits of the same corners the lower is the likelier one."""
+        return self._criterion(0.0, len(self.free))
+
+    @property
+    def asks_for_more(self) -> bool:
+        """Whether all terms together would be likelier, by how the squares fall where they begin."""
+        inverse, gradient = self.inverse(range(9))
+        return self._criterion(float(gradient @ inverse @ gradient), 9) < self.criterion
+
+    def _criterion(self, less: float, terms: int) -> float:
+        off = np.concatenate([off.ravel() for off in self.off_px])
+        return float(off.size * np.log(max(np.sum(off**2) - less, 1e-12)) + terms * np.log(off.size))
+
+    def columns(self, view: BoardView, turn: Float64, move: Float64) -> tuple[Float64, Float64]:
+        """Derivatives of a view's corners by its pose (n, 6), and (n, 9) by ``PARAMETERS`` and the board's stretch."""
+        places, jacobian = cv2.projectPoints(view.board, turn, move, self.matrix, self.distortion)
+        longer = view.board * np.array([1 + STEP, 1, 1], np.float32)
+        moved = cv2.projectPoints(longer, turn, move, self.matrix, self.distortion)[0]
+        stretch = np.asarray((moved - places).reshape(-1, 1) / STEP, np.float64)
+        by_aspect = jacobian[:, 7:8] * self.matrix[1, 1]
+        focal = jacobian[:, 6:7] * self.matrix[0, 0] + by_aspect
+        return np.asarray(jacobian[:, :6]), np.hstack([focal, jacobian[:, 8:14], by_aspect, stretch])
+
+    def inverse(self, free: Sequence[int]) -> tuple[Float64, Float64]:
+        """(9, 9) inverse of the information on columns ``free``, 0 elsewhere; (9,) half the slope of the squares."""
+        information, gradient = np.zeros((len(free), len(free))), np.zeros(9)
         for view, turn, move, off in zip(self.views, self.turns, self.moves, self.off_px, strict=True):
-            _, jacobian = cv2.projectPoints(view.board, turn, move, self.matrix, self.distortion)
-            pose = jacobian[:, :6]
-            focal = (jacobian[:, 6] + jacobian[:, 7]) * self.matrix[0, 0]
-            lens = np.stack([focal, jacobian[:, 8], jacobian[:, 9], jacobian[:, 10]], axis=1)
+            pose, lens = self.columns(view, turn, move)
+            gradient += lens.T @ off.ravel()
+            lens = lens[:, free]
             cross = pose.T @ lens
             information += lens.T @ lens - cross.T @ np.linalg.solve(pose.T @ pose, cross)
-            squares += float(np.sum(off**2))
-            free += off.size - 6
         scale = 1.0 / np.sqrt(np.diag(information))
-        inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-        return np.asarray(inverse * squares / max(free, 1))
+        inverse = np.zeros((9, 9))
+        solved = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        inverse[np.ix_(free, free)] = solved * np.outer(scale, scale)
+        return inverse, gradient
+
+    def covariance(self) -> Float64:
+        """(8, 8) of ``PARAMETERS``, all else eliminated, with the corners' own scatter as their noise."""
+        squares = float(sum(np.sum(off**2) for off in self.off_px))
+        measured = sum(off.size - 6 for off in self.off_px) - len(self.free)
+        return self.inverse(self.free)[0][:8, :8] * squares / max(measured, 1)
 
 
-def _require_alike(fit: _LensFit, size_px: tuple[int, int]) -> tuple[float, Float64]:
-    """What corners that are off alike with their neighbours say: they are not independent, and the lens is another.
+STEP: Final = 1e-3
 
-    In each view, cubic functions of the board's coordinates hold such misfit. Returns the factor of the covariance, and
-    the lens with more terms. Raises CalibrationError("camera-lens-unlike").
+
+def _simplest(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
+    """The lens with as many terms as the corners ask for.
+
+    Raises CalibrationError("camera-lens-unlike") where they do not tell a stretched board from pixels not square.
+    """
+    fit = _fit(views, size_px)
+    if not fit.asks_for_more:
+        return fit
+    fit = min(fit, _fit(views, size_px, tuple(TERMS)), key=lambda one: one.criterion)
+    for name in fit.terms:
+        less = _fit(views, size_px, tuple(term for term in fit.terms if term != name))
+        if less.criterion <= fit.criterion:
+            fit = less
+    if ("stretch" in fit.terms) == ("aspect" in fit.terms):
+        return fit
+    other = {"stretch": "aspect", "aspect": "stretch"}
+    if _fit(views, size_px, tuple(other.get(name, name) for name in fit.terms)).criterion > fit.criterion + UNDECIDED:
+        return fit
+    both = _fit(views, size_px, tuple(name for name in TERMS if name in (*fit.terms, *other)))
+    if both.covariance()[7, 7] < LARGEST_FOCAL_REL_SIGMA**2:
+        return both
+    raise CalibrationError(
+        "camera-lens-unlike",
+        what="Either the camera's pixels are not square, or the board is longer on one side than the other.",
+        remedy="Photograph the board turned by 90 degrees, too, so that the pictures tell which of the two it is.",
+    )
+
+
+def _growth(fit: _LensFit) -> float:
+    """The factor of the covariance for corners that are off alike with their neighbours, and so are not independent.
+
+    In each view, cubic functions of the board's coordinates hold such misfit. Raises
+    CalibrationError("camera-lens-unlike").
     """
     alike, alone, whole, free = 0.0, 0.0, 0, 0
     for view, off in zip(fit.views, fit.off_px, strict=True):
@@ -166,24 +238,17 @@ def _require_alike(fit: _LensFit, size_px: tuple[int, int]) -> tuple[float, Floa
     own = (CUBIC - 6) * len(fit.views)
     bend = max(alike - own * noise, 0.0) / whole
     if bend > max(LARGEST_BEND_PX**2, noise):
-        other = _fit(fit.views, size_px, cv2.CALIB_FIX_K3).matrix
         raise CalibrationError(
             "camera-lens-unlike",
-            what=f"One focal length and one distortion term do not explain the corners: whole areas are off by "
-            f"{math.sqrt(bend):.1f} px. With more terms the focal lengths are {other[0, 0]:.0f} px across and "
-            f"{other[1, 1]:.0f} px down.",
+            what="Focal lengths, radial and tangential distortion do not explain the corners: whole areas are off by "
+            f"{math.sqrt(bend):.1f} px.",
             remedy="Give all photographs as the camera took them, unturned and uncropped, with the stabiliser off and "
             "the board flat. If the lens is very wide, use a longer one, or write focal_length_px and "
             "focal_length_rel_sigma = 0.02 into stage.toml.",
         )
-    factor = (noise + bend * whole / own) / max(noise + bend, 1e-12)
-    if bend < WEAKEST * noise:
-        return factor, fit.lens()
-    return factor, _fit(fit.views, size_px, cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_ASPECT_RATIO).lens()
+    return (noise + bend * whole / own) / max(noise + bend, 1e-12)
 
 
-WEAKEST: Final = 0.05
-"""Of the noise's variance: less misfit shows no other lens."""
 CUBIC: Final = 20
 """Cubic functions of two coordinates, of x and of y; six of their sums are the board's pose."""
 
@@ -203,7 +268,17 @@ def _require_enough(views: Sequence[BoardView]) -> None:
         )
 
 
-def _fit(views: Sequence[BoardView], size_px: tuple[int, int], flags: int = FLAGS) -> _LensFit:
+def _fit(views: Sequence[BoardView], size_px: tuple[int, int], terms: tuple[str, ...] = ()) -> _LensFit:
+    fit = _fit_lens(views, size_px, terms)
+    for _ in range(3 * ("stretch" in terms)):
+        inverse, gradient = fit.inverse(fit.free)
+        longer = np.array([np.clip(1 - inverse[8, 8] * gradient[8], 0.9, 1.1), 1, 1], np.float32)
+        fit = _fit_lens([BoardView(view.board * longer, view.seen_px) for view in fit.views], size_px, terms)
+    return fit
+
+
+def _fit_lens(views: Sequence[BoardView], size_px: tuple[int, int], terms: tuple[str, ...]) -> _LensFit:
+    flags = cv2.CALIB_FIX_K3 | sum(flag for name, (_, flag) in TERMS.items() if name not in terms)
     try:
         _, matrix, distortion, turns, moves = cv2.calibrateCamera(
             [view.board for view in views],
@@ -223,15 +298,9 @@ def _fit(views: Sequence[BoardView], size_px: tuple[int, int], flags: int = FLAG
     for view, turn, move in zip(views, turns, moves, strict=True):
         corners, _ = cv2.projectPoints(view.board, turn, move, matrix, distortion)
         off.append(np.asarray(corners.reshape(-1, 2) - view.seen_px, dtype=np.float64))
-    lens = np.asarray(distortion, dtype=np.float64).ravel()
-    return _LensFit(
-        views,
-        np.asarray(matrix, dtype=np.float64),
-        lens,
-        [np.asarray(t, np.float64) for t in turns],
-        [np.asarray(m, np.float64) for m in moves],
-        off,
-    )
+    poses = [[np.asarray(one, np.float64) for one in part] for part in (turns, moves)]
+    bent = np.asarray(distortion, np.float64).ravel()
+    return _LensFit(views, terms, np.asarray(matrix, np.float64), bent, poses[0], poses[1], off)
 
 
 def _trimmed(view: BoardView, off_px: Float64, most_px: float) -> BoardView:
@@ -337,7 +406,7 @@ def bend_px(lens: Pinhole) -> float:
     corners = np.array([(x, y) for x in (0, width) for y in (0, height)], np.float64)
     focal = lens.matrix[[0, 1], [0, 1]]
     squared = np.sum(((corners - lens.matrix[:2, 2]) / focal) ** 2, axis=1)
-    k1, k2 = lens.distortion
+    k1, k2 = lens.distortion[:2]
     return float(np.max(np.abs(k1 * squared + k2 * squared**2) * np.sqrt(squared)) * focal.mean())
 
 

@@ -5,7 +5,10 @@ Compiled and single-threaded on purpose: the matrices are so small that threads 
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numba.extending import register_jitable
 
 from controller.core.arrays import Float64, Mask
 from controller.core.jit import compiled
@@ -17,6 +20,7 @@ LENS = 4
 NEAREST = 1e-4
 """Along a projector's view axis, in baselines: anything nearer counts as behind the projector."""
 BEHIND_PX = 1e6
+Numbers = TypeVar("Numbers", float, Float64)
 
 
 @compiled()
@@ -34,15 +38,43 @@ def straightening(k1: float, squared: float) -> float:
     return s
 
 
+@register_jitable
+def bending(x: Numbers, y: Numbers, k1: float, k2: float, p1: float, p2: float) -> tuple[Numbers, ...]:
+    """Where OpenCV's lens puts ``x``, ``y`` at depth 1, and derivatives: x by x, either by the other, y by y."""
+    r2 = x * x + y * y
+    radial, grows = 1.0 + r2 * (k1 + r2 * k2), 2.0 * (k1 + 2.0 * k2 * r2)
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    x_by_x = radial + grows * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    y_by_y = radial + grows * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    return bent_x, bent_y, x_by_x, grows * x * y + 2.0 * (p1 * x + p2 * y), y_by_y
+
+
 @compiled()
 def undistort(lens: Float64, px: Float64) -> Float64:
-    """(points, 2) x, y at depth 1 of pixels (points, 2); ``lens``: log f, cx, cy, k1."""
+    """(points, 2) x, y at depth 1 of pixels (points, 2); ``lens`` (8,): log f, cx, cy, k1, k2, p1, p2, log fy/fx.
+
+    A lens of the first four alone has zeros for the others.
+    """
     focal, k1 = np.exp(lens[0]), lens[3]
+    k2, p1, p2, aspect = 0.0, 0.0, 0.0, 1.0
+    if lens.size > LENS:
+        k2, p1, p2, aspect = lens[4], lens[5], lens[6], np.exp(lens[7])
     out = np.empty((len(px), 2))
     for p in range(len(px)):
-        x, y = (px[p, 0] - lens[1]) / focal, (px[p, 1] - lens[2]) / focal
-        s = straightening(k1, x * x + y * y)
-        out[p, 0], out[p, 1] = s * x, s * y
+        to_x, to_y = (px[p, 0] - lens[1]) / focal, (px[p, 1] - lens[2]) / (focal * aspect)
+        if k2 == 0.0 and p1 == 0.0 and p2 == 0.0:
+            s = straightening(k1, to_x * to_x + to_y * to_y)
+            x, y = s * to_x, s * to_y
+        else:
+            x, y = to_x, to_y
+            for _ in range(30):
+                bent_x, bent_y, a, b, c = bending(x, y, k1, k2, p1, p2)
+                off_x, off_y, size = bent_x - to_x, bent_y - to_y, max(a * c - b * b, 0.1)
+                x, y = x - (c * off_x - b * off_y) / size, y - (a * off_y - b * off_x) / size
+                if abs(off_x) + abs(off_y) < 1e-13:
+                    break
+        out[p, 0], out[p, 1] = x, y
     return out
 
 

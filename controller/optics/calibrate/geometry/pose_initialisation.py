@@ -206,8 +206,10 @@ def sample_pixels(correspondences: Sequence[Correspondence], most: int) -> tuple
 def solve_pair(problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, int]) -> Pair | None:
     """Candidates for one projector from its correspondences alone; None where no epipolar geometry fits them."""
     seen = np.flatnonzero(problem.seen[:, index])
-    camera_px, observed = problem.camera_px[seen], problem.projector_px[seen, index]
-    focal = float(np.exp(problem.camera_prior[0]))
+    observed = problem.projector_px[seen, index]
+    focal, middle = float(np.exp(problem.camera_prior[0])), problem.camera_prior[1:3]
+    rays = ba.undistorted(problem.camera_prior, problem.camera_px[seen])
+    camera_px = focal * rays + middle  # as a lens without distortion puts them
     # MAGSAC measures in both images with one threshold: bring the camera's pixels to the projector's size
     shrink = float(np.sqrt(_spread(observed) / max(_spread(camera_px), 1e-9)))
     fit = fundamental(camera_px * shrink, observed)
@@ -217,11 +219,8 @@ def solve_pair(problem: ba.AdjustmentProblem, index: int, size_px: tuple[int, in
     noise = 1.4826 * float(np.median(epipolar_distance_px(matrix, camera_px[fits], observed[fits])))
     inliers = np.zeros(len(problem.seen), dtype=np.bool_)
     inliers[seen[fits]] = True
-    rays = ba.undistorted(problem.camera_prior, camera_px[fits])
-    camera_matrix = np.array(
-        [[focal, 0, problem.camera_prior[1]], [0, focal, problem.camera_prior[2]], [0, 0, 1.0]], dtype=np.float64
-    )
-    starts = candidates(matrix, rays, camera_matrix, observed[fits], size_px, _CANDIDATES)
+    camera_matrix = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1.0]], dtype=np.float64)
+    starts = candidates(matrix, rays[fits], camera_matrix, observed[fits], size_px, _CANDIDATES)
     chosen = seen[fits][:: max(1, int(fits.sum()) // _PAIR_POINTS)]
     small = replace(restricted(problem, chosen, [index]), noise_px=max(noise, 0.02))
     solved = []

@@ -230,7 +230,7 @@ def _problem(
         camera_px,
         projector_px,
         seen,
-        np.array([np.log(prior.focal_length_px), x, y, prior.distortion_k1]),
+        np.array([np.log(prior.focal_length_px), x, y, prior.distortion_k1, *prior.other_terms]),
         np.array([prior.focal_length_rel_sigma, sigma, sigma, prior.distortion_sigma]),
         shapes,
         widths,
@@ -358,7 +358,7 @@ def _shape_sigma(problem: ba.AdjustmentProblem, adjusted: ba.Adjusted) -> float:
 
 
 def _refuse_if_contradicted(problem: ba.AdjustmentProblem, state: ba.AdjustmentState) -> None:
-    off = np.abs(state.camera - problem.camera_prior) / problem.camera_sigma
+    off = np.abs(state.camera - problem.camera_prior)[: ba.CAMERA_PARAMETERS] / problem.camera_sigma
     if float(off.max()) > _LARGEST_PRIOR_SIGMAS:
         raise CalibrationError(
             "camera-prior-contradicted",

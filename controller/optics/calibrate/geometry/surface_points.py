@@ -319,16 +319,14 @@ def _surface(raw: FloatImage, rays: FloatImage, focal_px: float) -> tuple[FloatI
 def _ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
     """(rows, columns, 2) float32 undistorted x, y at depth 1 of every camera pixel."""
     width, height = size
-    focal, k1 = np.exp(camera[0]), camera[3]
-    distorted_x, distorted_y = (np.arange(width) - camera[1]) / focal, (np.arange(height)[:, None] - camera[2]) / focal
-    x, y = distorted_x, distorted_y
-    for _ in range(8):
-        bent = 1.0 + k1 * (x * x + y * y)
-        x, y = distorted_x / bent, distorted_y / bent
-    return np.stack([x, y], axis=2, dtype=np.float32, casting="same_kind")
+    rays = np.empty((height, width, 2), np.float32)
+    for row in range(height):
+        rays[row] = ba.undistorted(camera, np.stack([np.arange(width), np.full(width, row)], axis=1, dtype=np.float64))
+    return rays
 
 
 def _pinhole(lens: Float64, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:
-    focal = float(np.exp(lens[0]))
-    matrix = np.array([[focal, 0.0, lens[1]], [0.0, focal, lens[2]], [0.0, 0.0, 1.0]])
-    return Pinhole(matrix, np.array([float(lens[3]), 0.0]), rotation.copy(), -rotation @ centre_m, size)
+    lens = np.append(lens, np.zeros(8 - len(lens)))
+    fx, fy = np.exp(lens[0]), np.exp(lens[0] + lens[7])
+    matrix = np.array([[fx, 0.0, lens[1]], [0.0, fy, lens[2]], [0.0, 0.0, 1.0]])
+    return Pinhole(matrix, lens[3:7], rotation.copy(), -rotation @ centre_m, size)

@@ -119,8 +119,9 @@ class CameraPrior:
 
     ``focal_length_rel_sigma``: 0.001 after a ChArUco session, 0.01-0.03 from EXIF.
     ``principal_point_px`` (x, y): the middle of the image if None; ``principal_point_sigma_px``: 0.5 % of the width if
-    None. ``distortion_k1`` with its ``distortion_sigma``. ``distance_m``: from the front of the lens to the nearest
-    visible point of the object. ``distances``: between points of the picture; they tell the scale better.
+    None. ``distortion_k1`` with its ``distortion_sigma``. ``other_terms``: k2, p1, p2 and log fy/fx, which stay as they
+    are; ``focal_length_px`` is then fx. ``distance_m``: from the front of the lens to the nearest visible point of the
+    object. ``distances``: between points of the picture; they tell the scale better.
     ``size_px`` of the picture that the focal length belongs to, if that is known.
     """
 
@@ -134,6 +135,7 @@ class CameraPrior:
     distortion_k1: float = 0.0
     distances: tuple[MeasuredDistance, ...] = ()
     size_px: tuple[int, int] | None = None
+    other_terms: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Raises UsageError("camera-prior-invalid")."""

@@ -21,6 +21,7 @@ from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
 from controller.optics.calibrate.correspondence.captures import Captures, coloured
 from controller.optics.calibrate.correspondence.phase_map import invert_map
+from controller.optics.calibrate.geometry.normal_equations import bending
 from controller.optics.calibrate.metapixels.from_phase import carry_covariance
 from controller.optics.calibrate.metapixels.gaussian_fit import PARAMETERS, fit_gaussian
 from controller.optics.calibrate.values import Correspondence, Geometry, Metapixels, Pinhole
@@ -86,8 +87,7 @@ def project(pinhole: Pinhole, points_m: Float64) -> tuple[Float64, Float64]:
     depth = local[..., 2]
     with np.errstate(invalid="ignore", divide="ignore"):
         xy = local[..., :2] / depth[..., None]
-    r2 = np.sum(xy * xy, axis=-1, keepdims=True)
-    xy = xy * (1 + pinhole.distortion[0] * r2 + pinhole.distortion[1] * r2 * r2)
+    xy = np.stack(bending(xy[..., 0], xy[..., 1], *pinhole.distortion)[:2], axis=-1)
     return xy @ pinhole.matrix[:2, :2].T + pinhole.matrix[:2, 2], depth
 
 

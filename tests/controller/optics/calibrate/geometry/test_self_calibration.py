@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -47,6 +48,14 @@ def looking_at(centre: Array, target: Array, roll: float) -> Array:
     return np.asarray(turn(2, roll) @ np.stack([x, np.cross(z, x), z]), dtype=np.float64)
 
 
+def opencv_lens(lens: CameraPrior) -> tuple[Array, Array]:
+    k2, p1, p2, log_aspect = lens.other_terms
+    assert lens.principal_point_px is not None
+    x, y = lens.principal_point_px
+    matrix = np.array([[lens.focal_length_px, 0, x], [0, lens.focal_length_px * np.exp(log_aspect), y], [0, 0, 1]])
+    return matrix, np.array([lens.distortion_k1, k2, p1, p2])
+
+
 def make_stage(
     seed: int,
     *,
@@ -59,8 +68,9 @@ def make_stage(
     focal_error: float = 0.01,
     lens: tuple[float, float] = (0.0, 0.0),
     projector_px: tuple[int, int] = PROJECTOR,
+    camera_lens: CameraPrior | None = None,
 ) -> Stage:
-    """``lens``: k1 and k2 of every projector, about its principal point."""
+    """``lens``: k1 and k2 of every projector, about its principal point; ``camera_lens`` instead of the usual one."""
     rng = np.random.default_rng(seed)
     width, height = camera
     focal = 1.55 * width
@@ -69,6 +79,13 @@ def make_stage(
     xy = distorted
     for _ in range(20):
         xy = distorted / (1 + k1 * np.sum(xy**2, axis=2, keepdims=True))
+    if camera_lens is not None:
+        focal = camera_lens.focal_length_px
+        matrix, terms = opencv_lens(camera_lens)
+        seen = np.stack([column, row], axis=2).reshape(-1, 1, 2).astype(float)
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-13)
+        flat = cv2.undistortPointsIter(seen, matrix, terms, np.eye(3), np.eye(3), until)
+        xy = np.asarray(flat, np.float64).reshape(height, width, 2)
     waves = rng.uniform(8, 22, (5, 2)) * rng.choice([-1, 1], (5, 2))
     phases = rng.uniform(0, 6.28, 5)
 
@@ -214,6 +231,28 @@ def test_projectors_in_another_order_give_the_same_stage(stage: Stage, found: Re
     for n, own in zip(order, again.geometry.projectors, strict=True):
         np.testing.assert_allclose(own.matrix, found.geometry.projectors[n].matrix, rtol=1e-3, atol=0.05)
         np.testing.assert_allclose(own.translation_m, found.geometry.projectors[n].translation_m, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("k1", "terms"),
+    [(-0.9, (1.0, 0.0, 0.0, 0.0)), (-0.05, (0.0, 0.02, -0.03, 0.0)), (-0.05, (0.0, 0.0, 0.0, np.log(1380 / 1300)))],
+)
+def test_a_camera_lens_with_more_terms_costs_no_shape(k1: float, terms: tuple[float, float, float, float]) -> None:
+    wide = CameraPrior(
+        1.55 * CAMERA[0], 0.001, (0.5 * CAMERA[0] + 2.0, 0.5 * CAMERA[1] - 3.0), 0.5, 0.005,
+        distortion_k1=k1, other_terms=terms,
+    )  # fmt: skip
+    stage = make_stage(5, camera_lens=wide)
+    found = reconstruct(stage.correspondences, CAMERA, [stage.projector_px] * 3, wide)
+    assert shape_error_m(stage, found) < 4e-4
+    seen = found.geometry.camera
+    matrix, distortion = opencv_lens(wide)
+    rays = stage.points[np.isfinite(found.geometry.points_m[..., 2])]
+    theirs, ours = (
+        cv2.projectPoints(rays, np.zeros(3), np.zeros(3), *one)[0].reshape(-1, 2)
+        for one in ((matrix, distortion), (seen.matrix, seen.distortion))
+    )
+    assert np.max(np.abs(theirs - ours)) < 1.0
 
 
 BENT = [(0.02, -0.005), (-0.04, 0.01), (0.06, 0.0), (-0.06, 0.0)]
