@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from controller.api.captures import CaptureSet
 from controller.core.errors import CalibrationError, UsageError
-from controller.optics.calibrate.correspondence import any_code
 from controller.optics.calibrate.correspondence import decode as correspondence_decode
+from controller.optics.calibrate.correspondence.captures import check_still, inconsistent
 from controller.optics.calibrate.correspondence.colour_alignment import ColourPlaces, colour_shifts, colours_apart
 from controller.optics.calibrate.metapixels.from_phase import FittedPixels, fit_pixels
 from controller.optics.calibrate.photometry.colour_tiles import tile_code
@@ -93,13 +93,12 @@ def _check_same_camera(captures: CaptureSet, steps: list[str]) -> None:
         colours, later = (np.nanmean(one, axis=(0, 1)) / np.nanmean(one) for one in (ends, mean))
         off, exchanged = np.abs(later - colours).max(), np.abs(later[::-1] - colours).max()
         if off > EXCHANGED and exchanged < off / 4:
-            raise CalibrationError(
-                "captures-inconsistent",
-                what="Red and blue of the sinusoids are exchanged against those of black and white.",
-                remedy="Read all photographs in one way: OpenCV's imread gives blue first.",
+            raise inconsistent(
+                "red and blue of the sinusoids are exchanged against those of black and white",
+                "Read all photographs in one way: OpenCV's imread gives blue first.",
             )
         ends, mean = ends.sum(axis=2), mean.sum(axis=2)
-    any_code.check_still(ends, mean, "white and the sinusoids")
+    check_still(ends, mean, "white and the sinusoids")
 
 
 EXCHANGED = 0.04

@@ -241,7 +241,7 @@ def overexposed(name: str, image: Any) -> Any:
     ("change", "size", "code", "words"),
     [
         (moved, SCENE.projector_px, "captures-inconsistent", "camera moved by .* px between white and the sinusoids"),
-        (colours_exchanged, SCENE.projector_px, "captures-inconsistent", "Red and blue"),
+        (colours_exchanged, SCENE.projector_px, "captures-inconsistent", "red and blue"),
         (overexposed, SCENE.projector_px, "captures-overexposed", "clipped"),
         (lambda name, image: image, SCENE.projector_px[::-1], "projector-size-wrong", "48x64"),
     ],

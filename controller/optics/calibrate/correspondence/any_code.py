@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
-from controller.core.errors import CalibrationError
 from controller.core.jit import compiled
+from controller.optics.calibrate.correspondence.captures import check_still, inconsistent
 from controller.optics.calibrate.values import Correspondence
 
 SURE, CLEAR, POSSIBLE = 6.0, 1.75, 0.25
@@ -33,13 +33,12 @@ UNLIKE: Final = 0.15
 """Of the light: a picture and its opposite always add up to the same, up to noise and the lamp's flicker."""
 SETTLED: Final = 1e-4
 """Of all pixels: fewer that lose their neighbours are not looked for."""
-STILL_PX: Final = 0.4
 LEVELS: Final = 16
 FEWEST: Final = 100
-LINES: Final = 256
+LINES: Final = 64
 REACH: Final = 8
 """Camera px over which the direction of x and y is looked at."""
-SOME: Final = 400_000
+SOME: Final = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +96,7 @@ def decode_any(
     valid = _with_neighbours(cells, sure)
     found = int(np.count_nonzero(valid & clear))
     if np.count_nonzero(clear) >= FEWEST and found < 0.3 * np.count_nonzero(clear):
-        raise _wrong("the code jumps from pixel to pixel", "Give the bits in the order in which they were shown.")
+        raise inconsistent("the code jumps from pixel to pixel", "Give the bits in the order in which they were shown.")
     if not mirrored:
         _check_mirrored(cells, valid & clear)
     position = np.full((*valid.shape, 2), np.nan, np.float32)
@@ -147,9 +146,8 @@ class _Code:
 def _read(bits: Bits, axis: str) -> _Code:
     code: _Code | None = None
     for number, (picture, opposite) in enumerate(bits.pairs):
-        # clipped light is at least full scale, so a difference with it is at least as large as it looks
-        first, second = (np.where(np.isfinite(one), one, np.float32(1)) for one in (picture, opposite))
-        difference = np.asarray(channels.mean(first - second), np.float32)
+        first, second = _light(picture), _light(opposite)
+        difference = first - second
         if code is None:
             a, b, c, d, e = (np.zeros(difference.shape, np.float32) for _ in range(5))
             code = _Code(a.astype(np.int32), np.full_like(a, np.inf), a, b, c, d, e)
@@ -161,14 +159,14 @@ def _read(bits: Bits, axis: str) -> _Code:
             np.maximum(code.finer, size, out=code.finer)
         code.seen.append(float(np.percentile(size.ravel()[:: max(1, size.size // SOME)], 99)))
         if bits.opposites:
-            code.last = np.asarray(channels.mean(first + second), np.float32)
+            code.last = first + second
             code.total += code.last
             code.square += code.last * code.last
             code.count += 1
     assert code is not None
     for number, seen in enumerate(code.seen, 1):
         if seen < EMPTY * max(code.seen):
-            raise _wrong(
+            raise inconsistent(
                 f"the picture of bit {number} of {axis} and its opposite show the same",
                 "Give two different files for it. If they are, the camera was late by one picture: take them again.",
             )
@@ -176,6 +174,15 @@ def _read(bits: Bits, axis: str) -> _Code:
 
 
 COARSE: Final = 3
+
+
+def _light(picture: FloatImage) -> FloatImage:
+    """(rows, columns) of three colours. Clipped light is at least full scale, so differences are at least as large."""
+    light = np.asarray(cv2.transform(picture, np.full((1, 3), 1 / 3, np.float32)), np.float32)
+    clipped = ~np.isfinite(light)
+    if clipped.any():
+        light[clipped] = channels.mean(np.where(np.isfinite(picture[clipped]), picture[clipped], np.float32(1)))
+    return light
 
 
 def _certainty(codes: tuple[_Code, _Code]) -> FloatImage:
@@ -202,7 +209,7 @@ def _certainty(codes: tuple[_Code, _Code]) -> FloatImage:
     unlike = codes[1].last - light
     shape = np.std(cv2.blur(unlike, (5, 5))) > 0.5 * np.std(unlike)  # noise has none
     if shape and np.median(np.sqrt(spread[lit])) > UNLIKE * np.median(largest.ravel()[::step][lit]):
-        raise _wrong(
+        raise inconsistent(
             "pictures and their opposites do not add up to the same light",
             "Check that each pair holds the two pictures of one bit, and that the exposure is fixed. If so, the camera "
             "was late by one picture: take them again.",
@@ -244,9 +251,10 @@ def _steps(pairs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
 def _check_order(code: _Code, clear: Mask, axis: str) -> None:
     """Compare the code with what other orders of its pictures would give; the right one has the shortest steps."""
     bits, gray = len(code.seen), _beside(code.gray, clear)
-    steps = _steps(_binary(gray))
-    if steps.size < FEWEST:
+    if gray.shape[1] < FEWEST:
         return
+    gray = gray[:, gray[0] != gray[1]]  # what looks at one cell does so in every order
+    steps = _steps(_binary(gray))
     orders = {"its bits begin with the finest": list(range(bits))[::-1]}
     for bit in range(1, bits):
         orders[f"bits {bit} and {bit + 1} are exchanged"] = [*range(bit - 1), bit, bit - 1, *range(bit + 1, bits)]
@@ -264,7 +272,9 @@ def _check_order(code: _Code, clear: Mask, axis: str) -> None:
         if shorter > 4 * longer and shorter - longer > best:
             best, fault = shorter - longer, what
     if fault:
-        raise _wrong(f"the code of {axis} jumps as if {fault}", "Correct the order of the files in captures.toml.")
+        raise inconsistent(
+            f"the code of {axis} jumps as if {fault}", "Correct the order of the files in captures.toml."
+        )
 
 
 def _check_range(seen_px: npt.NDArray[np.int32], bits: Bits, count: int, size_px: int, axis: str) -> None:
@@ -277,7 +287,9 @@ def _check_range(seen_px: npt.NDArray[np.int32], bits: Bits, count: int, size_px
         remedy = (
             f"The code seems to be centred in its power of two: write offset_px with {spare} for {axis} below [gray]."
         )
-    raise _wrong(f"the code of {axis} reaches from {low} to {high}, and the projector has {size_px} px there", remedy)
+    raise inconsistent(
+        f"the code of {axis} reaches from {low} to {high}, and the projector has {size_px} px there", remedy
+    )
 
 
 def _check_mirrored(cells: list[npt.NDArray[np.int32]], valid: Mask) -> None:
@@ -290,46 +302,11 @@ def _check_mirrored(cells: list[npt.NDArray[np.int32]], valid: Mask) -> None:
         return
     turned = np.abs(y).mean() + np.abs(x_down).mean() > np.abs(x).mean() + np.abs(y_down).mean()
     fault = "the picture is mirrored, as if the picture of the coarsest bit and its opposite were exchanged"
-    raise _wrong(
+    raise inconsistent(
         "x and y seem to be exchanged" if turned else fault,
         "Correct the lists in captures.toml. If a mirror or a screen that is lit from behind turns the picture, write "
         "mirrored = true below [gray].",
     )
-
-
-def check_still(first: FloatImage, second: FloatImage, what: str) -> None:
-    """Refuse pictures of one scene, (rows, columns) light up to a factor, between which the camera moved.
-
-    Raises CalibrationError("captures-inconsistent").
-    """
-    a, b = (
-        cv2.GaussianBlur(np.nan_to_num(one / np.nanmean(one)).astype(np.float32), (0, 0), 2.0)
-        for one in (first, second)
-    )
-    moved = np.zeros(2)
-    down, across = np.gradient(a)
-    slopes = np.stack([across.ravel(), down.ravel()])
-    normal = slopes @ slopes.T
-    if np.linalg.matrix_rank(normal) < 2:
-        return
-    for _ in range(6):
-        shifted = cv2.warpAffine(
-            b,
-            np.array([[1, 0, moved[0]], [0, 1, moved[1]]]),
-            a.shape[::-1],
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        moved -= np.linalg.solve(normal, slopes @ (shifted - a).ravel())
-    if np.hypot(*moved) > STILL_PX:
-        raise _wrong(
-            f"the camera moved by {np.hypot(*moved):.1f} px between {what}",
-            "Fix the camera, and take the photographs again.",
-        )
-
-
-def _wrong(why: str, remedy: str) -> CalibrationError:
-    return CalibrationError("captures-inconsistent", what=f"The pictures do not fit together: {why}.", remedy=remedy)
 
 
 def _with_neighbours(cells: list[npt.NDArray[np.int32]], sure: FloatImage) -> Mask:

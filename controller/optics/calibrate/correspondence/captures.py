@@ -57,6 +57,33 @@ def grey(captures: Captures, name: str, shape: tuple[int, ...] | None = None) ->
     return np.asarray(cv2.transform(image, np.ones((1, 3), np.float32)), np.float32).reshape(image.shape[:2])
 
 
+def inconsistent(why: str, remedy: str) -> CalibrationError:
+    """The error for photographs that can't be of one scene, or not in this order."""
+    return CalibrationError("captures-inconsistent", what=f"The pictures do not fit together: {why}.", remedy=remedy)
+
+
+STILL_PX, BLUR_PX = 0.4, 7
+
+
+def check_still(first: FloatImage, second: FloatImage, what: str) -> None:
+    """Refuse pictures of one scene, (rows, columns) light up to a factor, between which the camera moved.
+
+    Raises CalibrationError("captures-inconsistent").
+    """
+    a, b = (cv2.pyrDown(np.nan_to_num(one / np.nanmean(one)).astype(np.float32)) for one in (first, second))
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-7)
+    start = np.eye(2, 3, dtype=np.float32)
+    try:
+        _, found = cv2.findTransformECC(a, b, start, cv2.MOTION_TRANSLATION, until, np.ones(a.shape, np.uint8), BLUR_PX)
+    except cv2.error:
+        return  # a picture without contrast shows no motion
+    moved = 2 * float(np.hypot(*found[:, 2]))
+    if moved > STILL_PX:
+        raise inconsistent(
+            f"the camera moved by {moved:.1f} px between {what}", "Fix the camera, and take the photographs again."
+        )
+
+
 LIT_SHARE: Final = 0.05
 """Of the 99th percentile of white: darker camera pixels add noise and stray light."""
 

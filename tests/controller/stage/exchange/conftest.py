@@ -28,17 +28,23 @@ def two_projectors() -> Geometry:
     )
     turn = cv2.Rodrigues(np.array([-0.05, -0.3, 0.1]))[0].astype(np.float64)
     matrix = np.array([[300.0, 0, 285.0], [0, 302.0, 70.0], [0, 0, 1]])
-    second = Pinhole(matrix, np.array([-0.05, 0.01]), turn, np.array([-0.3, 0.0, 0.05]), (210, 150))
+    second = Pinhole(matrix, np.array([-0.05, 0.01, 0.004, -0.003]), turn, np.array([-0.3, 0.0, 0.05]), (210, 150))
     return replace(one, projectors=(first, second))
 
 
 def opencv_px(own: Pinhole, points_m: FloatImage) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """What OpenCV says of (points, 3): it shares no code with ours."""
     px, _ = cv2.projectPoints(
-        points_m.astype(np.float64), cv2.Rodrigues(own.rotation)[0], own.translation_m, own.matrix,
-        np.array([*own.distortion, 0, 0]),
-    )  # fmt: skip
+        points_m.astype(np.float64), cv2.Rodrigues(own.rotation)[0], own.translation_m, own.matrix, own.distortion
+    )
     return np.asarray(px[:, 0], np.float64)
+
+
+def opencv_bent(own: Pinhole, ray: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> FloatImage:
+    """Where OpenCV puts (..., 2) x, y at depth 1."""
+    points = np.concatenate([ray, np.ones((*ray.shape[:-1], 1))], axis=-1).reshape(-1, 3)
+    px, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), own.matrix, own.distortion)
+    return np.asarray(px.reshape(ray.shape))
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.formats import format_of
-from tests.controller.stage.exchange.conftest import NAMES, opencv_px
+from tests.controller.stage.exchange.conftest import NAMES, opencv_bent, opencv_px
 
 Floats = npt.NDArray[np.float64]
 
@@ -127,17 +127,13 @@ def test_a_picture_warped_by_the_2d_profile_is_that_of_each_pixels_place(content
 
 def test_the_3d_profile_names_the_camera_without_its_lens(content: Content, folder: Path) -> None:
     camera = content.geometry.camera
-    k1, k2 = camera.distortion
     for one, metapixels in zip(read(folder / "stage-3d.mpcdi", "3d"), content.metapixels(), strict=True):
         slope = {a: math.tan(math.radians(one.number(f"frustum/{a}Angle"))) for a in ("left", "right", "up", "down")}
         assert [one.number(f"frustum/{a}") for a in ("yaw", "pitch", "roll")] == [0, 0, 0]
         u, v = one.warp[metapixels.valid][:, 0], one.warp[metapixels.valid][:, 1]
         ray = np.stack([slope["left"] + u * (slope["right"] - slope["left"]),
                         -slope["up"] + v * (slope["up"] - slope["down"])], -1)  # fmt: skip
-        square = np.sum(ray**2, axis=1, keepdims=True)
-        bent = ray * (1 + k1 * square + k2 * square**2)
-        there = bent * camera.matrix[(0, 1), (0, 1)] + camera.matrix[:2, 2]
-        np.testing.assert_allclose(there, metapixels.centre_px[metapixels.valid], atol=1e-3)
+        np.testing.assert_allclose(opencv_bent(camera, ray), metapixels.centre_px[metapixels.valid], atol=1e-3)
 
 
 def test_points_of_the_shader_lamp_profile_are_where_opencv_projects_them(content: Content, folder: Path) -> None:
@@ -147,19 +143,14 @@ def test_points_of_the_shader_lamp_profile_are_where_opencv_projects_them(conten
         points = one.warp[known]
         # the file's frame has y up
         theirs = opencv_px(own, (points * (1, -1, -1)).astype(np.float32))
-        k1, k2 = own.distortion
         ideal = one.ideal(points) * one.size - 0.5
         ray = (ideal - own.matrix[:2, 2]) / own.matrix[(0, 1), (0, 1)]
-        square = np.sum(ray**2, axis=1, keepdims=True)
-        bent = ray * (1 + k1 * square + k2 * square**2) * own.matrix[(0, 1), (0, 1)] + own.matrix[:2, 2]
-        np.testing.assert_allclose(bent, theirs, atol=1e-3)
+        np.testing.assert_allclose(opencv_bent(own, ray), theirs, atol=1e-3)
         assert one.distortion is not None
         x, y = np.meshgrid(np.arange(one.size[0]), np.arange(one.size[1]))
         straight = one.distortion[..., :2] * one.size - 0.5
         ray = (straight - own.matrix[:2, 2]) / own.matrix[(0, 1), (0, 1)]
-        square = np.sum(ray**2, axis=2, keepdims=True)
-        bent = ray * (1 + k1 * square + k2 * square**2) * own.matrix[(0, 1), (0, 1)] + own.matrix[:2, 2]
-        np.testing.assert_allclose(bent, np.stack([x, y], -1), atol=1e-3)
+        np.testing.assert_allclose(opencv_bent(own, ray), np.stack([x, y], -1), atol=1e-3)
 
 
 def test_the_readme_says_that_a_superimposed_solve_is_more_than_a_warp(folder: Path) -> None:

@@ -121,7 +121,7 @@ def test_gltf_has_the_poses_and_the_intrinsics_of_all_views(content: Content, tm
         matrix, _ = scene.graph.get(name)
         extras = scene.graph.transforms.edge_data[("world", name)]["metadata"]
         local = trimesh.transform_points(points, np.linalg.inv(matrix)) * (1, -1, -1)
-        lens = np.array([*extras["distortion"], 0, 0])
+        lens = np.array(extras["distortion"])
         px, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), np.array(extras["camera_matrix"]), lens)
         np.testing.assert_allclose(px[:, 0], opencv_px(own, content.mesh.vertices_m), atol=CLOSE_PX)
         assert tuple(extras["size_px"]) == own.size_px
