@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,10 @@ from controller.core.arrays import Float64, FloatImage, load_arrays, save_arrays
 
 FILE_NAME = "camera.npz"
 SAME_EXPOSURE = 1e-6
+
+
+LEFT_BY_INTERPOLATION: Final = (0.5625, 0.625, 0.5625)
+"""The mean variance of red, green and blue by bilinear interpolation, relative to that of a sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +33,14 @@ class CameraNoise:
     def per_second(self, exposure_s: float) -> CameraNoise:
         """The same of values in full scales per second, from photographs of this exposure."""
         return CameraNoise(self.shot / exposure_s, self.read / exposure_s)
+
+    def variance(self, values: FloatImage, *, interpolated: bool) -> FloatImage:
+        """Of ``values`` (rows, columns, 3), NaN where they are; ``interpolated``: from a mosaic, which takes some away.
+
+        A channel's samples, and means of two and of four of them, alternate.
+        """
+        left = np.array(LEFT_BY_INTERPOLATION if interpolated else (1.0, 1.0, 1.0), np.float32)
+        return np.asarray(left * (np.float32(self.shot) * np.maximum(values, 0) + np.float32(self.read**2)), np.float32)
 
 
 def _nothing_clips() -> Float64:

@@ -20,8 +20,6 @@ from controller.optics.calibrate.verify.error_causes import COLOURS, WORDS, Erro
 NEAR_PX = 15
 BAD = 0.05
 """A neighbourhood whose error exceeds this share of its light counts as bad."""
-SHOT, READ = 1 / 30_000, 6 / 30_000
-"""Variance of a full-scale value v: SHOT v + READ squared, of a 12-bit APS-C camera."""
 JUMP_PX = 2.0
 """Neighbouring camera pixels that see places this much farther apart on the projector's image than usual."""
 STRETCHED = 3.0
@@ -56,7 +54,7 @@ def attribute_error(
     shown: FloatImage,
     seen: FloatImage,
     *,
-    exposure_s: float,
+    variance: FloatImage,
     indirect: FloatImage | None = None,
 ) -> ErrorAttribution:
     """Find the reason at every camera pixel.
@@ -66,7 +64,7 @@ def attribute_error(
     light : the light transport of ``calibration``
     shown : (rows, columns, 3) what projector ``n`` alone showed, linear light
     seen : (rows, columns, 3) its photograph, full scales per second, NaN where saturated
-    exposure_s : of that photograph, from which its noise follows
+    variance : (rows, columns, 3) of that photograph's noise
     indirect : (rows, columns, 3) what else is expected of what was shown, by way of other surfaces
     """
     part = calibration.projectors[n]
@@ -87,12 +85,11 @@ def attribute_error(
     def label(reason: ErrorCause, where: Mask, among: Mask) -> None:
         labels[among & where] = reason
 
-    sigma = _noise(np.maximum(seen, 0), exposure_s)
     x, y, spread = _places(light, n, shown.shape)
     # From the last to the first: what is written later stands before.
     label(ErrorCause.DEFOCUS, spread > BLURRED_PX, bad)
     label(ErrorCause.GRAZING, _stretch(x, y) > STRETCHED, bad)
-    label(ErrorCause.DARK, _near(np.where(lit, np.nan_to_num(sigma) ** 2, 0)) > 0.5 * near_error, bad)
+    label(ErrorCause.DARK, _near(np.where(lit & measured, channels.total(variance), 0)) > 0.5 * near_error, bad)
     moved, dimmed = _explained(light, n, shown, predicted, error, lit & measured)
     label(ErrorCause.DIMMED, dimmed > EXPLAINED, bad)
     if indirect is not None:
@@ -120,12 +117,6 @@ def _without_lamp(seen: FloatImage, predicted: FloatImage, use: Mask) -> FloatIm
 
 def _near(image: npt.NDArray[Any]) -> FloatImage:
     return np.asarray(cv2.boxFilter(np.asarray(image, np.float32), -1, (NEAR_PX, NEAR_PX)), np.float32)
-
-
-def _noise(seen: FloatImage, exposure_s: float) -> FloatImage:
-    """(rows, columns): standard deviation of the three channels together, in full scales per second."""
-    variance = SHOT * np.nan_to_num(seen) / exposure_s + (READ / exposure_s) ** 2
-    return np.asarray(np.sqrt(channels.total(variance)), np.float32)
 
 
 def _places(light: TransportModel, n: int, shape: tuple[int, ...]) -> tuple[FloatImage, FloatImage, FloatImage]:

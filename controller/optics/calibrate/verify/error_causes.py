@@ -35,8 +35,10 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
     ErrorCause.MOVED: ("moved", "the pattern lies elsewhere than predicted", "something moved: run `velatura drift`"),
     ErrorCause.DIMMED: ("brightness", "it is evenly brighter or darker than predicted",
                     "let the lamps warm up longer, keep other light out, and calibrate again"),
-    ErrorCause.DARK: ("too dark", "it is too dark for the camera: the error is noise",
-                  "usually no action is needed; more light or a lighter surface would help"),
+    ErrorCause.DARK: (
+        "noise", "most of the error is the camera's noise",
+        "usually no action is needed; longer exposures, more light or a camera with less noise would help",
+    ),
     ErrorCause.GRAZING: ("grazing light", "the light falls at a grazing angle",
                      "turn the object, or move a projector towards that side"),
     ErrorCause.DEFOCUS: ("out of focus", "the projector is out of focus there", "focus the projector on this depth"),

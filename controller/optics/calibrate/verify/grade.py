@@ -31,7 +31,9 @@ LIMITS = ((Grade.A, 0.02), (Grade.B, 0.04), (Grade.C, 0.08))
 class Verification:
     """How well a photograph was predicted.
 
-    ``relative_rms`` rms of predicted less photographed over the rms of the photographed light without the black image
+    ``relative_rms`` rms of predicted less photographed over the rms of the photographed light without the black image,
+    both without what noise adds
+    ``noise_rms`` what noise adds to the error, relative to the same light; 0 where it is not known
     ``gain`` (3,) photographed over predicted light per camera channel: 1, or the lamp has dimmed
     ``without_gain_rms`` the relative error that remains when the gain is taken out: what is left is place and shape
     ``error_map`` (rows, columns) float32: the same ratio around each camera pixel, NaN outside the mask
@@ -43,9 +45,12 @@ class Verification:
     without_gain_rms: float
     error_map: FloatImage
     grade: Grade
+    noise_rms: float = 0.0
 
 
-def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, mask: Mask) -> Verification:
+def verify(
+    predicted: FloatImage, photographed: FloatImage, black: FloatImage, mask: Mask, variance: FloatImage | None = None
+) -> Verification:
     """Compare a predicted with a photographed pattern.
 
     Parameters
@@ -53,6 +58,7 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
     predicted, photographed, black : (rows, columns, 3) linear camera images in one unit, black light included in both
         pictures; NaN where not measured
     mask : (rows, columns) camera pixels that count
+    variance : (rows, columns, 3) of the photograph's noise, as measured of the camera; None where it is not known
 
     Raises
     ------
@@ -69,7 +75,9 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
     seen = np.where(use[:, :, None], photographed - black, 0).astype(np.float64)
     light_predicted = np.where(use[:, :, None], predicted - black, 0).astype(np.float64)
     per_pixel = channels.total(seen * seen)
-    light = float(per_pixel.sum())
+    noise = np.zeros(mask.shape) if variance is None else np.where(use, channels.total(variance), 0).astype(np.float64)
+    added = float(noise.sum())
+    light = float(per_pixel.sum()) - added
     if not light > 0 or not np.any(light_predicted):
         raise CalibrationError(
             "verification-dark",
@@ -83,11 +91,12 @@ def verify(predicted: FloatImage, photographed: FloatImage, black: FloatImage, m
     gain = both / np.maximum(predicted_square, 1e-30)
     off = light_predicted - seen
     error = channels.total(np.multiply(off, off, out=off))
-    relative = float(np.sqrt(error.sum() / light))
+    relative = float(np.sqrt(max(error.sum() - added, 0.0) / light))
     without = float(np.sqrt(max(float(np.sum(gain * gain * predicted_square - 2 * gain * both)) + light, 0.0) / light))
     red, green, blue = (float(value) for value in gain)
-    error_map = _error_map(error, per_pixel, use)
-    return Verification(relative, (red, green, blue), without, error_map, grade_of(relative))
+    error_map = _error_map(error - noise, per_pixel - noise, use)
+    noise_rms = float(np.sqrt(added / light))
+    return Verification(relative, (red, green, blue), without, error_map, grade_of(relative), noise_rms)
 
 
 def grade_of(relative_rms: float) -> Grade:

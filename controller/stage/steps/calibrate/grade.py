@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from controller.bundle.describe import png
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import TroubleCode
@@ -20,9 +22,11 @@ from controller.optics.calibrate.verify.error_attribution import (
     attribution_picture,
     ranked,
 )
+from controller.optics.calibrate.verify.error_causes import WORDS, ErrorCause
 from controller.optics.calibrate.verify.grade import Verification, verify
 from controller.optics.capture.pattern_frames import device_frame, frame
 from controller.optics.capture.patterns import Pattern
+from controller.optics.capture.profile import CameraNoise
 from controller.optics.solve.scaling.dither import to_light
 from controller.run.background import side_by_side
 from controller.run.runner import Context, Step
@@ -32,7 +36,7 @@ from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.geometry import known_geometry
 from controller.stage.artefacts.grade import ErrorMaps, in_rows, write_grade
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of
+from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of, noise_of
 from controller.stage.artefacts.projectors import IndirectFigures, Light
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
@@ -41,6 +45,7 @@ from controller.stage.steps.calibrate.drift import shown_frames
 from controller.stage.steps.capture.photographs import Planned, take_all
 from controller.stage.steps.troubles import tell
 
+NOISE: Final = WORDS[ErrorCause.DARK][0]
 JUDGING_BYTES: Final = 300
 """A camera pixel, while one projector is judged (decision 3)."""
 
@@ -120,12 +125,14 @@ def _judged(calibrated: Calibrated, folder: Path, n: int) -> tuple[dict[str, obj
     shown = _shown(folder, part, pattern, (columns, rows))
     light, indirect = transport.forward_part(n, shown), calibrated.indirect_of(n, shown)
     taken = _taken(folder, part.name, pattern)
-    seen = taken.per_second()
+    photograph = taken.read()
+    seen = photograph.measured() / np.float32(taken.exposure_s)
+    variance = noise_of(taken).variance(seen, interpolated=photograph.colours is not None)
     expected = light + calibration.black if indirect is None else light + indirect + calibration.black
-    found = verify(expected, seen, calibration.black, transport.lit[n])
-    why = attribute_error(
-        transport, calibration, n, shown, seen, exposure_s=taken.exposure_s, indirect=indirect
-    )  # fmt: skip
+    # a camera's noise that was not measured may be less than that of others
+    known = taken.profile is not None and taken.profile.noise != CameraNoise()
+    found = verify(expected, seen, calibration.black, transport.lit[n], variance if known else None)
+    why = attribute_error(transport, calibration, n, shown, seen, variance=variance, indirect=indirect)
     figures = _figures(found, why) | _indirect_figures(folder, part.name)
     return figures, ErrorMaps(found.error_map, why.labels), attribution_picture(why, calibration, part.name)
 
@@ -151,5 +158,7 @@ def _figures(found: Verification, why: ErrorAttribution) -> dict[str, object]:
         "without_gain_rms": found.without_gain_rms,
         "gain": found.gain,
         "grade": found.grade.value,
-        "reasons": ranked(why),
+        "noise_rms": found.noise_rms,
+        # noise that was taken off is the reason for nothing
+        "reasons": sorted(ranked(why), key=lambda row: found.noise_rms > 0 and row["reason"] == NOISE),
     }

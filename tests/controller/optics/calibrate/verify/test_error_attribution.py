@@ -12,6 +12,7 @@ from controller.optics.calibrate.verify.error_attribution import attribute_error
 from controller.optics.calibrate.verify.error_causes import COLOURS, ErrorCause
 from controller.optics.capture.pattern_frames import frame
 from controller.optics.capture.patterns import Pattern, PatternKind
+from controller.optics.capture.profile import CameraNoise
 
 ROWS, COLUMNS = 90, 120
 SHOWN: FloatImage = np.asarray(
@@ -47,6 +48,10 @@ def stage(white: float = 100.0) -> tuple[OneToOne, Calibration]:
     return OneToOne(image, everywhere[None].copy()), calibration
 
 
+def variance(seen: FloatImage, exposure_s: float = 0.005) -> FloatImage:
+    return CameraNoise().per_second(exposure_s).variance(seen, interpolated=False)
+
+
 @pytest.mark.parametrize(
     "reason", [ErrorCause.SATURATED, ErrorCause.UNDECODED, ErrorCause.MOVED, ErrorCause.DIMMED, ErrorCause.DARK]
 )
@@ -66,7 +71,7 @@ def test_each_fault_is_blamed_on_what_caused_it(reason: ErrorCause) -> None:
         exposure_s = 1e-5
         sigma = np.sqrt(seen / 30_000 / exposure_s + (6 / 30_000 / exposure_s) ** 2)
         seen += (sigma * random.standard_normal(seen.shape)).astype(np.float32)
-    found = attribute_error(light, calibration, 0, SHOWN, seen, exposure_s=exposure_s)
+    found = attribute_error(light, calibration, 0, SHOWN, seen, variance=variance(seen, exposure_s))
     inner = found.labels[38:52, 50:70]
     assert np.mean(inner == reason) > 0.8
     assert ranked(found)[0]["sentence"].endswith(".")
@@ -77,7 +82,8 @@ def test_each_fault_is_blamed_on_what_caused_it(reason: ErrorCause) -> None:
 
 def test_a_good_prediction_blames_nothing_and_the_picture_stays_grey() -> None:
     light, calibration = stage()
-    found = attribute_error(light, calibration, 0, SHOWN, light.forward_part(0, SHOWN), exposure_s=0.005)
+    seen = light.forward_part(0, SHOWN)
+    found = attribute_error(light, calibration, 0, SHOWN, seen, variance=variance(seen))
     assert not found.labels.any()
     assert ranked(found) == []
     picture = attribution_picture(found, calibration, "one")
@@ -91,13 +97,13 @@ def test_indirect_light_is_the_reason_where_there_is_much_of_it() -> None:
     back[PATCH] = 0.5 * seen[PATCH].mean()
     ripple = np.sin(np.arange(ROWS) / 2)[:, None, None] * np.cos(np.arange(COLUMNS) / 2)[None, :, None]
     found = attribute_error(
-        light, calibration, 0, SHOWN, (seen + back * (1 + 0.5 * ripple)).astype(np.float32), exposure_s=0.005,
+        light, calibration, 0, SHOWN, (seen + back * (1 + 0.5 * ripple)).astype(np.float32), variance=variance(seen),
         indirect=back,
     )  # fmt: skip
     inside = found.labels[PATCH]
     assert np.mean(inside[inside > 0] == ErrorCause.INDIRECT) > 0.5
     assert "indirect light" in [row["reason"] for row in ranked(found)]
-    exact = attribute_error(light, calibration, 0, SHOWN, seen + back, exposure_s=0.005, indirect=back)
+    exact = attribute_error(light, calibration, 0, SHOWN, seen + back, variance=variance(seen), indirect=back)
     assert not exact.labels.any()
 
 
