@@ -104,22 +104,22 @@ def traced_stage(folder: Path, scene: str, size: str, seed: int) -> Path:
     return stage
 
 
-def worked(stage: Path) -> Path:
+def worked(stage: Path, names: Sequence[str] = NAMES, refined: Sequence[int] = REFINED) -> Path:
     """Calibrate the stage, make its appearances, refine them, where that was not done before; the calibration's run."""
     session, cancel = OwnSession(stage), threading.Event()
-    left = [photographs for photographs in REFINED if not _kept(stage, NAMES[-1], photographs).exists()]
+    left = [photographs for photographs in refined if not _kept(stage, names[-1], photographs).exists()]
     if left:
         with BenchProcess(stage, cancel=cancel):
             if not finished_calibrations(stage):
                 calibrate(session=session, reporter=Silent(), cancel=cancel, accept_grade=True)
             for photographs in left:
                 make_appearances(
-                    AppearanceOrder(names=NAMES, accept_grade=True, refinement=Refinement(photographs)),
+                    AppearanceOrder(names=names, accept_grade=True, refinement=Refinement(photographs)),
                     session=session,
                     reporter=Silent(),
                     cancel=cancel,
                 )
-                _keep(stage, photographs)
+                _keep(stage, names, photographs)
     return finished_calibrations(stage)[0]
 
 
@@ -127,25 +127,25 @@ def _kept(stage: Path, name: str, photographs: int) -> Path:
     return stage.parent / f"{name}-{photographs}.npz"
 
 
-def _keep(stage: Path, photographs: int) -> None:
+def _keep(stage: Path, names: Sequence[str], photographs: int) -> None:
     """The device frames of each appearance, beside the stage."""
     run = finished_calibrations(stage)[0]
-    names = check_stage(stage).names
-    for name in NAMES:
-        solved = read_solved(run, name, names)
-        np.savez(_kept(stage, name, photographs), *[solved.frames[projector] for projector in names])
+    projectors = check_stage(stage).names
+    for name in names:
+        solved = read_solved(run, name, projectors)
+        np.savez(_kept(stage, name, photographs), *[solved.frames[projector] for projector in projectors])
 
 
-def judged(stage: Path, run: Path) -> dict[str, float]:
+def judged(stage: Path, run: Path, names: Sequence[str] = NAMES, refined: Sequence[int] = REFINED) -> dict[str, float]:
     """All figures of a stage."""
-    names = check_stage(stage).names
-    judge = Judge(stage, Calibrated(run, names))
+    projectors = check_stage(stage).names
+    judge = Judge(stage, Calibrated(run, projectors))
     found = judge.calibration()
-    for photographs in REFINED:
-        for name in NAMES:
+    for photographs in refined:
+        for name in names:
             with np.load(_kept(stage, name, photographs)) as kept:
                 frames = [kept[key] for key in kept.files]
-            figures = judge.appearance(read_solved(run, name, names), frames)
+            figures = judge.appearance(read_solved(run, name, projectors), frames)
             found |= {f"{name} {key}, {photographs}": value for key, value in figures.items()}
     return found
 
@@ -272,4 +272,4 @@ def _rows(found: list[dict[str, float]]) -> list[Row]:
     return rows
 
 
-__all__: Sequence[str] = ("GOALS", "Judge", "measure", "traced_stage")
+__all__: Sequence[str] = ("GOALS", "Judge", "judged", "measure", "traced_stage", "worked")
