@@ -93,7 +93,7 @@ def _calibrated(folder: Path, asked: DemoStage) -> tuple[Path, Path]:
         screen = np.rint(255 * linear_to_srgb(_smooth((height, width)))).astype(np.uint8)
         cv2.imwrite(str(stage / PICTURE_FILE), screen[..., ::-1])
         toml = stage / "stage.toml"
-        table = f'[[appearances]]\nname = "{PICTURE}"\nkind = "picture"\nfile = "{PICTURE_FILE}"\n'
+        table = f'\n[[appearances]]\nname = "{PICTURE}"\nkind = "picture"\nfile = "{PICTURE_FILE}"\n'
         toml.write_text(toml.read_text().split("[[appearances]]")[0] + table)
     return stage, worked(stage, (PICTURE,), tuple(REFINED))
 
