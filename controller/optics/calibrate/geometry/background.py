@@ -28,6 +28,8 @@ LEAST: Final = 0.03
 """Share of the points that a plane holds."""
 LEAST_OBJECT: Final = 0.1
 """Share of the points that are not the room's; with fewer, the flat surfaces are themselves the object."""
+PICTURE: Final = 0.5
+"""Least size of a picture, in sizes of its frame; a wall that is seen between an arm and a body is smaller."""
 BORDER: Final = 0.02
 """Width of the picture's border, as a share of its height."""
 AT_BORDER: Final = 0.03
@@ -38,7 +40,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
     """Pixels (rows, columns) that see flat surfaces of the room; ``points_m``: as ``Geometry``, NaN where unknown.
 
     A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
-    picture's border, or where hardly anything else is seen.
+    picture's border, or where hardly anything else is seen. A picture in its frame is no part of the wall behind it.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -64,7 +66,22 @@ def room_pixels(points_m: FloatImage) -> Mask:
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = room[tuple(nearest)].astype(np.uint8)
     # the median of 25
-    return np.asarray(cv2.boxFilter(filled, -1, (5, 5), normalize=False, borderType=cv2.BORDER_REFLECT) > 12)
+    room = np.asarray(cv2.boxFilter(filled, -1, (5, 5), normalize=False, borderType=cv2.BORDER_REFLECT) > 12)
+    return room & ~_pictures(room)
+
+
+def _pictures(room: Mask) -> Mask:
+    """Parts of ``room`` that are pictures in their frames: large beside these, and with no way to the border."""
+    found = np.zeros_like(room)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(room.astype(np.uint8), connectivity=4)
+    _, around, sizes, _ = cv2.connectedComponentsWithStats((~room).astype(np.uint8), connectivity=8)
+    beside = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    for part in sorted(set(range(1, count)) - set(beside.tolist())):
+        here = parts == part
+        frame = np.unique(around[cv2.dilate(here.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
+        if stats[part, cv2.CC_STAT_AREA] > PICTURE * sizes[frame[frame > 0], cv2.CC_STAT_AREA].sum():
+            found |= here
+    return found
 
 
 def _plane(

@@ -65,3 +65,22 @@ def test_round_things_that_fill_the_picture_are_no_room() -> None:
 def test_a_wall_alone_is_the_object() -> None:
     assert not room_pixels(points(WALL)).any()
     assert not room_pixels(points(WALL, ball((0.0, 0.0, 1.4), 0.1))).any()
+
+
+@pytest.mark.parametrize("wide", [8, 16])
+def test_a_picture_in_its_frame_is_no_part_of_the_wall_that_it_almost_touches(wide: int) -> None:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    outside, inside = (np.maximum(np.abs(x - 89.5) / 1.4, np.abs(y - 59.5)) < size for size in (48, 48 - wide))
+    before = np.where(inside, 0.004, np.where(outside, 0.016, 0.0))
+    found = room_pixels(points(WALL * (1.0 - before)))
+    assert not found[(np.abs(y - 59.5) < 44) & (np.abs(x - 89.5) < 60)].any()
+    assert found[~outside].mean() > 0.98
+
+
+def test_a_wall_behind_a_handle_is_the_rooms() -> None:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    away = np.hypot(x - 89.5, y - 59.5)
+    handle = np.where((away < 36) & (away > 20), 1.1, np.inf)
+    found = room_pixels(points(WALL, handle))
+    assert found[away < 18].all()
+    assert not found[(away > 22) & (away < 34)].any()
