@@ -63,7 +63,8 @@ class VideoSource:
         self._path, self._loop = path, loop
         # Errors of a file are reported in our words; its decoder would write its own to the terminal.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        self._capture = cv2.VideoCapture(str(path))
+        self._capture = _opened(path)
+        _check_colours(path)
         rate = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
         if not rate > 0:
             self._capture.release()
@@ -109,7 +110,7 @@ class VideoSource:
             self._begins_s = self._end_s()
             self._first_s, self._read_s = None, self._begins_s - self._frame_s
             self._capture.release()
-            self._capture = cv2.VideoCapture(str(self._path))
+            self._capture = _opened(self._path)
             return self._read()
         said_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000
         self._first_s = said_s if self._first_s is None else self._first_s
@@ -132,6 +133,36 @@ class VideoSource:
     def close(self) -> None:
         """Close the file."""
         self._capture.release()
+
+
+UNLIKE_SRGB: Final = re.compile("2020|2084|2100|428|431|P3|PQ|HLG|XYZ|Adobe|Linear|Log", re.IGNORECASE)
+"""Of the names of colours in ``pymediainfo``."""
+
+
+def _opened(path: Path) -> cv2.VideoCapture:
+    """Raises UsageError("live-source-unreadable")."""
+    try:
+        with path.open("rb") as file:
+            # by its number: OpenCV takes no name that is not UTF-8
+            return cv2.VideoCapture(f"/proc/self/fd/{file.fileno()}")
+    except OSError as error:
+        raise unreadable(path, str(error.strerror)) from error
+
+
+def _check_colours(path: Path) -> None:
+    """Raises UsageError("live-source-unreadable") where they are not those of sRGB, since OpenCV converts none."""
+    from pymediainfo import MediaInfo
+
+    with path.open("rb") as file:
+        tracks = MediaInfo.parse(file).video_tracks
+    named = [
+        name
+        for track in tracks
+        for name in (track.color_primaries, track.transfer_characteristics, track.matrix_coefficients)
+        if name and UNLIKE_SRGB.search(name)
+    ]
+    if named:
+        raise unreadable(path, f"its colours are {', '.join(named)}; convert it to BT.709 without HDR first")
 
 
 LAST_PICTURE_S: Final = 30.0
@@ -391,10 +422,16 @@ POLL_MS: Final = 200
 def open_stream(source: str, *, silent_s: float = SILENT_S, retry_s: float = RETRY_S) -> StreamSource:
     """The stream at an address that ``is_stream`` knows; one that is ``silent_s`` without a picture is lost.
 
-    Raises UsageError("extra-missing") for NDI without cyndilib.
+    Raises UsageError("extra-missing") for NDI without cyndilib, and "live-source-unreadable" for SRT.
     """
     if source.lower().startswith(NDI):
         return StreamSource(source, _ndi(source[len(NDI) :], silent_s), retry_s=retry_s)
+    if source.lower().startswith("srt:"):
+        raise UsageError(
+            "live-source-unreadable",
+            what="SRT can't be read: the FFmpeg in OpenCV has no part for it.",
+            remedy="Forward it: `ffmpeg -i ADDRESS -c copy -f mpegts udp://127.0.0.1:5000`, and give udp://@:5000.",
+        )
     # What OpenCV and FFmpeg have to say comes in our words, and without the address's password.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

@@ -104,6 +104,42 @@ def test_a_video_of_changing_rate_shows_each_second_in_its_second(
         source.close()
 
 
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg (a package of the test set-up)")
+@pytest.mark.parametrize(
+    ("name", "primaries", "curve", "matrix", "refused"),
+    [
+        ("v.mp4", 9, 14, 9, "BT.2020, BT.2020"),
+        ("v.mkv", 9, 16, 9, "PQ"),
+        ("v.mp4", 9, 18, 9, "HLG"),
+        ("v.mp4", 2, 2, 9, "BT.2020 non-constant"),
+        ("v.mov", 12, 13, 1, "P3"),
+        ("v.mp4", 1, 1, 1, ""),
+        ("v.mkv", 6, 6, 6, ""),
+        ("v.avi", 2, 2, 2, ""),
+    ],
+)
+def test_a_video_whose_colours_are_not_those_of_srgb_is_refused_by_their_names(
+    tmp_path: Path, name: str, primaries: int, curve: int, matrix: int, refused: str
+) -> None:
+    codes = f"colour_primaries={primaries}:transfer_characteristics={curve}:matrix_coefficients={matrix}"
+    path = seconds_of(tmp_path / name, [(90, 5)], "-c:v", "libx264", "-bsf:v", f"h264_metadata={codes}")
+    if refused:
+        with pytest.raises(UsageError, match=refused) as error:
+            VideoSource(path, loop=False)
+        assert error.value.code == "live-source-unreadable"
+    else:
+        VideoSource(path, loop=False).close()
+
+
+def test_a_video_whose_name_is_not_utf_8_plays_again_and_again(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"b\xfchne")
+    folder.mkdir()
+    source = VideoSource(video(tmp_path / "v.avi", [10, 200]).rename(folder / os.fsdecode(b"\xe9t\xe9.avi")), loop=True)
+    shown = [source.next(at_s) for at_s in (0.01, 0.11, 0.21, 0.31)]
+    assert [picture is not None and picture.pixels.mean() > 100 for picture in shown] == [False, True, False, True]
+    source.close()
+
+
 def test_a_folder_that_is_gone_is_told_of_once_then_black_and_comes_back(tmp_path: Path) -> None:
     folder = tmp_path / "stick"
     folder.mkdir()

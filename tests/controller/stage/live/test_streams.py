@@ -268,6 +268,13 @@ def test_passwords_are_left_out_of_messages() -> None:
     assert without_password("ndi://PC (a@b)") == "ndi://PC (a@b)"
 
 
+@pytest.mark.parametrize("address", ["srt://host:9000", "SRT://host:9000?mode=listener"])
+def test_srt_is_refused_at_once_with_the_way_round_it(address: str) -> None:
+    with pytest.raises(UsageError, match="udp://") as refused:
+        open_stream(address)
+    assert refused.value.code == "live-source-unreadable"
+
+
 def test_ndi_without_its_runtime_is_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cyndilib", None)
     with pytest.raises(UsageError) as refused:
