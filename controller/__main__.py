@@ -21,7 +21,7 @@ except ModuleNotFoundError as missing:  # an installation with only the player
 from controller.cli import console
 from controller.cli.commands.appearances import appearance, live, photograph, play
 from controller.cli.commands.bundles import BUNDLE
-from controller.cli.commands.calibration import calibrate, drift, export, report
+from controller.cli.commands.calibration import calibrate, drift, export, register, report
 from controller.cli.commands.emulation import demo, emulate, record
 from controller.cli.commands.kiosk import KIOSK
 from controller.cli.commands.stage import CAMERA, doctor, init, plan
@@ -32,12 +32,15 @@ from hal.runtime.caches import prepare_libraries
 SUMMARY: Final = "Gives a physical object a new appearance with light from several superimposed projectors."
 MEMBERS: Final[Members] = {
     "Set up a stage": (init, doctor, plan, CAMERA),
-    "Calibrate it, and make appearances": (calibrate, drift, appearance, photograph, report),
+    "Calibrate it, and make appearances": (calibrate, drift, register, appearance, photograph, report),
     "Show them": (play, live, KIOSK),
     "Take them elsewhere": (BUNDLE, export),
-    "Work without hardware": (demo, emulate, record),
+    "Work without hardware": (demo, emulate),
+    "": (record,),
 }
-"""The commands in the order of a technician's life, by the titles of the help. Other distributions add theirs."""
+"""The commands in the order of a technician's life, by the titles of the help. Other distributions add theirs.
+
+Without a title: what the first help leaves out, because only the writer of a driver needs it."""
 
 
 def application(members: Members = MEMBERS) -> typer.Typer:

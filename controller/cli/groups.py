@@ -150,7 +150,7 @@ def group(name: str, summary: str, members: Members, *, whole: bool = False) -> 
                 app.add_typer(member, rich_help_panel=title)
             else:
                 word = member.__name__.strip("_").replace("_", "-")
-                app.command(word, rich_help_panel=title)(with_all_parameters(member))
+                app.command(word, rich_help_panel=title, hidden=not title)(with_all_parameters(member))
     return app
 
 
@@ -202,6 +202,8 @@ class Commands(TyperGroup):
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
             assert command is not None
+            if command.hidden:
+                continue
             title = str(getattr(command, "rich_help_panel", None) or INSTALLED)
             titles.setdefault(title, []).append((name, command.get_short_help_str(LONGEST_SENTENCE)))
         for title, rows in titles.items():

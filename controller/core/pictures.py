@@ -63,6 +63,10 @@ class Picture:
         """(rows, columns): more than half opaque. The others are no part of the picture; None: all pixels are."""
         return None if self.alpha is None else np.asarray(self.alpha > _full(self.alpha) / 2)
 
+    def opacity(self) -> FloatImage | None:
+        """(rows, columns) float32 in [0, 1]; None: all is opaque."""
+        return None if self.alpha is None else self.alpha.astype(np.float32) / np.float32(_full(self.alpha))
+
     def linear(self, colours: Colours | None = None) -> FloatImage:
         """(rows, columns, 3) float32 linear sRGB light; ``colours`` go before the file's own. Raises Unsuitable."""
         if self.values.dtype.kind == "f":

@@ -33,7 +33,7 @@ class MeshFile:
 
     ``vertices`` (V, 3), finite; ``faces`` (F, 3) indices of vertices, F may be 0; ``colours`` (F, 3, 3) float32 in
     [0, 1] of each face's corners, sRGB or, where ``linear``, light; ``uv`` (F, 3, 2) float32 places in ``texture``
-    (rows, columns, 3) uint8 sRGB. None where the file has none.
+    (rows, columns, 3) uint8 sRGB, (0, 0) its lower left corner. None where the file has none.
     """
 
     vertices: Floats
@@ -47,7 +47,7 @@ class MeshFile:
 def read_mesh(path: Path, *, coloured: bool = True) -> MeshFile:
     """The mesh in a file of any format that trimesh reads. Raises MeshUnreadable.
 
-    ``coloured``: with its colours; a texture that is missing is then an error
+    ``coloured``: with its colours; a texture that is missing is then an error. Else ``uv`` is given without a texture
     """
     try:
         data = read_bytes(path, LARGEST_MESH)
@@ -72,12 +72,10 @@ def _by_trimesh(path: Path, suffix: str, data: bytes, coloured: bool) -> MeshFil
     files = _Files(path.parent)
     if suffix == "obj":
         data = plain_obj(_text(data)).encode()
-    scene = trimesh.load(
-        io.BytesIO(data), file_type=suffix, resolver=files, force="mesh", process=False, skip_materials=not coloured
-    )
-    vertices, faces = np.asarray(scene.vertices, np.float64), np.asarray(scene.faces, np.int32).reshape(-1, 3)
     if not coloured:
-        return MeshFile(vertices, faces)
+        return _shape(trimesh.load_scene(io.BytesIO(data), file_type=suffix, resolver=files, process=False))
+    scene = trimesh.load(io.BytesIO(data), file_type=suffix, resolver=files, force="mesh", process=False)
+    vertices, faces = np.asarray(scene.vertices, np.float64), np.asarray(scene.faces, np.int32).reshape(-1, 3)
     if files.problem:
         raise MeshUnreadable(files.problem)
     visual = scene.visual
@@ -91,6 +89,19 @@ def _by_trimesh(path: Path, suffix: str, data: bytes, coloured: bool) -> MeshFil
         unit = np.asarray(own[..., :3] / 255, np.float32)
         return MeshFile(vertices, faces, unit, linear=suffix in ("glb", "gltf"))
     return MeshFile(vertices, faces)
+
+
+def _shape(scene: Any) -> MeshFile:
+    """Its parts as one mesh, each with its own places in its texture: trimesh would pack several textures into one."""
+    parts = [part for part in scene.dump() if hasattr(part, "faces")]
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)])
+    faces = np.concatenate([np.zeros((0, 3), int), *(part.faces + at for part, at in zip(parts, first, strict=False))])
+    own = [getattr(part.visual, "uv", None) for part in parts]
+    if not own or any(uv is None for uv in own):
+        return MeshFile(vertices, faces.astype(np.int32))
+    uv = np.concatenate([np.asarray(uv, np.float32)[part.faces] for uv, part in zip(own, parts, strict=True)])
+    return MeshFile(vertices, faces.astype(np.int32), uv=uv)
 
 
 def _text(data: bytes) -> str:
@@ -229,6 +240,7 @@ class _Files:
             yield from (one for one in with_case if one.relative_to(self._folder).as_posix().lower() == part.lower())
 
 
+_PLACES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 _COLOURS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
 
@@ -250,11 +262,14 @@ def _of_ply(data: bytes) -> MeshFile | None:
     name = next((name for name in ("vertex_indices", "vertex_index") if name in face["properties"]), None)
     lists = _column(face, name or next(iter(face["properties"])))
     faces, source = _triangulated(vertices, [np.asarray(one, np.int64) for one in lists])
+    places = next((names for names in _PLACES if set(names) <= set(vertex["properties"])), ())
+    columns = [np.asarray(_column(vertex, name), np.float32).reshape(-1) for name in places]
+    uv = np.stack(columns, axis=1)[faces] if columns else None
     for element, index in ((vertex, faces), (face, source[:, None].repeat(3, 1))):
         for names in _COLOURS:
             if set(names) <= set(element["properties"]):
-                return MeshFile(vertices, faces, _unit(element, names)[index])
-    return MeshFile(vertices, faces)
+                return MeshFile(vertices, faces, _unit(element, names)[index], uv=uv)
+    return MeshFile(vertices, faces, uv=uv)
 
 
 def _column(element: Mapping[str, Any], name: str) -> Any:

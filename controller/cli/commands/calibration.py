@@ -21,7 +21,8 @@ AcceptGrade = Annotated[
     bool, typer.Option("--accept-grade", help="Accept a calibration below the grade in stage.toml.")
 ]
 FormatName = Literal[
-    "glb", "ply", "blender", "usd", "colmap", "colmap-binary", "opencv", "st-maps", "mpcdi", "transport", "dataset"
+    "glb", "ply", "blender", "usd", "colmap", "colmap-binary", "opencv", "st-maps", "mpcdi", "transport", "dataset",
+    "uv",
 ]  # fmt: skip
 RunFolder = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run's folder (STAGE/runs/...), or a stage for its newest run.")
@@ -106,7 +107,8 @@ def export(
         Path,
         typer.Argument(
             metavar="RUN",
-            help="Folder of a finished calibration (STAGE/runs/...), or for transport a folder of pairs of pictures.",
+            help="Folder of a finished calibration (STAGE/runs/...), a stage for its newest one, or for transport a "
+            "folder of pairs of pictures.",
         ),
     ],
     kind: Annotated[
@@ -120,8 +122,39 @@ def export(
     crop: Annotated[
         str | None, typer.Option(help="For transport: only X,Y,WIDTH,HEIGHT of the camera's picture.")
     ] = None,
+    uv: Annotated[bool, typer.Option("--uv", help="Short for --format uv.")] = False,
 ) -> None:
     """Export a calibration for other programs. It has the object, views, warps, or the light transport."""
     from controller.stage.services.export import export as written
 
-    console.show_result(written(run=run, kind=kind, out=out, step=step, crop=crop))
+    console.show_result(written(run=run, kind="uv" if uv else kind, out=out, step=step, crop=crop))
+
+
+def register(
+    stage: StageFolder,
+    mesh: Annotated[Path, typer.Argument(metavar="MESH", help="The object's mesh: OBJ, glTF (.glb), PLY or STL.")],
+    unit: Annotated[
+        Literal["mm", "cm", "m", "inch"] | None, typer.Option(help="Unit of the file's numbers (default: guessed).")
+    ] = None,
+    pairs: Annotated[
+        Path | None, typer.Option(help="Pairs of points, where the mesh does not find its place by itself (JSON).")
+    ] = None,
+    limit: Annotated[
+        float | None,
+        typer.Option(
+            help="Millimetres that mesh and object may differ (default: 2 % of the object's size).", min=0.001
+        ),
+    ] = None,
+    fill: Annotated[
+        bool, typer.Option("--fill", help="Take the shape from the mesh where no two projectors measured it.")
+    ] = False,
+) -> None:
+    """Lay a known mesh on the calibrated object. Textures are painted on it, and it can fill what was not measured."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.stage.services.register import MeshOrder, read_pairs, register
+
+        order = MeshOrder(mesh, unit, () if pairs is None else read_pairs(pairs), limit, fill)
+        return register(stage, order, reporter)
+
+    work(do, stage=stage)

@@ -53,6 +53,8 @@ FORMATS: Final = (
            f"{_HERE}.sparse:write_transport", shape=False),
     Format("dataset", "a folder with photographs, calibration, targets and results, for research", "dataset",
            f"{_HERE}.dataset:write_dataset", shape=False),
+    Format("uv", "a sheet to paint on: the registered mesh's UV, or the camera's view, with the object's picture (PNG)",
+           "sheet.png", f"{_HERE}.meshes:write_sheet", shape=False),
 )  # fmt: skip
 
 

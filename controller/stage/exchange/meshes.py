@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.colour import srgb_to_linear
-from controller.core.storage import write_atomically
+from controller.core.colour import linear_to_srgb, srgb_to_linear
+from controller.core.errors import UsageError
+from controller.core.storage import stream_atomically, write_atomically
 from controller.optics.calibrate.mesh import View, scene_script, write_glb, write_ply
 from controller.optics.calibrate.values import Pinhole
+from controller.optics.solve.targets.sheets import as_it_is, photographed, sheet_side
+from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.exchange.content import Content
 
 MESH, SCRIPT = "object.glb", "scene.py"
@@ -166,3 +170,34 @@ def _tuples(values: npt.NDArray[Any]) -> str:
 
 def _tuple(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{one:.17g}" for one in values) + ")"
+
+
+def write_sheet(content: Content, path: Path) -> dict[str, object]:
+    """A sheet for an appearance of kind texture: sRGB with its profile, clear where the camera sees nothing of it.
+
+    It has the UV of the run's mesh; without one, or without UV, it is the camera's picture. Raises
+    UsageError("sheet-exists"): somebody may have painted on the file.
+    """
+    from PIL import Image, ImageCms
+
+    if path.exists():
+        raise UsageError(
+            "sheet-exists",
+            what=f"{path} exists, and may have been painted on.",
+            remedy="Name another file with --out, or move that file away.",
+        )
+    transport = content.transport()
+    picture, mask = as_it_is(transport), transport.object_mask
+    mesh = RegisteredMesh.read(content.folder)
+    if mesh is None or mesh.uv is None:
+        uv, sheet = "camera", np.dstack([picture, mask])
+    else:
+        camera = content.geometry.camera
+        side = sheet_side(mesh.places(camera), mask)
+        uv, sheet = "mesh", photographed(picture, camera, mesh.solid, mesh.uv, mesh.pose, side)
+        replace(mesh, figures={**mesh.figures, "sheet_px": [side, side]}).write_figures(content.folder)
+    shown = np.dstack([linear_to_srgb(sheet[..., :3]), sheet[..., 3]])
+    image = Image.fromarray(np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8), "RGBA")
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    stream_atomically(path, lambda file: image.save(file, "PNG", icc_profile=profile))
+    return {"uv": uv, "size_px": list(image.size), "next": f'kind = "texture", uv = "{uv}", file = your painted sheet'}

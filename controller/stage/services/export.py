@@ -13,29 +13,39 @@ from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.transport.planes import CameraBox
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import known_geometry, projectors_of, read_geometry_figures, require_shape
+from controller.stage.artefacts.geometry import (
+    has_geometry,
+    known_geometry,
+    projectors_of,
+    read_geometry_figures,
+    require_shape,
+)
 from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.exchange.content import Content
 from controller.stage.exchange.formats import format_of
 from controller.stage.exchange.pairs import is_pairs, write_pairs_transport
+from controller.stage.sessions.calibrations import finished_calibration
+from controller.stage.steps.mesh import carried_mesh
 
 MOST_VERTICES: Final = 1_000_000
 
 
 def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: str | None = None) -> dict[str, Any]:
-    """Write a finished calibration run in the format ``kind`` to ``out``, a file or a folder.
+    """Write a finished calibration run, or a stage's newest, in the format ``kind`` to ``out``, a file or a folder.
 
     ``step``: every n-th camera pixel becomes a vertex; None: at most ``MOST_VERTICES`` vertices
     ``run``: for a transport also a folder of pairs (``read_pairs``)
     ``crop``: "X,Y,WIDTH,HEIGHT" in camera pixels, for a transport
 
-    Raises UsageError("export-format-unknown", "not-calibrated", "crop-wrong"), and as the writers.
+    Raises UsageError("export-format-unknown", "not-calibrated", "crop-wrong"), and as the writers and ``carried_mesh``.
     """
     chosen = format_of(kind)
     box = None if crop is None else _box(crop)
     if kind == "transport" and is_pairs(run):
         target = out or run / chosen.place
         return {"written": target, **write_pairs_transport(run, target, box)}
+    if (run / "stage.toml").is_file():
+        run = finished_calibration(run)
     if not read_geometry_figures(run):
         raise UsageError(
             "not-calibrated",
@@ -44,6 +54,8 @@ def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: st
         )
     if chosen.shape:
         require_shape(run, f"The format {chosen.name}")
+    if kind == "uv" and has_geometry(run):
+        carried_mesh(run)
     target = run / chosen.place if out is None else out
     return {"written": target, **chosen.write(_content(run, step, box), target)}
 

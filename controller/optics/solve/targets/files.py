@@ -8,7 +8,7 @@ from typing import Final, Literal
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage
 from controller.core.colour import SPACES, ColourSpace, Primaries, Unsuitable, mixed
 from controller.core.errors import UsageError
 from controller.core.pictures import KINDS, read_picture_file
@@ -55,19 +55,23 @@ def check_picture(path: Path, picture: FloatImage, size: tuple[int, int]) -> Non
         )
 
 
-def read_picture(path: Path, colour: ColourSpace | None = None) -> FloatImage:
+def read_picture(path: Path, colour: ColourSpace | None = None, *, soft: bool = False) -> FloatImage:
     """(rows, columns, 3 or 4) float32 linear sRGB light of an EXR, PNG, JPEG, TIFF or WebP, upright.
 
     ``colour``: the file's colour space; None: what the file says (an ICC profile, chromaticities, ...), else sRGB.
-    An EXR is linear light. The fourth channel, where there is transparency, is 1 or 0; at 0 the light is 0.
+    An EXR is linear light. The fourth channel, where there is transparency, is 1 or 0, or ``soft``: as in the file; at
+    0 the light is 0.
 
     Raises UsageError("target-unreadable").
     """
     try:
-        light, mask = _read_exr(path, colour) if path.suffix.lower() == ".exr" else _read_encoded(path, colour)
+        light, alpha = _read_exr(path, colour) if path.suffix.lower() == ".exr" else _read_encoded(path, colour)
     except Unsuitable as error:
         raise unreadable(path, error) from error
-    return light if mask is None else np.dstack([np.where(mask[..., None], light, 0), mask]).astype(np.float32)
+    if alpha is None:
+        return light
+    opaque = alpha if soft else alpha > 0.5
+    return np.dstack([np.where(opaque[..., None] > 0, light, 0), opaque]).astype(np.float32)
 
 
 def unreadable(path: Path, why: Unsuitable) -> UsageError:
@@ -79,25 +83,24 @@ def unreadable(path: Path, why: Unsuitable) -> UsageError:
     )
 
 
-def _read_exr(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, Mask | None]:
+def _read_exr(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, FloatImage | None]:
     picture = read_exr(path)
-    light, mask = picture[..., :3], None
+    light, alpha = picture[..., :3], None
     if picture.shape[2] == 4:
-        alpha = picture[..., 3:]
-        mask = np.asarray(alpha[..., 0] > 0.5)
-        light = np.asarray(light / np.clip(alpha, 0.5, 1), np.float32)  # EXR's alpha is premultiplied
+        alpha = np.clip(picture[..., 3], 0, 1)
+        light = np.asarray(light / np.clip(alpha, 1e-3, 1)[..., None], np.float32)  # EXR's alpha is premultiplied
     said = exr_chromaticities(path) if colour is None else None
     if said is None:
-        return mixed(light, SPACES[colour or "srgb"]), mask
+        return mixed(light, SPACES[colour or "srgb"]), alpha
     red, green, blue, white = ((said[n], said[n + 1]) for n in (0, 2, 4, 6))
-    return mixed(light, Primaries(red, green, blue, white)), mask
+    return mixed(light, Primaries(red, green, blue, white)), alpha
 
 
-def _read_encoded(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, Mask | None]:
+def _read_encoded(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, FloatImage | None]:
     if colour is not None and SPACES[colour].curve == "none":
         raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
     picture = read_picture_file(path)
-    return picture.linear(SPACES[colour] if colour else None), picture.mask()
+    return picture.linear(SPACES[colour] if colour else None), picture.opacity()
 
 
 def shipped_photograph(name: Literal["astronaut"] = "astronaut") -> FloatImage:

@@ -148,7 +148,7 @@ def wrap_photograph(photo_linear: FloatImage, geometry: Geometry, mask: Mask, lo
     def pattern(across: FloatImage, above: FloatImage) -> FloatImage:
         x = (across - np.float32(middle[0])) / np.float32(metres) + np.float32((width - 1) / 2)
         y = (np.float32(middle[1]) - above) / np.float32(metres) + np.float32((height - 1) / 2)
-        return np.float32(ink) + np.float32(paper - ink) * _sampled(photo_linear, x, y)
+        return np.float32(ink) + np.float32(paper - ink) * sampled(photo_linear, x, y)
 
     return painted(space, pattern, gain=facing(geometry, mask, look.shading) if look.shading else None)
 
@@ -206,15 +206,18 @@ def _pixel_m(space: ObjectSpace) -> float:
     return float(np.median(np.abs(across)))
 
 
-def _sampled(photo: FloatImage, x: FloatImage, y: FloatImage) -> FloatImage:
-    """Bilinear samples (pixels, 3) of a picture at (pixels,) positions, its edge repeated outside."""
+def sampled(photo: FloatImage, x: FloatImage, y: FloatImage, *, border: int = cv2.BORDER_REPLICATE) -> FloatImage:
+    """Bilinear samples (pixels, channels) of a picture at (pixels,) positions, its edge repeated outside.
+
+    ``border``: OpenCV's name for another picture outside
+    """
     # remap takes at most 32767 columns, so the list is folded into rows
     width = 4096
     padded = -(-len(x) // width) * width
     maps = [np.pad(v, (0, padded - len(v))).reshape(-1, width).astype(np.float32) for v in (x, y)]
-    out = np.empty((padded, 3), dtype=np.float32)
+    out = np.empty((padded, photo.shape[2]), dtype=np.float32)
     for start in range(0, len(maps[0]), 32000):
         part = slice(start, start + 32000)
-        rows = cv2.remap(photo, maps[0][part], maps[1][part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[start * width : start * width + rows.shape[0] * width] = rows.reshape(-1, 3)
+        rows = cv2.remap(photo, maps[0][part], maps[1][part], cv2.INTER_LINEAR, borderMode=border)
+        out[start * width : start * width + rows.shape[0] * width] = rows.reshape(-1, photo.shape[2])
     return out[: len(x)]

@@ -9,14 +9,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, Final, Literal, get_type_hints
 
 import numpy as np
 
 from controller.config import Stage
 from controller.config.models import AppearanceTable
 from controller.config.table import allowed, checked_arguments
-from controller.core.arrays import FloatImage
 from controller.core.colour import ColourSpace
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
@@ -29,15 +28,18 @@ from controller.optics.solve.targets.patterns import (
     replace_pattern,
 )
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
+from controller.optics.solve.targets.sheets import as_it_is, camera_places, texture
 from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry, require_shape
+from controller.stage.artefacts.mesh import RegisteredMesh, filled_digest
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
 from controller.stage.steps.appearance.solving import AppearanceRequest
+from controller.stage.steps.mesh import carried_mesh
 
 TITLES: Mapping[str, str] = {
     "photograph": "A photograph wrapped around the object",
@@ -47,12 +49,13 @@ TITLES: Mapping[str, str] = {
     "recolour": "Recoloured",
     "picture": "A picture as seen from the camera",
     "blender": "Rendered by Blender",
+    "texture": "A picture painted on the object",
 }
 """Title of every kind of appearance."""
 
-NEEDS_FILE = ("photograph", "picture")
-NEEDS_NO_SHAPE: Final = ("recolour", "picture")
-"""Kinds that are made in the camera's picture alone."""
+NEEDS_FILE = ("photograph", "picture", "texture")
+NEEDS_NO_SHAPE: Final = ("recolour", "picture", "texture")
+"""Kinds that are made in the camera's picture alone; a texture may be."""
 
 
 def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ()) -> list[AppearanceRequest]:
@@ -94,12 +97,19 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
     if file is not None:
         inputs["file"] = sha256_of(file)
+    title = TITLES[table.kind]
+    if table.kind == "texture":
+        assert file is not None
+        inputs["mesh"], is_whole = _check_sheet(table, file, options, calibrated)
+        title += " (the sheet is nowhere transparent)" * is_whole
+    elif (digest := filled_digest(calibrated.folder)) and table.kind not in ("picture", "recolour"):
+        inputs["filled"] = digest
 
     def target() -> Target:
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
         return make_target(table.kind, file, arguments, calibrated)
 
-    return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
+    return AppearanceRequest(table.name, title, target, inputs)
 
 
 _MAKERS: Mapping[str, tuple[Callable[..., Target], type[Any]]] = {
@@ -117,8 +127,8 @@ def _options(kind: str) -> dict[str, Any]:
         return {"tint": Colour}
     if kind == "blender":
         return {"scene": str, "samples": int, "seed": int}
-    if kind == "picture":
-        return dict(_OF_FILES)
+    if kind in ("picture", "texture"):
+        return {**_OF_FILES, **({"uv": Literal["mesh", "camera"]} if kind == "texture" else {})}
     if kind not in _MAKERS:
         return {}
     options = {_RENAMED.get(name, name): kind_of for name, kind_of in get_type_hints(_MAKERS[kind][1]).items()}
@@ -147,6 +157,43 @@ def _check_picture(
     check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
 
 
+def _check_sheet(
+    table: AppearanceTable, file: Path, options: Mapping[str, Any], calibrated: Calibrated
+) -> tuple[str, bool]:
+    """What identifies the mesh and its pose, and whether the sheet has no transparency. Raises UsageError.
+
+    A mesh that was laid on an earlier calibration is laid on this one; that raises as ``lay_mesh``.
+    """
+    sheet = read_picture(file, options.get("colour"), soft=True)
+    height, width = sheet.shape[:2]
+    size_px, identity = calibrated.camera_px, "camera"
+    if options.get("uv", "mesh") == "mesh":
+        require_shape(calibrated.folder, "A texture on a mesh")
+        mesh = carried_mesh(calibrated.folder)
+        if mesh is None or mesh.uv is None:
+            raise UsageError(
+                "mesh-not-registered" if mesh is None else "mesh-without-uv",
+                what=f"The appearance {table.name} is painted on a mesh, "
+                + ("and none was laid on the object." if mesh is None else "and the registered mesh has no UV."),
+                remedy=(
+                    "Run `velatura register STAGE MESH`, " if mesh is None else "Unwrap it, and register it again, "
+                )
+                + 'or set uv = "camera" for a sheet that shows the camera\'s view.',
+            )
+        size_px, identity = mesh.figures.get("sheet_px"), f"{mesh.figures['sha256']} {mesh.pose}"
+    if size_px is not None and abs(width * size_px[1] / (height * size_px[0]) - 1) > SHEET_SHAPE:
+        raise UsageError(
+            "sheet-wrong-shape",
+            what=f"{file.name} is {width} x {height} pixels, and its sheet is {size_px[0]} x {size_px[1]}.",
+            remedy="Save it with the size of the exported sheet, or a multiple of it, and do not crop it.",
+        )
+    return identity, sheet.shape[2] == 3
+
+
+SHEET_SHAPE: Final = 0.005
+"""Relative difference of width to height that comes from rounding alone."""
+
+
 def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibrated: Calibrated) -> Target:
     """The target of a ``kind`` with its checked ``options``, on a calibrated object. Raises UsageError."""
     mask = calibrated.transport.object_mask
@@ -157,7 +204,17 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         rows, columns = mask.shape
         return load_target(file, (columns, rows), colour)
     if kind == "recolour":
-        return recolour(_as_it_is(calibrated), mask, **options)
+        return recolour(as_it_is(calibrated.transport), mask, **options)
+    if kind == "texture":
+        assert file is not None
+        sheet = np.maximum(read_picture(file, colour, soft=True), 0)
+        if sheet.shape[2] == 3:
+            sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
+        mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
+        places = (
+            camera_places(mask.shape[::-1]) if mesh is None else mesh.places(read_geometry(calibrated.folder).camera)
+        )
+        return texture(sheet, places, as_it_is(calibrated.transport), mask)
     geometry = read_geometry(calibrated.folder, calibrated.projectors)
     if kind == "photograph":
         assert file is not None
@@ -167,13 +224,6 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         maker, look = _MAKERS[kind]
         make = partial(maker, look=look(**options))
     return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make)))
-
-
-def _as_it_is(calibrated: Calibrated) -> FloatImage:
-    """The object under white light, scaled so that its brightest parts are 1."""
-    light = calibrated.transport.reach()
-    brightest = np.percentile(light[calibrated.transport.object_mask], 99)
-    return np.asarray(np.clip(light / brightest, 0, 1), np.float32)
 
 
 PREFIX: Final = "builtin:"

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
+from scipy import ndimage
 
+from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
+from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.solve.targets.files import read_picture
 from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.mesh import RegisteredMesh
+from controller.stage.services.export import export
 from controller.stage.steps.appearance.requests import requests_of
 from tests.controller.config.test_stage_file import STAGE, load
 from tests.docs.synthetic_data import CAMERA, write_run
@@ -53,3 +60,86 @@ def test_a_space_that_does_not_fit_is_refused_before_anything_is_solved(
     with pytest.raises(UsageError) as refused:
         requests_of(load(tmp_path, text), calibrated)
     assert refused.value.code == code
+
+
+def lay_wall(run: Path, *, uv: bool = True) -> None:
+    """The wall of ``write_run``, 1 m before the camera, as a registered mesh whose sheet is 2 m wide and 1.5 m high."""
+    corners = np.array([[-1, 0.75, 0], [1, 0.75, 0], [1, -0.75, 0], [-1, -0.75, 0]], np.float64)
+    faces, places = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    pose = Pose(1.0, np.eye(3), np.array([0.0, 0.0, 1.0]))
+    facts = {"sha256": "0", "sheet_px": [80, 60]}
+    RegisteredMesh(corners, faces, places[faces] if uv else None, pose, np.zeros((1, 1), np.float32), facts).write(run)
+
+
+def painted(folder: Path, sheet: npt.NDArray[np.uint8]) -> None:
+    Image.fromarray(sheet).save(folder / "t.png")
+
+
+TEXTURE = PICTURE.replace("KIND", "texture")
+
+
+def test_a_sheet_lies_on_the_mesh_and_leaves_the_object_where_it_is_clear(
+    tmp_path: Path, calibrated: Calibrated
+) -> None:
+    lay_wall(calibrated.folder)
+    sheet = np.zeros((600, 800, 4), np.uint8)
+    sheet[:, :400] = (255, 0, 0, 255)
+    painted(tmp_path, sheet)
+    request = requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0]
+    target = request.target()
+    np.testing.assert_array_equal(target.mask, calibrated.transport.object_mask)
+    left, right = target.mask.copy(), target.mask.copy()
+    left[:, 37:], right[:, :43] = False, False
+    np.testing.assert_allclose(target.image[left], np.broadcast_to((1, 0, 0), (left.sum(), 3)), atol=1e-5)
+    as_it_is = recolour_white(tmp_path, calibrated)
+    np.testing.assert_allclose(target.image[right], as_it_is[right], atol=1e-4)
+
+
+def recolour_white(folder: Path, calibrated: Calibrated) -> FloatImage:
+    text = STAGE + '\n[[appearances]]\nname = "x"\nkind = "recolour"\ntint = [1.0, 1.0, 1.0]\n'
+    return requests_of(load(folder, text), calibrated)[0].target().image
+
+
+def test_a_sheet_without_transparency_is_named(tmp_path: Path, calibrated: Calibrated) -> None:
+    lay_wall(calibrated.folder)
+    painted(tmp_path, np.full((60, 80, 3), 200, np.uint8))
+    assert "nowhere transparent" in requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0].title
+
+
+def test_a_sheet_that_does_not_fit_is_refused_before_anything_is_solved(tmp_path: Path, calibrated: Calibrated) -> None:
+    def code(settings: str = "") -> str:
+        with pytest.raises(UsageError) as refused:
+            requests_of(load(tmp_path, STAGE + TEXTURE + settings), calibrated)
+        return refused.value.code
+
+    painted(tmp_path, np.full((60, 60, 3), 200, np.uint8))
+    assert code() == "mesh-not-registered"
+    assert code('uv = "camera"\n') == "sheet-wrong-shape"
+    lay_wall(calibrated.folder)
+    assert code() == "sheet-wrong-shape"
+    lay_wall(calibrated.folder, uv=False)
+    assert code() == "mesh-without-uv"
+    painted(tmp_path, np.full((90, 120, 3), 200, np.uint8))
+    assert requests_of(load(tmp_path, STAGE + TEXTURE + 'uv = "camera"\n'), calibrated)
+
+
+@pytest.mark.parametrize("uv", ["mesh", "camera"])
+def test_an_exported_sheet_that_nobody_painted_on_leaves_the_object_as_it_is(
+    tmp_path: Path, calibrated: Calibrated, uv: str
+) -> None:
+    if uv == "mesh":
+        lay_wall(calibrated.folder)
+    (tmp_path / "t.png").unlink()
+    figures = export(run=calibrated.folder, kind="uv", out=tmp_path / "t.png", step=None)
+    assert figures["uv"] == uv
+    with Image.open(tmp_path / "t.png") as sheet:
+        assert sheet.mode == "RGBA"
+        assert list(sheet.size) == figures["size_px"]
+        assert "sRGB" in ImageCms.getProfileName(ImageCms.ImageCmsProfile(io.BytesIO(sheet.info["icc_profile"])))
+    target = requests_of(load(tmp_path, STAGE + TEXTURE + f'uv = "{uv}"\n'), calibrated)[0].target()
+    inside = ndimage.binary_erosion(target.mask, iterations=4)
+    as_it_is = recolour_white(tmp_path, calibrated)
+    assert np.abs(target.image - as_it_is)[inside].mean() < 0.02
+    with pytest.raises(UsageError) as refused:
+        export(run=calibrated.folder, kind="uv", out=tmp_path / "t.png", step=None)
+    assert refused.value.code == "sheet-exists", "somebody may have painted on it"

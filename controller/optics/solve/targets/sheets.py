@@ -1,0 +1,171 @@
+"""A picture painted on a sheet, the surface of an object unfolded: from the sheet to the object, and back.
+
+A place on a sheet is u to the right and v upwards, both 0 to 1 (UV). Sheets are (rows, columns, 4) float32: linear
+light, and alpha, with which the light is not multiplied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final, TypeAlias
+
+import cv2
+import numpy as np
+
+from controller.core import channels
+from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh, rays_of
+from controller.optics.calibrate.metapixels.from_dots import project
+from controller.optics.calibrate.values import Pinhole
+from controller.optics.solve.targets.values import Target, through_camera
+from controller.optics.solve.targets.wrap import sampled
+from controller.optics.transport import LightTransport
+
+Places: TypeAlias = Callable[[Float64], tuple[Float64, Float64]]
+"""Of camera pixels (N, 2): their places on the sheet (N, 2), NaN where it does not cover the object, and by how much
+these change (N, 2, 2) one camera pixel to the right, and one down."""
+
+_SUBPIXELS: Final = 4
+_BESIDE_PX: Final = 8
+"""Pixels of a sheet around its parts that get their colours, so that a soft brush and a filter find no black there."""
+_BEHIND: Final = 2e-3
+"""Of the mesh's size: a point this much farther away than what the camera sees there is hidden."""
+_MOST_GRAZING: Final = 0.15
+SIDES_PX: Final = (512, 4096)
+
+
+def as_it_is(transport: LightTransport) -> FloatImage:
+    """The object under white light (rows, columns, 3), scaled so that its brightest parts are 1."""
+    light = transport.reach()
+    brightest = np.percentile(light[transport.object_mask], 99)
+    return np.asarray(np.clip(light / brightest, 0, 1), np.float32)
+
+
+def camera_places(size_px: tuple[int, int]) -> Places:
+    """The sheet of an object without a mesh: the camera's picture, (width, height)."""
+    size = np.asarray(size_px, np.float64)
+
+    def places(px: Float64) -> tuple[Float64, Float64]:
+        at = (px + 0.5) / size
+        steps = np.broadcast_to(np.diag([1.0, -1.0]) / size, (len(px), 2, 2))
+        return np.stack([at[:, 0], 1 - at[:, 1]], axis=1), steps
+
+    return places
+
+
+def mesh_places(mesh: SolidMesh, uv: FloatImage, pose: Pose, camera: Pinhole) -> Places:
+    """The sheet of a mesh; ``uv`` (faces, 3, 2): the places of each face's corners."""
+
+    def places(px: Float64) -> tuple[Float64, Float64]:
+        rays = rays_of(camera, px)
+        face = mesh.met_by(rays, pose).face
+
+        def on_sheet(rays: Float64) -> Float64:
+            return np.asarray(np.einsum("nc,nck->nk", mesh.weights(rays, pose, face), uv[np.maximum(face, 0)]))
+
+        at = on_sheet(rays)
+        # on the plane of the same face, so that no seam of the sheet lies between
+        steps = np.stack([on_sheet(rays_of(camera, px + step)) - at for step in ((1.0, 0.0), (0.0, 1.0))], axis=1)
+        at[face < 0] = np.nan
+        return at, np.nan_to_num(steps, posinf=1.0, neginf=-1.0)
+
+    return places
+
+
+def texture(sheet: FloatImage, places: Places, own: FloatImage, mask: Mask) -> Target:
+    """The object with a sheet on it; ``own`` (rows, columns, 3): as it is, where the sheet is transparent or ends."""
+    painted = through_camera(Target(_painted(sheet, places, mask), mask))
+    image = painted.image[..., :3] + (1 - painted.image[..., 3:]) * own
+    return replace(painted, image=np.where(mask[..., None], image, 0).astype(np.float32))
+
+
+def _painted(sheet: FloatImage, places: Places, mask: Mask) -> FloatImage:
+    """(rows, columns, 4): light times alpha, and alpha, each the mean over the pixel's area on the sheet."""
+    levels = [np.dstack([sheet[..., :3] * sheet[..., 3:], sheet[..., 3]]).astype(np.float32)]
+    while min(levels[-1].shape[:2]) > 1:
+        rows, columns = levels[-1].shape[:2]
+        half_px = max(1, columns // 2), max(1, rows // 2)
+        levels.append(np.asarray(cv2.resize(levels[-1], half_px, interpolation=cv2.INTER_AREA), np.float32))
+    image: FloatImage = np.zeros((*mask.shape, 4), np.float32)
+    size = np.array([sheet.shape[1], sheet.shape[0]])
+    for rows_at in strips(len(mask)):
+        y, x = np.nonzero(mask[rows_at])
+        if not len(y):
+            continue
+        y += rows_at.start
+        at, steps = places(np.stack([x, y], axis=1).astype(np.float64))
+        on = np.isfinite(at[:, 0])
+        y, x, at, steps = y[on], x[on], at[on], steps[on]
+        # positions farther apart than a pixel of the sheet would alias: means of its pixels instead
+        apart_px = np.linalg.norm(steps * size, axis=2).max(axis=1, initial=0.0) / _SUBPIXELS
+        level = np.clip(np.ceil(np.log2(np.maximum(apart_px, 1e-9))), 0, len(levels) - 1).astype(np.int64)
+        for one in np.unique(level):
+            use = level == one
+            image[y[use], x[use]] = _mean(levels[one], at[use], steps[use])
+    return image
+
+
+def _mean(sheet: FloatImage, at: Float64, steps: Float64) -> FloatImage:
+    """(N, 4): of 4 x 4 positions in each pixel."""
+    rows, columns = sheet.shape[:2]
+    total = np.zeros((len(at), 4), np.float32)
+    offsets = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
+    for down in offsets:
+        for right in offsets:
+            u, v = (at + right * steps[:, 0] + down * steps[:, 1]).T
+            # a place beyond the sheet is on a repetition of it
+            x, y = (u % 1) * columns - 0.5, ((1 - v) % 1) * rows - 0.5
+            total += sampled(sheet, x.astype(np.float32), y.astype(np.float32), border=cv2.BORDER_WRAP)
+    return total / np.float32(_SUBPIXELS**2)
+
+
+def sheet_side(places: Places, mask: Mask) -> int:
+    """The side in pixels, a power of two, of a sheet as fine as the camera's picture of the object in ``mask``."""
+    y, x = np.nonzero(mask)
+    some = np.linspace(0, len(y) - 1, min(len(y), 20_000)).astype(np.int64)
+    at, steps = places(np.stack([x, y], axis=1)[some].astype(np.float64))
+    area = np.abs(np.linalg.det(steps[np.isfinite(at[:, 0])]))
+    area = area[area > 0]
+    side = 1 / np.sqrt(np.median(area)) if len(area) else 1.0
+    return int(2 ** np.ceil(np.log2(np.clip(side, *SIDES_PX))))
+
+
+def photographed(
+    picture: FloatImage, camera: Pinhole, mesh: SolidMesh, uv: FloatImage, pose: Pose, side: int
+) -> FloatImage:
+    """The sheet (side, side, 4) with the camera's ``picture`` (rows, columns, 3) where it sees the mesh, else clear."""
+    from scipy.ndimage import distance_transform_edt
+
+    corners = uv - np.floor(uv.mean(axis=1, keepdims=True))
+    flat = SolidMesh(
+        np.pad(corners.reshape(-1, 2).astype(np.float64), ((0, 0), (0, 1))),
+        np.arange(3 * len(uv), dtype=np.int32).reshape(-1, 3),
+    )
+    # the sheet lies in the plane z = 0, and is seen from above its middle
+    above = Pose(1.0, np.diag([1.0, -1.0, -1.0]), np.array([-0.5, 0.5, 1.0]))
+    sheet: FloatImage = np.zeros((side, side, 4), np.float32)
+    across = (np.arange(side) + 0.5) / side - 0.5
+    for rows in strips(side):
+        y, x = (grid.ravel() for grid in np.meshgrid(across[rows], across, indexing="ij"))
+        rays = np.stack([x, y, np.ones_like(x)], axis=1)
+        face = flat.met_by(rays, above).face
+        use = np.flatnonzero(face >= 0)
+        if not len(use):
+            continue
+        share = flat.weights(rays[use], above, face[use])
+        points_m = pose.placed(np.einsum("nc,nck->nk", share, mesh.vertices[mesh.faces[face[use]]]))
+        px, depth = project(camera, points_m)
+        met = mesh.met_by(points_m / depth[:, None], pose)
+        facing = -channels.total(met.normals * points_m) / np.linalg.norm(points_m, axis=1)
+        with np.errstate(invalid="ignore"):
+            shown = (met.depth > depth - _BEHIND * mesh.size * pose.scale) & (facing > _MOST_GRAZING)
+            shown &= channels.every((px > -0.5) & (px < np.array(picture.shape[1::-1]) - 0.5))
+        colours = sampled(picture, px[shown, 0].astype(np.float32), px[shown, 1].astype(np.float32))
+        part = sheet[rows].reshape(-1, 4)
+        part[use[shown]] = np.column_stack([colours, np.ones(len(colours), np.float32)])
+    seen = sheet[..., 3] > 0
+    if seen.any():
+        far, nearest = distance_transform_edt(~seen, return_indices=True)
+        sheet = np.where((far <= _BESIDE_PX)[..., None], sheet[tuple(nearest)], sheet)
+    return sheet
