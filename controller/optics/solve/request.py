@@ -94,8 +94,8 @@ class AppearanceResult:
     ``reachable`` (rows, columns) bool: valid pixels of the picture where ``target`` is reachable
     ``asked`` (rows, columns, 3) float32: radiance that was asked for, before any adaptation
     ``asked_reachable``, ``valid`` (rows, columns) bool: where that is reachable; where the picture says something
-    ``figures``: mode, exposure, seconds, reachable_share, fine_detail, advice, iterations, kkt; with adaptation also
-        adapted_share, that of the pixels where ``target`` is reachable
+    ``figures``: mode, exposure, held_back (of ``ExposedTarget``), seconds, reachable_share, fine_detail, advice,
+        iterations, kkt; with adaptation also adapted_share, that of the pixels where ``target`` is reachable
     """
 
     frames: tuple[FloatImage, ...]
@@ -169,6 +169,7 @@ class _ExposedPicture:
         self._light, self._folder = light, folder
         self.asked = self.wanted = moved_to_file(exposed.wanted, folder)
         self.exposure, self.needed, self.possible = exposed.exposure, exposed.needed, exposed.possible
+        self.held_back = exposed.held_back
 
     def adapt(self, strength: float) -> None:
         """Bend ``wanted`` into what the stage can make, around what ``needed`` throws back."""
@@ -201,6 +202,7 @@ def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder
     figures: dict[str, float | int | str | None] = {
         "exposure": exposed.exposure,
         "reachable_share": asked_possible.share,
+        "held_back": exposed.held_back,
     }
     if options.adapt > 0:
         for _ in range(1 if light.indirect is None else ADAPTATIONS):

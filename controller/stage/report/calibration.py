@@ -45,6 +45,8 @@ from controller.stage.report.words import When, moment, spent
 COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
 LONGEST_PX: Final = 960
+OUTLINE: Final = (230, 159, 0)
+"""Colour of the line around what counts as the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,8 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
         troubles=tuple(trouble["sentence"] for trouble in figures["troubles"]),
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
-             (ReportPicture("Before", before, "all projectors at white"), *_maps(run, calibration, crop, fine))),
+             (ReportPicture("Before", before, "all projectors at white; a line around what counts as the object"),
+              *_maps(run, calibration, crop, fine))),
             *causes_gallery(run, figures["verification"], calibration.object_mask.shape),
             *light_gallery(calibration, crop),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures, when)),
@@ -165,7 +168,12 @@ def size_px(covariance_px2: FloatImage) -> npt.NDArray[np.floating[Any]]:
 def _white(calibration: Calibration, crop: Crop) -> ByteImage:
     lit = np.asarray(sum(whites(calibration), start=calibration.black), np.float32)
     level = float(np.nanpercentile(lit[calibration.object_mask], 99))
-    return fitted(_cut(to_screen(lit, calibration.camera_to_xyz, white=level), crop), longest_px=LONGEST_PX)
+    screen = to_screen(lit, calibration.camera_to_xyz, white=level)
+    around, _ = cv2.findContours(
+        calibration.object_mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )  # fmt: skip
+    cv2.drawContours(screen, around, -1, OUTLINE, max(2, round(max(screen.shape) / LONGEST_PX)))
+    return fitted(_cut(screen, crop), longest_px=LONGEST_PX)
 
 
 def _cut(image: Any, crop: Crop) -> Any:

@@ -19,7 +19,7 @@ from controller.bundle.reader import Bundle
 from controller.core.arrays import FloatImage
 from controller.core.errors import BundleError, UsageError
 from controller.core.storage import runtime_folder
-from controller.optics.solve.reach.feasibility import exposure
+from controller.optics.solve.reach.feasibility import exposures
 from controller.optics.solve.scaling.interactive import Interactive
 from controller.play.frames import FrameFile, FrameSet, OutputSize
 from controller.play.live_stream import SILENT_S, TARGET, LiveFile
@@ -149,7 +149,7 @@ def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Read
     black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
-    brightness = exposure(
+    brightness, _ = exposures(
         calibrated.transport, white, black, share=share, drive=calibrated.drive, indirect=calibrated.indirect
     )
     reporter.say(f"White of a target has the radiance {brightness:.7g}.")

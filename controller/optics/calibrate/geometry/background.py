@@ -34,18 +34,28 @@ BORDER: Final = 0.02
 """Width of the picture's border, as a share of its height."""
 AT_BORDER: Final = 0.03
 """Share of the picture's border that a plane of the room takes: an object stands inside the picture."""
+LOOSE: Final = 4.0
+"""So many times as far from a plane of the room, a floor whose points lie in waves is found in stripes."""
+FOOT: Final = 0.05
+"""Of the picture's height: so far from the object's middle parts, what is near a plane is its foot."""
+PART: Final = 0.02
+"""A part of the object is at least this large, relative to its largest."""
+GAP: Final = 0.02
+"""Of the picture's height: parts so near to each other are one; contours, where points are unknown, part them."""
 
 
 def room_pixels(points_m: FloatImage) -> Mask:
     """Pixels (rows, columns) that see flat surfaces of the room; ``points_m``: as ``Geometry``, NaN where unknown.
 
-    A pixel without a point counts as its nearest neighbour with one. None is the room's where no plane reaches the
-    picture's border, or where hardly anything else is seen. A picture in its frame is no part of the wall behind it.
+    Room is also what is nearly on such a surface, as far as it reaches the border, and what is small or reaches the
+    border without being the largest thing. A pixel without a point counts as its nearest neighbour with one. None is
+    the room's where no plane reaches the picture's border, or where hardly anything else is seen. A picture in its
+    frame is no part of the wall behind it.
     """
     from scipy.ndimage import distance_transform_edt
 
     known = channels.finite(points_m)
-    room = np.zeros(known.shape, dtype=np.bool_)
+    room, loose = np.zeros_like(known), np.zeros_like(known)
     border, rng = _border(known.shape), np.random.default_rng(0)
     if np.mean(known[border]) < AT_BORDER:
         return room
@@ -61,6 +71,9 @@ def room_pixels(points_m: FloatImage) -> Mask:
         if np.mean(near[border]) < AT_BORDER:
             break
         room |= near
+        loose |= _near(points_m, plane, LOOSE * thick)
+    if room.any():
+        room |= known & ~_things(known & ~room, loose, border)
     if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):
         return np.zeros_like(room)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -82,6 +95,33 @@ def _pictures(room: Mask) -> Mask:
         if stats[part, cv2.CC_STAT_AREA] > PICTURE * sizes[frame[frame > 0], cv2.CC_STAT_AREA].sum():
             found |= here
     return found
+
+
+def _things(left: Mask, loose: Mask, border: Mask) -> Mask:
+    """Of the pixels ``left``, the largest joined part and others like it, with their feet.
+
+    ``loose``: nearly on a plane of the room; there a part that reaches the ``border`` is floor or wall.
+    """
+
+    def wider(mask: Mask, share: float) -> npt.NDArray[np.uint8]:
+        side = 2 * round(share * mask.shape[0]) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        return np.asarray(cv2.dilate(mask.astype(np.uint8), disc), np.uint8)
+
+    def joined(mask: Mask) -> npt.NDArray[np.int32]:
+        return np.asarray(cv2.connectedComponents(wider(mask, GAP / 2), connectivity=8)[1] * mask, np.int32)
+
+    near = joined(left & loose)
+    floor = (near > 0) & np.isin(near, near[border])
+    labels = joined(left & ~floor)
+    areas = np.bincount(labels.ravel())
+    areas[0] = 0
+    kept = areas >= max(PART * areas.max(), 1)
+    kept[labels[border]] = False
+    kept[areas.argmax()] = areas.max() > 0
+    things = kept[labels]
+    around = wider(things, FOOT) > 0
+    return np.asarray(things | (floor & around))
 
 
 def _plane(

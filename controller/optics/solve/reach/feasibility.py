@@ -21,6 +21,8 @@ from controller.optics.transport.indirect.indirect_light import IndirectLight
 
 FORGIVEN_DRIVE: Final = 2e-3
 """So much drive beyond black and white still counts as in reach."""
+SMALL_PART: Final = 0.1
+"""Of the object: a part so small that decides how bright all is, is named."""
 MOST_BEYOND: Final = 6e4
 """float16 ends at 65504."""
 
@@ -90,6 +92,13 @@ def choose_exposure(
 
     Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the target is black.
     """
+    return _exposure_and_next(transport, target, black, share, drive)[0]
+
+
+def _exposure_and_next(
+    transport: LightTransport, target: FloatImage, black: FloatImage, share: float, drive: DriveLevels | None
+) -> tuple[float, float]:
+    """As ``choose_exposure``, and the exposure at which ``SMALL_PART`` less of the object could be that bright."""
     check_target(transport, target)
     if not 0 < share <= 1:
         raise UsageError(
@@ -101,15 +110,15 @@ def choose_exposure(
     most = np.concatenate([_most(drive, target[rows], black[rows], rows) for rows in strips(len(target))])
     most.sort()
     # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
-    bound = int(np.floor((1 - share) * most.size))
-    exposure = float(most[min(bound, most.size - 1)]) if most.size else 0.0
+    bounds = (int(np.floor((1 - one) * most.size)) for one in (share, share - SMALL_PART))
+    exposure, following = (float(most[min(bound, most.size - 1)]) if most.size else 0.0 for bound in bounds)
     if not 0 < exposure < np.inf:
         raise WorkError(
             "no-light",
             what="No exposure fits this target: it is black, or no projector lights the object.",
             remedy="Check the target. Check that the projectors lit the object during the calibration.",
         )
-    return exposure
+    return exposure, following
 
 
 def _most(drive: DriveLevels, target: FloatImage, black: FloatImage, rows: slice) -> Float64:
@@ -134,13 +143,15 @@ class ExposedTarget:
     """A target at its exposure, (rows, columns, 3) radiance.
 
     ``wanted``: the whole picture; ``needed``: what of it has to come from the projectors directly, with the black
-    image; ``possible``: how that lies in what they can make
+    image; ``possible``: how that lies in what they can make; ``held_back``: how many times as bright all could be if
+    ``SMALL_PART`` less of the object had to be
     """
 
     exposure: float
     wanted: FloatImage
     needed: FloatImage
     possible: Feasibility
+    held_back: float
 
 
 def expose_target(
@@ -158,10 +169,11 @@ def expose_target(
     ``choose_exposure`` raises.
     """
     drive = DriveLevels(transport) if drive is None else drive
-    found = exposure(transport, picture, black, share=share, drive=drive, indirect=indirect)
+    found, following = exposures(transport, picture, black, share, drive=drive, indirect=indirect)
     wanted = np.float32(found) * picture
     needed = direct_part(transport, wanted, black, indirect)
-    return ExposedTarget(found, wanted, needed, feasibility(transport, needed, black, drive=drive))
+    possible = feasibility(transport, needed, black, drive=drive)
+    return ExposedTarget(found, wanted, needed, possible, following / found)
 
 
 def direct_part(
@@ -173,23 +185,24 @@ def direct_part(
     return black + indirect.direct_target(wanted - black, reach=transport.reach())
 
 
-def exposure(
+def exposures(
     transport: LightTransport,
     picture: FloatImage,
     black: FloatImage,
-    *,
     share: float,
+    *,
     drive: DriveLevels,
     indirect: IndirectLight | None = None,
-) -> float:
+) -> tuple[float, float]:
     """As ``choose_exposure``, where a part of the picture's light comes by way of other surfaces.
 
-    As direct light is linear in the picture while none of it is out of reach, both are taken apart once.
+    The second one is that at which ``SMALL_PART`` less of the object could be as bright. As direct light is linear in
+    the picture while none of it is out of reach, both are taken apart once.
     """
-    first = choose_exposure(transport, picture, black, share=share, drive=drive)
+    first = _exposure_and_next(transport, picture, black, share, drive)
     if indirect is None:
         return first
     check_target(transport, picture)
-    direct = indirect.direct_target(np.float32(first) * picture) / np.float32(first)
+    direct = indirect.direct_target(np.float32(first[0]) * picture) / np.float32(first[0])
     needed = np.where(transport.object_mask[..., None], np.maximum(direct, 0), picture).astype(np.float32)
-    return choose_exposure(transport, needed, black, share=share, drive=drive)
+    return _exposure_and_next(transport, needed, black, share, drive)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from controller.optics.solve.appearance import Base, BaseChoice, base_image, sol
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
+from controller.optics.solve.reach.feasibility import SMALL_PART
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.targets.values import Target
@@ -33,6 +34,8 @@ from hal.runtime.compute import free_bytes
 BASE = StepId(StepKind.BASE)
 MOSTLY: Final = 0.5
 """A target of which less is in reach is mostly out of reach."""
+HELD_BACK: Final = 1.5
+"""So many times as bright all could be, where a small part is named that keeps it dark."""
 
 
 def options_of(table: SolveTable) -> SolveOptions:
@@ -173,14 +176,8 @@ def _solve_appearance(
     made = (answering or partial(_answer_here, calibrated))(request, options, context)
     if made.figures["advice"] is not None:
         context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
-    share = made.figures["reachable_share"]
-    if isinstance(share, float) and share < MOSTLY:
-        context.reporter.say(
-            f"{request.title}: only {share:.0%} of the object can be shown as asked for; the rest asks for stronger "
-            "colours, or for more or less light, than the projectors can make there. Choose paler colours or a target "
-            "nearer to the object's own paint, or make the room darker.",
-            Level.WARNING,
-        )
+    for line in _limits(request.title, made.figures, options.share):
+        context.reporter.say(line, Level.WARNING)
     figures: dict[str, object] = {
         "name": request.name,
         "title": request.title,
@@ -196,6 +193,25 @@ def _solve_appearance(
         asked=RequestedTarget(made.asked, made.asked_reachable, made.valid),
     )
     return solved.write(context.folder, request.name)
+
+
+def _limits(title: str, figures: Mapping[str, object], asked: float) -> list[str]:
+    """What people should know of a target that the stage can't make well; ``asked``: the share to be in reach."""
+    lines = []
+    share, held_back = figures["reachable_share"], figures.get("held_back")
+    if isinstance(share, float) and share < MOSTLY:
+        lines.append(
+            f"{title}: only {share:.0%} of the object can be shown as asked for; the rest asks for stronger colours, "
+            "or for more or less light, than the projectors can make there. Choose paler colours or a target nearer to "
+            "the object's own paint, or make the room darker."
+        )
+    if isinstance(held_back, float) and held_back > HELD_BACK:
+        lines.append(
+            f"{title}: a small dark part of the object decides how bright all is: without it, white could be "
+            f"{held_back:.1f} times as bright. Put more light or paler paint there, or give it up with "
+            f"exposure_share = {max(asked - SMALL_PART, SMALL_PART):.2g} under [solve] in stage.toml."
+        )
+    return lines
 
 
 def device_frames(calibration: Calibration, frames: Sequence[FloatImage]) -> dict[str, ByteImage]:

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.reach.feasibility import Feasibility, choose_exposure, feasibility, target_radiance
+from controller.optics.solve.reach.feasibility import (
+    Feasibility,
+    choose_exposure,
+    expose_target,
+    feasibility,
+    target_radiance,
+)
 from controller.optics.transport import build_transport
 
 Stage = Callable[..., Calibration]
@@ -116,3 +122,15 @@ def test_pixels_without_light_in_a_channel_do_not_bear_on_the_exposure(stage: St
     assert 0 < exposure < np.inf
     assert not found.reachable[10:20, 10:20].any()
     assert found.share > 0.9
+
+
+@pytest.mark.parametrize(("dark", "held_back"), [(0.15, 5.0), (0.05, 1.0), (0.0, 1.0)])
+def test_a_small_dark_part_that_decides_the_exposure_is_told(stage: Stage, dark: float, held_back: float) -> None:
+    calibration = stage(albedo_from=0.85)
+    columns = round(dark * calibration.black.shape[1])
+    for part in calibration.projectors:
+        part.white[:] = part.white.mean(axis=(0, 1))
+        part.white[:, :columns] *= 0.2
+    transport = build_transport(calibration)
+    found = expose_target(transport, np.ones_like(calibration.black), calibration.black, share=0.9)
+    assert found.held_back == pytest.approx(held_back, rel=0.1)

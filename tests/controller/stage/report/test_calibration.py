@@ -22,7 +22,13 @@ from controller.stage.artefacts.calibration import read_calibration
 from controller.stage.artefacts.grade import ErrorMaps, write_grade, write_troubles
 from controller.stage.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
 from controller.stage.report import plots
-from controller.stage.report.calibration import StageDescription, resolution_px, size_px, write_calibration_report
+from controller.stage.report.calibration import (
+    OUTLINE,
+    StageDescription,
+    resolution_px,
+    size_px,
+    write_calibration_report,
+)
 from hal.notices import Notice
 
 NAMES = ("left", "<b>right</b>")
@@ -95,6 +101,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_troubles(made, StepId("pixels", "left"), [Notice.warning(TroubleCode.PANEL_ALIGNMENT, BLUE, about="left")])
     write_calibration_report(made, ASKED)
     return made
+
+
+def test_the_picture_before_shows_what_counts_as_the_object(run: Path) -> None:
+    picture = cv2.imread(str(run / "before.png"))
+    assert picture is not None
+    line = np.abs(picture[..., ::-1].astype(int) - OUTLINE).max(axis=2) < 40
+    assert 0 < line.mean() < 0.2
 
 
 def test_the_page_is_one_file_that_loads_nothing_and_believes_nobody(run: Path) -> None:

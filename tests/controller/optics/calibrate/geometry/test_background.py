@@ -47,6 +47,26 @@ def test_table_and_wall_are_the_rooms_and_the_ball_is_not() -> None:
     assert found[~on_ball].mean() > 0.98
 
 
+@pytest.mark.parametrize("wave", [0.004, 0.008, 0.012])
+def test_a_floor_whose_points_lie_in_waves_is_no_object_in_stripes(wave: float) -> None:
+    rows = np.arange(ROWS)[:, None]
+    floor = TABLE * (1 + wave * np.sin(2 * np.pi * rows / 14))
+    found, on_ball = room_pixels(points(BALL, floor, WALL)), np.isfinite(BALL)
+    assert found[~on_ball].mean() > 0.95
+    assert found[on_ball].mean() < 0.05
+
+
+def test_two_things_are_the_object_and_what_goes_on_beyond_the_picture_is_not() -> None:
+    small, pillar = ball((-0.18, 0.05, 1.0), 0.06), ball((0.75, 0.0, 1.3), 0.25)
+    found = room_pixels(points(BALL, small, pillar, TABLE, WALL))
+    on_small, on_pillar = (
+        np.isfinite(one) & (one < np.minimum(BALL, np.minimum(TABLE, WALL))) for one in (small, pillar)
+    )
+    assert found[on_small].mean() < 0.1
+    assert on_pillar.sum() > 300
+    assert found[on_pillar].mean() > 0.9
+
+
 def test_shadows_without_points_go_with_what_is_beside_them() -> None:
     seen = points(BALL, TABLE, WALL)
     seen[20:60, 140:170] = np.nan

@@ -12,7 +12,7 @@ from controller.core.arrays import FloatImage
 from controller.optics.solve.bounded.engine import IterationControl, Processor
 from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.solve.engines import choose_engine
-from controller.optics.solve.request import SolveOptions
+from controller.optics.solve.request import AppearanceResult, SolveOptions
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
 from controller.run.journal import Journal
@@ -85,6 +85,37 @@ class Said(Silent):
 
     def say(self, text: str, level: Level = Level.INFO) -> None:
         self.lines.append(text)
+
+
+@pytest.mark.parametrize(("held_back", "told"), [(2.5, True), (1.1, False)])
+def test_a_small_dark_part_that_keeps_all_dark_is_named(tmp_path: Path, held_back: float, told: bool) -> None:
+    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
+    picture = np.ones((*CAMERA, 3), np.float32)
+    everywhere = np.ones(CAMERA, np.bool_)
+    figures: dict[str, float | int | str | None] = {
+        "exposure": 1.0,
+        "reachable_share": 0.9,
+        "held_back": held_back,
+        "advice": None,
+    }
+    made = AppearanceResult(
+        tuple(np.ones((14, 18, 3), np.float32) for _ in names),
+        picture,
+        everywhere,
+        picture,
+        everywhere,
+        everywhere,
+        figures,
+    )
+    request, said = AppearanceRequest("one", "One", lambda: Target(picture, everywhere), {}), Said()
+    steps = solve_steps(
+        Calibrated(tmp_path, names), [request], options_of(SolveTable()), (), answering=lambda *asked: made
+    )
+    with Journal(tmp_path) as journal:
+        Runner(steps, journal, reporter=said).run("appearance", deadline=in_seconds(60))
+    lines = [line for line in said.lines if "a small dark part" in line]
+    assert bool(lines) is told
+    assert all("white could be 2.5 times as bright" in line and "exposure_share = 0.8 " in line for line in lines)
 
 
 @pytest.mark.parametrize(("colour", "told"), [((1.0, 0.0, 0.0), True), ((0.5, 0.5, 0.5), False)])
