@@ -38,16 +38,7 @@ from plugins.emulated.core.truth import (
     read_truth,
     write_truth,
 )
-from plugins.emulated.optics.layout import (
-    DARK,
-    SETTINGS,
-    Stands,
-    arranged,
-    read_engine,
-    read_object,
-    read_room,
-    read_stands,
-)
+from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_choice, read_stands
 from plugins.emulated.optics.objects import VASE_AND_BUST, default_object, load_object
 from plugins.emulated.optics.scenes import BUILT_IN
 from plugins.emulated.optics.staging import (
@@ -400,8 +391,8 @@ def _stop_on_signals(stopped: threading.Event) -> Iterator[None]:
 
 
 def _open(settings: Mapping[str, Any], context: OpenContext, deadline: Deadline) -> EmulatedBench:
-    stands = read_stands(settings, context.stage)
-    return EmulatedBench(stands, read_room(settings), read_engine(settings), read_object(settings))
+    room, engine, built_in = (read_choice(settings, key) for key in ("room", "engine", "object"))
+    return EmulatedBench(read_stands(settings, context.stage), room or DARK, engine, built_in)
 
 
 DRIVER: Final = Driver(

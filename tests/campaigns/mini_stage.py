@@ -37,14 +37,16 @@ TIME_SCALE: Final = 0.02
 APPEARANCE: Final = "checkerboard"
 
 
-def prepare_mini(out: Path, seed: int = 3) -> Path:
-    """The stage folder ``out/stage``: two projectors, short exposures, one appearance."""
-    two = bench.EmulatedBench(Stands(PROJECTORS))
+def prepare_mini(out: Path, seed: int = 3, *, thing: str | None = None, projectors: int = PROJECTORS) -> Path:
+    """The stage folder ``out/stage``: short exposures, and one appearance, or those of the built-in ``thing``."""
+    its_bench = bench.EmulatedBench(Stands(projectors), built_in=thing)
     sizes = patch.object(staging, "SIZES", {**staging.SIZES, "mini": MINI})
-    with sizes, patch.object(demo_stage, "bench_of", lambda folder, settings: two):
-        stage = demo_stage.prepare(out, demo_stage.DemoStage("mini", seed, room="dark"))
+    with sizes, patch.object(demo_stage, "bench_of", lambda folder, settings: its_bench):
+        stage = demo_stage.prepare(out, demo_stage.DemoStage("mini", seed, thing, "dark", projectors))
     truth, known = stage / "bench.toml", stage / "stage.toml"
     truth.write_text(truth.read_text().replace("time_scale = 0.25", f"time_scale = {TIME_SCALE}"))
+    if thing is not None:
+        return stage
     head = known.read_text().partition("\n[[appearances]]")[0].rpartition("\n#")[0]
     table = f'[capture]\nsettle_s = 0.05\n\n[[appearances]]\nname = "{APPEARANCE}"\nkind = "checkerboard"\n'
     known.write_text(f"{head}\n\n{table}")

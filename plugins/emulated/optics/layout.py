@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from hal.errors import DeviceError, PluginError
+from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.runtime.files import read_text
 from plugins.emulated.core.tables import Between, load
@@ -53,7 +53,9 @@ TURNS: Final = Dithering(levels=64, turns=4, frame_s=1 / 240)
 def arranged(truth: BenchTruth, room: str, thing: StageObject, *, hung: bool = False) -> BenchTruth:
     """The stage in a room of ``ROOMS``; ``dark`` leaves it as it is. ``hung``: the object hangs on a wall."""
     if hung:
-        truth = dataclasses.replace(truth, surfaces=(_wall_behind(thing),))
+        corner = (-HALF_WIDTH_M, -CEILING_M, float(thing.vertices[:, 2].max()) + TABLE_GAP_M)
+        wall = SurfaceTruth("wall", corner, (2.0 * HALF_WIDTH_M, 0.0, 0.0), (0.0, 2.0 * CEILING_M, 0.0), PAINT)
+        truth = dataclasses.replace(truth, surfaces=(wall,))
     if room == DARK:
         return truth
     truth = dataclasses.replace(
@@ -99,11 +101,6 @@ def table_and_wall(thing: StageObject) -> tuple[SurfaceTruth, ...]:
         SurfaceTruth("table", (-HALF_WIDTH_M, low, -FRONT_M), across, (0.0, 0.0, FRONT_M + WALL_M), WOOD),
         SurfaceTruth("wall", (-HALF_WIDTH_M, -CEILING_M, WALL_M), across, (0.0, low + CEILING_M, 0.0), PAINT),
     )
-
-
-def _wall_behind(thing: StageObject) -> SurfaceTruth:
-    corner = (-HALF_WIDTH_M, -CEILING_M, float(thing.vertices[:, 2].max()) + TABLE_GAP_M)
-    return SurfaceTruth("wall", corner, (2.0 * HALF_WIDTH_M, 0.0, 0.0), (0.0, 2.0 * CEILING_M, 0.0), PAINT)
 
 
 PLACES: Final = (
@@ -198,12 +195,13 @@ class Stands:
         )
 
 
+CHOICES: Final = {"object": tuple(BUILT_IN), "room": ROOMS, "engine": ENGINES}
 SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
     f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens, pupil_m and sharpest_px; without the last, it is drawn at random",
-    "object": f"one of {', '.join(BUILT_IN)}; if omitted: a vase and a bust",
+    "object": f"one of {', '.join(BUILT_IN)}; if omitted: a mesh (`velatura demo --object FILE`), or a vase and a bust",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
     "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
 }
@@ -239,32 +237,12 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
     return Stands(len(stands), stands)
 
 
-def read_room(settings: Mapping[str, Any]) -> str:
-    """From the settings of the bench. Raises PluginError("setting-wrong")."""
-    room = settings.get("room", DARK)
-    if room not in ROOMS:
-        raise _wrong("room", room)
-    return str(room)
-
-
-def read_object(settings: Mapping[str, Any]) -> str | None:
-    """A name of ``BUILT_IN`` from the settings of the bench; None: vase and bust. Raises DeviceError."""
-    name = settings.get("object")
-    if name is not None and name not in BUILT_IN:
-        raise DeviceError(
-            "object-missing",
-            what=f"There is no object called {name!r}.",
-            remedy=f"Choose one of {', '.join(BUILT_IN)}, or give the path of a mesh, .obj or .ply.",
-        )
-    return name
-
-
-def read_engine(settings: Mapping[str, Any]) -> str | None:
-    """From the settings of the bench; None: as the room says. Raises PluginError("setting-wrong")."""
-    engine = settings.get("engine")
-    if engine is not None and engine not in ENGINES:
-        raise _wrong("engine", engine)
-    return engine
+def read_choice(settings: Mapping[str, Any], key: str) -> str | None:
+    """One of ``CHOICES`` from the settings of the bench; None if omitted. Raises PluginError("setting-wrong")."""
+    value = settings.get(key)
+    if value is not None and value not in CHOICES[key]:
+        raise _wrong(key, value)
+    return value
 
 
 def _wrong(key: str, value: object) -> PluginError:

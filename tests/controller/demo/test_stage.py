@@ -163,7 +163,7 @@ def test_a_bare_word_is_a_built_in_object_and_all_else_a_mesh(bench: ModelBench,
 @pytest.mark.parametrize(
     ("asked", "code", "words"),
     [
-        ({"thing": "vase"}, "object-missing", "painting, relief, statue"),
+        ({"thing": "vase"}, "setting-wrong", "painting, relief, statue"),
         ({"projectors": 7}, "setting-wrong", "from 1 to 6"),
     ],
 )

@@ -62,16 +62,17 @@ def room_pixels(points_m: FloatImage) -> Mask:
     at = np.flatnonzero(known)
     everything = points_m.reshape(-1, 3)[at[rng.integers(0, at.size, POINTS)]].astype(np.float64)
     thick = THICK * float(np.median(np.linalg.norm(everything, axis=1)))
+    looked_at = np.zeros_like(room)
     for _ in range(MOST_PLANES):
-        left = known & ~room
+        left = known & ~looked_at
         plane = _plane(points_m, left, everything, thick, rng)
         if plane is None:
             break
         near = left & _near(points_m, plane, thick)
-        if np.mean(near[border]) < AT_BORDER:
-            break
-        room |= near
-        loose |= _near(points_m, plane, LOOSE * thick)
+        looked_at |= near
+        if np.mean(near[border]) >= AT_BORDER:
+            room |= near
+            loose |= _near(points_m, plane, LOOSE * thick)
     if room.any():
         room |= known & ~_things(known & ~room, loose, border)
     if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from hal.deadline import in_seconds
-from hal.errors import DeviceError
+from hal.errors import PluginError
 from hal.registry import OpenContext
 from plugins.emulated.bench import DRIVER
 from plugins.emulated.core.truth import BenchTruth, read_truth
@@ -147,6 +147,7 @@ def test_a_statue_comes_with_a_scan_and_a_sheet_of_its_old_colours(seen: Callabl
 
 
 def test_an_object_that_the_bench_has_not_is_refused_with_all_that_it_has(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match="painting, relief, statue, corner, cylinder, sphere, two-objects") as refused:
-        DRIVER.open({"object": "vase"}, OpenContext(stage=tmp_path), in_seconds(5))
-    assert refused.value.code == "object-missing"
+    for name in ("vase", "Painting", "", ["painting"], 3):
+        with pytest.raises(PluginError, match="painting, relief, statue, corner, cylinder, sphere, two-") as refused:
+            DRIVER.open({"object": name}, OpenContext(stage=tmp_path), in_seconds(5))
+        assert refused.value.code == "setting-wrong"

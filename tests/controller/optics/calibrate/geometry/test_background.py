@@ -67,6 +67,13 @@ def test_two_things_are_the_object_and_what_goes_on_beyond_the_picture_is_not() 
     assert found[on_pillar].mean() > 0.9
 
 
+def test_a_wall_that_is_lit_in_the_middle_alone_does_not_end_the_search_for_the_table() -> None:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    seen = points(BALL, TABLE, np.where((y > 8) & (x > 8) & (x < 171), WALL, np.inf))
+    on_table = np.minimum(BALL, WALL) > TABLE
+    assert room_pixels(seen)[on_table].mean() > 0.98
+
+
 def test_shadows_without_points_go_with_what_is_beside_them() -> None:
     seen = points(BALL, TABLE, WALL)
     seen[20:60, 140:170] = np.nan
