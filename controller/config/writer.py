@@ -95,11 +95,11 @@ def _value(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeyChange:
-    """``key`` = ``value`` in the table at ``path``, e.g. ``("projectors", 0)``: changed, or added."""
+    """``key`` = ``value`` in the table at ``path``, e.g. ``("projectors", 0)``: changed, added, or removed (None)."""
 
     path: KeyPath
     key: str
-    value: str | int | float | bool
+    value: str | float | bool | list[str] | None
 
 
 def edited(text: str, changes: Sequence[KeyChange] = (), tables: Mapping[str, Any] | None = None) -> str:
@@ -132,10 +132,10 @@ def rewrite_stage(
 
 def _changed(text: str, change: KeyChange) -> str:
     wanted: Any = tomllib.loads(text)
-    _table_at(wanted, change.path)[change.key] = change.value
+    _put(_table_at(wanted, change.path), change)
     try:
         document = tomlkit.parse(text)
-        _assign(_table_at(document, change.path), change.key, change.value, "\r\n" if "\r\n" in text else "\n")
+        _assign(_table_at(document, change.path), change, "\r\n" if "\r\n" in text else "\n")
         changed = tomlkit.dumps(document)
         safe = bool(tomllib.loads(changed) == wanted)
     # What tomlkit can't read or place, and what it would write wrongly, is left to a person.
@@ -152,19 +152,26 @@ def _table_at(content: Any, path: KeyPath) -> Any:
     return content
 
 
-def _assign(table: Any, key: str, value: str | int | float | bool, end: str) -> None:
-    """Change a key, or add it after the table's last own one: before comments and tables that follow."""
+def _put(table: Any, change: KeyChange) -> None:
+    if change.value is None:
+        table.pop(change.key, None)
+    else:
+        table[change.key] = change.value
+
+
+def _assign(table: Any, change: KeyChange, end: str) -> None:
+    """Change or remove a key, or add it after the table's last own one: before comments and tables that follow."""
     container = table.value if isinstance(table, tomlkit.items.Table) else table
-    if key in table or not isinstance(container, tomlkit.container.Container):
-        table[key] = value
+    if change.value is None or change.key in table or not isinstance(container, tomlkit.container.Container):
+        _put(table, change)
         return
-    added = tomlkit.item(value)
+    added = tomlkit.item(change.value)
     added.trivia.trail = end
     own = [n for n, (name, item) in enumerate(container.body) if name is not None and not _stands_as_table(item)]
     first = own[-1] + 1 if own else 0
     after = container.body[first:]
     del container.body[first:]
-    table[key] = added
+    table[change.key] = added
     container.body.extend(after)
 
 

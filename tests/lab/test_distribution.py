@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -37,6 +40,36 @@ def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.Monkey
         with pytest.raises(DeviceError, match="needs the distribution velatura-lab") as refused:
             extensions.extension(part, asked_by="This stage")
         assert refused.value.code == "bench-part-missing"
+
+
+_DEMO = """
+import importlib, importlib.metadata as metadata, re, sys
+plain = lambda name: re.sub("[-_.]+", "-", name).lower()
+locked = {plain(name) for name in re.findall("^([A-Za-z0-9_.-]+)==", open("requirements-demo.lock").read(), re.M)}
+locked |= {"velatura", "velatura-lab"}
+kept = metadata.packages_distributions().items()
+absent = {module for module, names in kept if not locked & set(map(plain, names))}
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in absent:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Absent())
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+"""
+
+
+def test_a_strangers_environment_is_enough_for_the_lab_which_the_first_tutorial_uses() -> None:
+    """It moves a projector by ``bench/bumps.toml``; all that a reader has is what `make demo` set up."""
+    page = (ROOT / "docs" / "tutorials" / "first-stage.md").read_text()
+    assert "bench/bumps.toml" in page
+    assert re.search(r'\[ "\$what" != player \]; then\n  install .*\./lab', (ROOT / ".ci" / "setup").read_text())
+    entries = PROJECT["project"]["entry-points"]
+    modules = {value.partition(":")[0] for group in entries.values() for value in group.values()}
+    subprocess.run([sys.executable, "-c", _DEMO, *sorted(modules)], check=True, cwd=ROOT)
+    for quoted in ("Ready. Ctrl-C ends.", "The stage is as it was set up, except for"):
+        assert quoted in page
+        assert quoted in (ROOT / "plugins" / "emulated" / "bench.py").read_text()
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, commands: dict[str, str]) -> None:

@@ -29,6 +29,7 @@ from controller.panel.auth.identity import Entry, Visitor, same_origin
 from controller.panel.context import Panel
 from controller.panel.pages.drawing import flags
 from controller.panel.pages.routes import Pages
+from controller.panel.pages.settings_fields import groups, with_fields
 from controller.panel.words.days import canonical
 from controller.panel.words.language import gettext, mark
 
@@ -77,15 +78,37 @@ class Forms:
         self._panel, self._pages = panel, pages
 
     def entries(self) -> list[Entry]:
-        return [
-            Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._operation(op)))
-            for op in self._panel.operations
-            if op.name in LEADS_TO
-        ] + [
-            Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._check))
-            for op in self._panel.operations
-            if op.name == "check-settings"
-        ]
+        return (
+            [
+                Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._operation(op)))
+                for op in self._panel.operations
+                if op.name in LEADS_TO
+            ]
+            + [
+                Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._check))
+                for op in self._panel.operations
+                if op.name == "check-settings"
+            ]
+            + [
+                Entry("POST", "/settings/fields", "session", op.role, checked(self._panel, self._fields(op)))
+                for op in self._panel.operations
+                if op.name == "save-settings"
+            ]
+        )
+
+    def _fields(self, save: Operation) -> Handler:
+        """The fields of the settings that museums change; all else in stage.toml stays."""
+
+        async def answer(request: Request, visitor: Visitor, sent: Sent) -> Response:
+            text = await self._panel.in_thread(self._panel.kiosk.settings)
+            try:
+                text = with_fields(text, sent.texts)
+                await self._panel.in_thread(lambda: self._panel.kiosk.validate_settings(text))
+            except answers.FAILURES as error:
+                return await self._settings(visitor, Sent({"text": text} | sent.texts), error)
+            return await self._operation(save)(request, visitor, Sent({"text": text}, {"text": [text]}))
+
+        return answer
 
     def _operation(self, operation: Operation) -> Handler:
         async def answer(_: Request, visitor: Visitor, sent: Sent) -> Response:
@@ -181,7 +204,8 @@ class Forms:
 
     async def _settings(self, visitor: Visitor, sent: Sent, error: answers.Failure | None) -> Response:
         """The settings page with the text that was sent."""
-        facts = {"text": sent.texts.get("text", ""), "problem": error, "here": "/settings"}
+        text = sent.texts.get("text", "")
+        facts = {"text": text, "groups": groups(text), "typed": sent.texts, "problem": error, "here": "/settings"}
         return await self._pages.show("settings.html", visitor, facts, 200 if error is None else 422)
 
 
@@ -335,9 +359,8 @@ class Setup:
             text = stage_text(sent.texts.get("name", ""), [device for device in devices if device.key in chosen])
             await self._panel.in_thread(lambda: self._panel.kiosk.save_settings(text))
         except answers.FAILURES as error:
-            return await self._pages.show(
-                "settings.html", visitor, {"text": text, "problem": error, "here": "/settings"}, 422
-            )
+            facts: dict[str, Any] = {"text": text, "groups": [], "problem": error, "here": "/settings"}
+            return await self._pages.show("settings.html", visitor, facts, 422)
         visitor.session.notes.append(("good", gettext("The stage is set up. Aim the projectors next.")))
         return RedirectResponse("/aiming", 303)
 

@@ -24,6 +24,7 @@ from controller.panel.context import Panel
 from controller.panel.pages import calendar
 from controller.panel.pages.calendar import lamp_reports
 from controller.panel.pages.drawing import EVENTS_SHOWN, Drawing
+from controller.panel.pages.settings_fields import groups
 from controller.panel.words.language import language, mark
 
 _CAUSES: Final = [(cause.name.lower(), name) for cause, (name, _, _) in error_causes.WORDS.items()]
@@ -109,12 +110,7 @@ class Pages:
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
-            (
-                "/settings",
-                Role.TECHNICIAN,
-                "settings.html",
-                self._settings,
-            ),
+            ("/settings", Role.TECHNICIAN, "settings.html", self._settings),
             ("/care", Role.TECHNICIAN, "care.html", lambda _: {}),
             ("/accounts", Role.TECHNICIAN, "accounts.html", self._accounts),
             ("/setup", Role.TECHNICIAN, "setup.html", lambda _: {"found": None, "tried": {}, "name": "", "chosen": ()}),
@@ -227,7 +223,7 @@ class Pages:
                 kiosk.validate_settings(text)
         except answers.FAILURES as error:
             problem = error
-        return {"text": text, "problem": problem}
+        return {"text": text, "problem": problem, "groups": groups(text)}
 
     def _now(self, _: Request) -> dict[str, Any]:
         """Without the camera's picture, which may wait for the camera: the script asks for it while a job runs."""

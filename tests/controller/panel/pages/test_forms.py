@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from pathlib import Path
@@ -218,3 +219,90 @@ def test_settings_that_are_wrong_come_back_as_they_were_typed(fresh: Served) -> 
         assert answer.status_code == 422
         assert "[stage\r\nname = &lt;b&gt;" in answer.text.replace("\n", "\r\n").replace("\r\r", "\r")
         assert "<b>" not in answer.text.partition("<textarea")[2].partition("</textarea")[0]
+
+
+FIELDS = """# ours
+[stage]
+name = "vase"  # by Anna
+
+[[projectors]]
+name = "left"
+output = "P1"
+driver = "serial"
+port = "/dev/ttyUSB0"
+profile = "optoma-later"
+
+[camera]
+driver = "ptp"
+iso = 100
+focal_length_px = 4100.0
+
+[display]
+driver = "player"
+
+[[display.outputs]]
+name = "P1"
+width_px = 1400
+height_px = 1050
+
+[[appearances]]
+name = "wood"
+kind = "pattern"
+shown_s = 20
+
+[disk]
+keep_runs = 7
+"""
+
+
+@pytest.mark.parametrize(
+    ("field", "typed", "old", "new"),
+    [
+        ("stage.name", "jar", '"vase"', '"jar"'),
+        ("appearances.0.shown_s", "7.5", "shown_s = 20", "shown_s = 7.5"),
+        ("appearances.0.fade_s", "2", "shown_s = 20\n", "shown_s = 20\nfade_s = 2.0\n"),
+        ("appearances.0.shown_s", "", "shown_s = 20\n", ""),
+        ("disk.keep_runs", "9", "keep_runs = 7", "keep_runs = 9"),
+        ("calibration.photograph_at_night", "true", "", "\n[calibration]\nphotograph_at_night = true\n"),
+        ("backup.at", "02:30", "", '\n[backup]\nat = "02:30"\n'),
+    ],
+)
+def test_a_field_of_the_settings_changes_its_key_alone(
+    fresh: Served, field: str, typed: str, old: str, new: str
+) -> None:
+    fresh.kiosk.save_settings(FIELDS)
+    with fresh.entered("tina") as client:
+        page = client.get("/settings").text
+        form = dict(re.findall(r'<input name="([a-z_.0-9]+)" value="([^"]*)"', page))
+        assert field in form or f'<select name="{field}"' in page
+        answer = client.post("/settings/fields", data=form | {"csrf": csrf(page), field: typed, "sure": "yes"})
+        if answer.status_code == 200:  # it asks first
+            text = answer.text.partition('<textarea name="text" hidden aria-hidden="true">\n')[2].partition(
+                "</textarea"
+            )[0]
+            sent = {"csrf": csrf(answer.text), "text": html.unescape(text), "sure": "yes"}
+            answer = client.post("/do/save-settings", data=sent)
+        assert answer.status_code == 303, answer.text
+    assert fresh.kiosk.settings() == (FIELDS.replace(old, new, 1) if old else FIELDS + new)
+
+
+def test_a_list_is_typed_with_commas(fresh: Served) -> None:
+    fresh.kiosk.save_settings(FIELDS)
+    mail = {"alerts.mail_to": "a@b.c, d@e.f,", "alerts.mail_from": "v@e.f", "alerts.mail_host": "mail.e.f"}
+    with fresh.entered("tina") as client:
+        form = mail | {"csrf": csrf(client.get("/settings").text)}
+        assert client.post("/settings/fields", data=form).status_code == 303
+        assert 'value="a@b.c, d@e.f"' in client.get("/settings").text
+    assert 'mail_to = ["a@b.c", "d@e.f"]\n' in fresh.kiosk.settings()
+
+
+def test_what_a_field_may_not_hold_is_named_and_what_was_typed_stays(fresh: Served) -> None:
+    fresh.kiosk.save_settings(FIELDS)
+    with fresh.entered("tina") as client:
+        form = {"csrf": csrf(client.get("/settings").text), "disk.keep_runs": "<many>", "stage.name": "jar"}
+        answer = client.post("/settings/fields", data=form)
+        assert answer.status_code == 422
+        assert "keep_runs" in answer.text.partition('role="alert"')[2].partition("</p>")[0]
+        assert "&lt;many&gt;" in answer.text
+        assert 'value="jar"' in answer.text
+    assert fresh.kiosk.settings() == FIELDS
