@@ -31,7 +31,8 @@ _FIELDS: Final[Mapping[tuple[str, str, type[ConfigTable]], Mapping[str, str]]] =
         "most_lux": mark("Most lux at the object for a calibration"),
     },
     ("calibration", mark("Calibration"), CalibrationTable): {
-        "photographs": mark("Number of photographs"), "worst_grade": mark("Largest error that is published, in per cent"),
+        "photographs": mark("Number of photographs"),
+        "worst_grade": mark("Largest error that is published, in per cent"),
         "photograph_at_night": mark("Photograph the appearances at night"),
     },
     ("backup", mark("Backup"), BackupTable): {
