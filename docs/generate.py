@@ -271,7 +271,7 @@ def missing_paths() -> Iterator[str]:
 def python_api() -> str:
     """What ``controller.api`` names, by its modules; the values of other modules come last."""
     module = importlib.import_module(STABLE)
-    text = [f"# Python API\n\n```{{eval-rst}}\n.. automodule:: {STABLE}\n   :no-members:\n   :no-index:\n```\n"]
+    text = [f"```{{eval-rst}}\n.. automodule:: {STABLE}\n   :no-members:\n   :no-index:\n```\n"]
     own, values = {}, []
     for name in module.__all__:
         home = getattr(module, name).__module__

@@ -62,6 +62,7 @@ from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.result.metrics import Comparison
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.stage.artefacts.solved import Solved
 from controller.stage.exchange.pairs import Pairs, read_pairs
 
 __all__ = [
@@ -88,6 +89,7 @@ __all__ = [
     "Radiometry",
     "ReachableTarget",
     "Solution",
+    "Solved",
     "VelaturaError",
     "base_image",
     "build_transport",

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.api.captures import CaptureSet
+from controller.core.arrays import FloatImage, as_light
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.correspondence import decode as correspondence_decode
 from controller.optics.calibrate.correspondence.captures import check_still, inconsistent
@@ -36,6 +37,7 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.calibration import object_mask, projectors_of
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.artefacts.grade import graded
+from controller.stage.artefacts.solved import Solved, read_solved
 
 
 def decode(captures: CaptureSet) -> Correspondence:
@@ -243,6 +245,28 @@ class CalibratedRun:
         """The light by way of other surfaces; None if the run measured none that counts."""
         return self._calibrated.indirect
 
+    def predicted(self, frames: Sequence[npt.ArrayLike]) -> FloatImage:
+        """What the camera sees of linear ``frames``, (rows, columns, 3) each, 0 to 1, one a projector.
+
+        (camera rows, columns, 3) float32, as for the grade: the black image, direct light, and what object and room
+        throw back.
+        ``indirect.forward(transport.forward(frames))`` leaves out what comes back from table and walls.
+        """
+        light = self.calibration.black.astype(np.float32)
+        for n, frame in enumerate(frames):
+            shown = as_light(frame)
+            back = self._calibrated.indirect_of(n, shown)
+            light += self.transport.forward_part(n, shown)
+            light += 0 if back is None else back
+        return light
+
+    def appearance(self, name: str) -> Solved:
+        """A solved appearance of the run, with its present frames: refined ones, where there are.
+
+        Errors: ``appearance-not-solved``.
+        """
+        return read_solved(self.folder, name, self.projectors)
+
     @cached_property
     def geometry(self) -> Geometry:
         """Poses and surface: ``points_m`` (camera rows, columns, 3) float32, metres in the camera's frame."""
@@ -271,7 +295,8 @@ def read_run(folder: Path | str, projectors: Sequence[str] | None = None) -> Cal
 
     Returns
     -------
-    ``CalibratedRun`` with ``calibration``, ``transport``, ``geometry``, ``camera`` and ``grade``
+    ``CalibratedRun`` with ``calibration``, ``transport``, ``geometry``, ``camera`` and ``grade``; ``predicted(frames)``
+    and ``appearance(name)``
 
     Errors: ``not-calibrated``, ``projector-unknown``; ``array-file-unreadable`` when a part is damaged.
     """

@@ -15,6 +15,7 @@ from skimage import color
 
 from controller import api
 from controller.core.arrays import Float64
+from lab.timings.tools.synthetic import write_synthetic_run
 from tests.controller.optics.solve.conftest import plane_calibration
 from tests.lab.study.array_stage import shell
 
@@ -189,3 +190,22 @@ def test_a_file_that_cannot_hold_the_content_is_refused(tmp_path: Path, name: st
         api.export(tmp_path / name, content)
     assert error.value.code == code
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_predicts_frames_and_reads_its_appearances(tmp_path: Path) -> None:
+    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=(36, 50))
+    run = api.CalibratedRun(tmp_path, names)
+    frames = [np.full((14, 18, 3), 0.1 * (n + 1), np.float32) for n in range(len(names))]
+    light = run.predicted(frames)
+    np.testing.assert_allclose(light, run.calibration.black + run.transport.forward(frames), rtol=1e-5)
+    with pytest.raises(api.VelaturaError) as missing:
+        run.appearance("gold")
+    assert missing.value.code == "appearance-not-solved"
+    device = dict(zip(names, (np.zeros((14, 18, 3), np.uint8) for _ in names), strict=True))
+    everywhere = np.ones((36, 50), np.bool_)
+    solved = api.Solved(device, dict(zip(names, frames, strict=True)), light, everywhere, {"exposure": 2.0})
+    solved.write(tmp_path, "gold")
+    found = run.appearance("gold")
+    np.testing.assert_array_equal(found.linear[names[1]], frames[1])
+    np.testing.assert_array_equal(found.target, light)
+    assert found.exposure == 2.0
