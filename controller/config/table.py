@@ -114,6 +114,8 @@ def allowed(kind: Any) -> str:
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Literal:
         return "one of " + ", ".join(f'"{word}"' for word in inner)
+    if origin is tuple and inner[-1] is ...:
+        return f"a list, each {allowed(inner[0])}"
     if origin is tuple:
         return f"a list of {len(inner)}, each {allowed(inner[0])}"
     if origin in (Union, types.UnionType):

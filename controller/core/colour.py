@@ -92,6 +92,19 @@ def to_linear_srgb(space: Primaries) -> Float64:
     return np.asarray(matrix)
 
 
+def reflectance_to_camera(white: tuple[float, float], camera_to_xyz: Float64) -> Float64:
+    """(3, 3): linear sRGB of a surface, as of D65, to camera RGB of the same surface under a light of CIE xy ``white``.
+
+    ``camera_to_xyz`` (3, 3), as of ``Calibration``: equal camera values are grey under D65. The light changes the
+    surface's colour as it changes that of white (Bradford); its luminance stays.
+    """
+    srgb = _to_xyz(SRGB)
+    camera_to_srgb = np.linalg.solve(srgb, camera_to_xyz)
+    camera_to_srgb /= camera_to_srgb.sum(axis=1, keepdims=True)
+    under_light = np.linalg.solve(srgb, _adapted(_xyz(D65), _xyz(white)) @ srgb)
+    return np.asarray(np.linalg.solve(camera_to_srgb, under_light))
+
+
 def mixed(light: FloatImage, space: Primaries) -> FloatImage:
     """Linear sRGB (..., 3) of linear light (..., 3) in ``space``. Raises Unsuitable."""
     matrix = to_linear_srgb(space).astype(np.float32)

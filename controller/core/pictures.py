@@ -63,15 +63,26 @@ class Picture:
         """(rows, columns): more than half opaque. The others are no part of the picture; None: all pixels are."""
         return None if self.alpha is None else np.asarray(self.alpha > _full(self.alpha) / 2)
 
-    def opacity(self) -> FloatImage | None:
-        """(rows, columns) float32 in [0, 1]; None: all is opaque."""
-        return None if self.alpha is None else self.alpha.astype(np.float32) / np.float32(_full(self.alpha))
+    def opacity(self, by: int = 1) -> FloatImage | None:
+        """(rows, columns) float32 in [0, 1], each the mean of ``by`` x ``by``; None: all is opaque."""
+        return None if self.alpha is None else _means(self.alpha, by) / np.float32(_full(self.alpha))
 
     def linear(self, colours: Colours | None = None) -> FloatImage:
         """(rows, columns, 3) float32 linear sRGB light; ``colours`` go before the file's own. Raises Unsuitable."""
         if self.values.dtype.kind == "f":
             raise Unsuitable("its numbers are floats, and it does not say which of them is white")
         return linear_light(self.values, colours or self.colours)
+
+    def averaged(self, colours: Colours | None, by: int) -> FloatImage:
+        """``linear``, each pixel the mean of ``by`` x ``by``, in little memory. Raises Unsuitable."""
+        if by == 1:
+            return self.linear(colours)
+        rows, columns = (side // by for side in self.values.shape[:2])
+        light = np.empty((rows, columns, 3), np.float32)
+        for row in range(0, rows, 64):
+            part = replace(self, values=self.values[row * by : min(row + 64, rows) * by])
+            light[row : row + 64] = _means(part.linear(colours), by)
+        return light
 
     def srgb(self) -> npt.NDArray[Any]:
         """(rows, columns, 3) sRGB: the numbers, or uint16 where colours were converted. Raises Unsuitable."""
@@ -362,17 +373,19 @@ def _turned(picture: Picture, orientation: int) -> Picture:
     return replace(picture, values=turn(picture.values), alpha=None if picture.alpha is None else turn(picture.alpha))
 
 
+def _means(plane: npt.NDArray[Any], by: int) -> FloatImage:
+    """Of ``by`` x ``by`` pixels of (rows, columns[, channels])."""
+    rows, columns = (side // by for side in plane.shape[:2])
+    whole = plane[: rows * by, : columns * by].reshape(rows, by, columns, by, *plane.shape[2:])
+    return np.asarray(whole.mean(axis=(1, 3), dtype=np.float32))
+
+
 def _smaller(picture: Picture, by: int) -> Picture:
     """Means of ``by`` x ``by`` pixels; a transparent pixel's colour has no weight."""
 
-    def mean(plane: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-        rows, columns = (side // by for side in plane.shape[:2])
-        whole = plane[: rows * by, : columns * by].reshape(rows, by, columns, by, -1)
-        return np.asarray(whole.mean(axis=(1, 3), dtype=np.float32))
-
     dtype = picture.values.dtype
     if picture.alpha is None:
-        return replace(picture, values=np.rint(mean(picture.values)).astype(dtype))
-    alpha = mean(picture.alpha[..., None])
-    colour = mean(picture.values * picture.alpha[..., None].astype(np.float32)) / np.maximum(alpha, 1e-6)
+        return replace(picture, values=np.rint(_means(picture.values, by)).astype(dtype))
+    alpha = _means(picture.alpha[..., None], by)
+    colour = _means(picture.values * picture.alpha[..., None].astype(np.float32), by) / np.maximum(alpha, 1e-6)
     return replace(picture, values=np.rint(colour).astype(dtype), alpha=np.rint(alpha[..., 0]).astype(dtype))

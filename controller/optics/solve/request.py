@@ -59,6 +59,7 @@ class SolveOptions:
     ``base``: the base image; with "high-pass" each appearance solves one of its own
     ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
     ``method``: which solver, so that a run knows; the engine of the context is the one that solves
+    ``exposure``: instead of that by ``share``, where a target asks for one
     """
 
     share: float
@@ -67,6 +68,7 @@ class SolveOptions:
     base: BaseChoice = "white"
     adapt: float = 0.0
     method: Method = "global"
+    exposure: float | None = None
 
     def inputs(self) -> dict[str, str]:
         """What an appearance depends on, as the journal compares it."""
@@ -117,7 +119,7 @@ def solve_appearance(
     """
     if light.drive is None:
         light = replace(light, drive=DriveLevels(light.transport, context.folder))
-    aim = aim_at(light, requested.image, options, context.folder)
+    aim = aim_at(light, requested.image, replace(options, exposure=requested.exposure), context.folder)
     valid = requested.mask
     del requested  # the picture is large, and of no more use
     began_s = time.perf_counter()
@@ -162,10 +164,11 @@ class _ExposedPicture:
     ``possible``: how ``needed`` lies in what they can make
     """
 
-    def __init__(self, light: StageLight, picture: FloatImage, share: float, folder: Path | None) -> None:
+    def __init__(self, light: StageLight, picture: FloatImage, options: SolveOptions, folder: Path | None) -> None:
         exposed = expose_target(
-            light.transport, picture, light.black, share=share, drive=light.drive, indirect=light.indirect
-        )
+            light.transport, picture, light.black,
+            share=options.share, drive=light.drive, indirect=light.indirect, asked=options.exposure,
+        )  # fmt: skip
         self._light, self._folder = light, folder
         self.asked = self.wanted = moved_to_file(exposed.wanted, folder)
         self.exposure, self.needed, self.possible = exposed.exposure, exposed.needed, exposed.possible
@@ -197,7 +200,7 @@ def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder
     dark, too, where more indirect light falls than is wanted. ``folder``: as of ``SolveContext``. Raises what
     ``choose_exposure`` raises.
     """
-    exposed = _ExposedPicture(light, picture, options.share, folder)
+    exposed = _ExposedPicture(light, picture, options, folder)
     asked_possible = exposed.possible
     figures: dict[str, float | int | str | None] = {
         "exposure": exposed.exposure,

@@ -76,7 +76,7 @@ SOURCES: Final = {
     "photograph": _("a photograph wrapped around the object"), "pattern": _("another pattern"),
     "checkerboard": _("a checkerboard"), "gloss": _("a gloss"), "recolour": _("recoloured"),
     "picture": _("a picture as seen from the camera"), "blender": _("rendered by Blender"),
-    "texture": _("a picture painted on the object"),
+    "texture": _("a picture painted on the object"), "restoration": _("restored"),
 }  # fmt: skip
 """By the kind in stage.toml."""
 SCENES: Final = {

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, Float64, FloatImage, Mask, load_arrays, save_arrays
-from controller.core.errors import WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.core.storage import sha256_of
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import json_path, npz_path, read_json, stem, write_json
@@ -82,6 +83,34 @@ def read_target(run: Path, name: str) -> Target:
 
     arrays = load_arrays(npz_path(run, StepKind.TARGET, name))
     return Target(np.asarray(arrays["image"], np.float32), np.asarray(arrays["mask"], np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """``registration-NAME.json`` and ``.npz``: how a restoration's picture lies on the object.
+
+    ``about``: what it depends on; ``figures``: turned_degrees, residual_px and residual_px_p95 (camera pixels, None
+    where nothing can be measured), by_points, matched_share of the picture's place, and those of ``LessLight``
+    ``residual_px`` (rows, columns) float16: NaN where it can't be measured
+    """
+
+    about: Mapping[str, str]
+    figures: Mapping[str, Any]
+    residual_px: npt.NDArray[np.float16]
+
+    def write(self, run: Path, name: str) -> Sequence[Path]:
+        arrays, figures = (path(run, "registration", name) for path in (npz_path, json_path))
+        save_arrays(arrays, {"residual_px": self.residual_px})
+        return [arrays, write_json(figures, {"about": dict(self.about), **self.figures})]
+
+    @classmethod
+    def read(cls, run: Path, name: str) -> Registered | None:
+        """None without one, or with a damaged one."""
+        try:
+            figures = read_json(json_path(run, "registration", name))
+            return cls(figures.pop("about"), figures, load_arrays(npz_path(run, "registration", name))["residual_px"])
+        except (OSError, ValueError, KeyError, AttributeError, UsageError):
+            return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ Direct and indirect light count together (``expose_target``).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from controller.core.channels import finite, largest, smallest
 from controller.core.errors import UsageError, WorkError
 from controller.optics.solve.bounded.solver import check_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 
@@ -162,18 +164,58 @@ def expose_target(
     share: float,
     drive: DriveLevels | None = None,
     indirect: IndirectLight | None = None,
+    asked: float | None = None,
 ) -> ExposedTarget:
     """Expose ``picture`` (rows, columns, 3), reflectance-like, so that ``share`` of the object can be that bright.
+
+    ``asked``: the exposure, instead of that by ``share``.
 
     With ``indirect`` light a pixel is too dark, too, where more of it falls than is wanted. Raises what
     ``choose_exposure`` raises.
     """
     drive = DriveLevels(transport) if drive is None else drive
-    found, following = exposures(transport, picture, black, share, drive=drive, indirect=indirect)
+    found = following = asked or 0.0
+    if asked is None:
+        found, following = exposures(transport, picture, black, share, drive=drive, indirect=indirect)
     wanted = np.float32(found) * picture
     needed = direct_part(transport, wanted, black, indirect)
     possible = feasibility(transport, needed, black, drive=drive)
     return ExposedTarget(found, wanted, needed, possible, following / found)
+
+
+@dataclass(frozen=True, slots=True)
+class LessLight:
+    """How much of a picture, as shares of its pixels, is in reach: ``share`` at the light that is wanted, and
+    ``then_share`` at ``light`` of it, the most at which hardly any is too bright; 1 where none is.
+    """
+
+    share: float
+    light: float
+    then_share: float
+
+
+HARDLY_ANY: Final = 0.99
+
+
+def with_less_light(
+    transport: LightTransport, target: Target, black: FloatImage, *,
+    share: float, drive: DriveLevels, indirect: IndirectLight | None = None,
+) -> LessLight:  # fmt: skip
+    """Whether more of a target is in reach with less light than its exposure, or that by ``share`` where it has none.
+
+    Raises what ``choose_exposure`` raises.
+    """
+    exposed = partial(exposures, transport, target.image, black, drive=drive, indirect=indirect)
+    asked = drive.mask & target.mask
+    wanted = exposed(share)[0] if target.exposure is None else target.exposure
+    # the share is one of all of the object's pixels
+    most = exposed(float(1 - (1 - HARDLY_ANY) * asked.sum() / max(1, drive.mask.sum())))[0]
+    shares = []
+    for level in (wanted, min(most, wanted)):
+        direct = direct_part(transport, np.float32(level) * target.image, black, indirect)
+        reachable = feasibility(transport, direct, black, drive=drive).reachable
+        shares.append(float(reachable[asked].mean()) if asked.any() else 0.0)
+    return LessLight(shares[0], min(most / wanted, 1.0), shares[1])
 
 
 def direct_part(

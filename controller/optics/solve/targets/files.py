@@ -64,14 +64,32 @@ def read_picture(path: Path, colour: ColourSpace | None = None, *, soft: bool = 
 
     Raises UsageError("target-unreadable").
     """
+    return read_large_picture(path, colour, soft=soft)[0]
+
+
+def read_large_picture(
+    path: Path, colour: ColourSpace | None = None, least_px: tuple[int, int] | None = None, *, soft: bool = False
+) -> tuple[FloatImage, int]:
+    """As ``read_picture``, and by how many times it was made smaller: a whole number, as long as it covers ``least_px``
+    (width, height); 1 without that. Each pixel is the mean light of those that it stands for; an EXR stays as it is.
+    """
+    by = 1
     try:
-        light, alpha = _read_exr(path, colour) if path.suffix.lower() == ".exr" else _read_encoded(path, colour)
+        if path.suffix.lower() == ".exr":
+            light, alpha = _read_exr(path, colour)
+        else:
+            if colour is not None and SPACES[colour].curve == "none":
+                raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
+            picture = read_picture_file(path)
+            height, width = picture.values.shape[:2]
+            by = max(1, min(width // least_px[0], height // least_px[1])) if least_px else 1
+            light, alpha = picture.averaged(SPACES[colour] if colour else None, by), picture.opacity(by)
     except Unsuitable as error:
         raise unreadable(path, error) from error
     if alpha is None:
-        return light
+        return light, by
     opaque = alpha if soft else alpha > 0.5
-    return np.dstack([np.where(opaque[..., None] > 0, light, 0), opaque]).astype(np.float32)
+    return np.dstack([np.where(opaque[..., None] > 0, light, 0), opaque]).astype(np.float32), by
 
 
 def unreadable(path: Path, why: Unsuitable) -> UsageError:
@@ -94,13 +112,6 @@ def _read_exr(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, Float
         return mixed(light, SPACES[colour or "srgb"]), alpha
     red, green, blue, white = ((said[n], said[n + 1]) for n in (0, 2, 4, 6))
     return mixed(light, Primaries(red, green, blue, white)), alpha
-
-
-def _read_encoded(path: Path, colour: ColourSpace | None) -> tuple[FloatImage, FloatImage | None]:
-    if colour is not None and SPACES[colour].curve == "none":
-        raise Unsuitable(f"{colour} is linear light, which only an EXR file can hold")
-    picture = read_picture_file(path)
-    return picture.linear(SPACES[colour] if colour else None), picture.opacity()
 
 
 def shipped_photograph(name: Literal["astronaut"] = "astronaut") -> FloatImage:

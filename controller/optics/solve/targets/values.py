@@ -19,11 +19,13 @@ class Target:
     ``image`` (rows, columns, 3) float32, linear, finite, >= 0: 1 is a white object in uniform light; 0 outside ``mask``
     ``mask`` (rows, columns) bool: valid pixels of the target
     ``softened``: what made it softer than it was asked for, in words; empty where nothing did
+    ``exposure``: radiance of its white, where that is asked for; None: as bright as the stage can make it
     """
 
     image: FloatImage
     mask: Mask
     softened: str = ""
+    exposure: float | None = None
 
 
 CAMERA_FILTER_PX = 0.7

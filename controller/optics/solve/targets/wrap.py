@@ -136,13 +136,9 @@ def wrap_photograph(photo_linear: FloatImage, geometry: Geometry, mask: Mask, lo
     low, high = (np.percentile([space.across_m[space.mask], space.up_m[space.mask]], q, axis=1) for q in (0.5, 99.5))
     height, width = photo_linear.shape[:2]
     metres = float(max((high[0] - low[0]) / width, (high[1] - low[1]) / height, 1e-9))
-    # photograph pixels smaller than the 4x4 positions would alias: average them first
-    finest = _SUBPIXELS * metres / max(_pixel_m(space), 1e-12)
-    if finest < 1.0:
-        small = (max(2, round(width * finest)), max(2, round(height * finest)))
-        photo_linear = cv2.resize(photo_linear, small, interpolation=cv2.INTER_AREA).astype(np.float32)
-        metres *= width / small[0]
-        height, width = photo_linear.shape[:2]
+    photo_linear = for_painting(photo_linear, max(_pixel_m(space), 1e-12) / metres)
+    metres *= width / photo_linear.shape[1]
+    height, width = photo_linear.shape[:2]
     middle = (low + high) / 2
 
     def pattern(across: FloatImage, above: FloatImage) -> FloatImage:
@@ -151,6 +147,17 @@ def wrap_photograph(photo_linear: FloatImage, geometry: Geometry, mask: Mask, lo
         return np.float32(ink) + np.float32(paper - ink) * sampled(photo_linear, x, y)
 
     return painted(space, pattern, gain=facing(geometry, mask, look.shading) if look.shading else None)
+
+
+def for_painting(photo: FloatImage, pixels: float) -> FloatImage:
+    """``photo``, smaller where it has so many ``pixels`` to one of the camera's that those between its 4x4 positions
+    would be left out.
+    """
+    by = _SUBPIXELS / pixels
+    if by >= 1:
+        return photo
+    small = (max(2, round(photo.shape[1] * by)), max(2, round(photo.shape[0] * by)))
+    return np.asarray(cv2.resize(photo, small, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def facing(geometry: Geometry, mask: Mask, shading: float) -> FloatImage:

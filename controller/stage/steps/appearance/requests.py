@@ -28,6 +28,7 @@ from controller.optics.solve.targets.patterns import (
     replace_pattern,
 )
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
+from controller.optics.solve.targets.restoration import RestorationLook, restored
 from controller.optics.solve.targets.sheets import as_it_is, camera_places, texture
 from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
@@ -38,6 +39,7 @@ from controller.stage.artefacts.mesh import RegisteredMesh, filled_digest
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
+from controller.stage.steps.appearance.restoring import restoration_request
 from controller.stage.steps.appearance.solving import AppearanceRequest
 from controller.stage.steps.mesh import carried_mesh
 
@@ -48,13 +50,14 @@ TITLES: Mapping[str, str] = {
     "gloss": "A gloss",
     "recolour": "Recoloured",
     "picture": "A picture as seen from the camera",
+    "restoration": "Restored",
     "blender": "Rendered by Blender",
     "texture": "A picture painted on the object",
 }
 """Title of every kind of appearance."""
 
-NEEDS_FILE = ("photograph", "picture", "texture")
-NEEDS_NO_SHAPE: Final = ("recolour", "picture", "texture")
+NEEDS_FILE = ("photograph", "picture", "restoration", "texture")
+NEEDS_NO_SHAPE: Final = ("recolour", "picture", "restoration", "texture")
 """Kinds that are made in the camera's picture alone; a texture may be."""
 
 
@@ -97,6 +100,9 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
     if file is not None:
         inputs["file"] = sha256_of(file)
+    if table.kind == "restoration":
+        assert file is not None
+        return restoration_request(table.name, file, options, calibrated, stage.tables.solve, inputs)
     title = TITLES[table.kind]
     if table.kind == "texture":
         assert file is not None
@@ -117,6 +123,7 @@ _MAKERS: Mapping[str, tuple[Callable[..., Target], type[Any]]] = {
     "checkerboard": (checkerboard, CheckerboardLook),
     "gloss": (gloss, GlossLook),
     "photograph": (wrap_photograph, PrintLook),
+    "restoration": (restored, RestorationLook),
 }
 """What makes the target of a kind, and its settings."""
 
@@ -152,6 +159,8 @@ def _check_picture(
             what=f"The picture {file} of appearance {table.name} does not exist.",
             remedy="Add the file, or correct `file` in stage.toml.",
         )
+    if table.kind == "restoration" and camera_px is not None:
+        return  # a large one is read once, when it is registered
     picture = read_picture(file, colour)
     size = camera_px if table.kind == "picture" else None
     check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)

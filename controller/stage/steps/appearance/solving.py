@@ -48,7 +48,7 @@ class AppearanceRequest:
     """An appearance to solve: ``target`` gives its picture, like reflectance, and a mask of its valid pixels.
 
     ``inputs`` are the hashes of the target's sources; ``prepare``, if given, is a step before
-    the solving, for slow targets, and ``prepare_s`` its cost.
+    the solving, for slow targets; ``preparing`` is what it does, and ``prepare_s`` its cost.
     """
 
     name: str
@@ -57,6 +57,7 @@ class AppearanceRequest:
     inputs: dict[str, str]
     prepare: Callable[[Context], Sequence[Path]] | None = None
     prepare_s: float = 0.0
+    preparing: str = "Rendering"
 
 
 def base_choice(name: str) -> BaseChoice:
@@ -104,7 +105,7 @@ def solve_steps(
                     request.prepare,
                     inputs=request.inputs,
                     after=tuple(after),
-                    title=f"Rendering {request.title}",
+                    title=f"{request.preparing} {request.title}",
                     weight=request.prepare_s * scale,
                 )
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +15,10 @@ from scipy import ndimage
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
 from controller.optics.calibrate.mesh_alignment import Pose
-from controller.optics.solve.targets.files import read_picture
+from controller.optics.solve.targets.files import read_large_picture, read_picture
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.mesh import RegisteredMesh
+from controller.stage.artefacts.solved import Registered
 from controller.stage.services.export import export
 from controller.stage.steps.appearance.requests import requests_of
 from tests.controller.config.test_stage_file import STAGE, load
@@ -143,3 +145,57 @@ def test_an_exported_sheet_that_nobody_painted_on_leaves_the_object_as_it_is(
     with pytest.raises(UsageError) as refused:
         export(run=calibrated.folder, kind="uv", out=tmp_path / "t.png", step=None)
     assert refused.value.code == "sheet-exists", "somebody may have painted on it"
+
+
+RESTORATION = PICTURE.replace("KIND", "restoration")
+CORNERS = "points = [[2, 2, 5.0, 5.0], [77, 2, 70.0, 5.0], [77, 57, 70.0, 50.0], [2, 57, 5.0, 50.0]]\n"
+
+
+def test_a_restoration_is_laid_by_points_at_the_light_that_is_asked_for(tmp_path: Path, calibrated: Calibrated) -> None:
+    light = "brightness = 0.25\n"
+    wish = requests_of(load(tmp_path, STAGE + RESTORATION + CORNERS + light), calibrated)[0]
+    target = wish.target()
+    assert target.image.shape == (*CAMERA, 3)
+    assert target.mask[10:45, 10:65].all()
+    assert not target.mask[:3].any()
+    assert target.exposure is not None
+    white = calibrated.transport.reach().mean(axis=2) / calibrated.reflectance.mean(axis=2)
+    assert target.exposure == pytest.approx(0.25 * float(np.median(white)), rel=1e-3)
+    assert wish.prepare is not None
+    said: list[str] = []
+    context = SimpleNamespace(folder=calibrated.folder, reporter=SimpleNamespace(say=said.append))
+    wish.prepare(context)  # type: ignore[arg-type]
+    (text,) = said
+    assert "by its points alone" in text
+    assert "At the light that is asked for" in text
+    kept = Registered.read(calibrated.folder, "x")
+    assert kept is not None
+    assert kept.figures["share"] <= kept.figures["then_share"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("written", "code"),
+    [
+        ("", "restoration-not-matched"),
+        ("points = [[2, 2, 5.0, 5.0]]\n", "restoration-points"),
+        ("points = [[2, 2, 5.0]]\n", "stage-key-type"),
+        ('outside = "blue"\n', "stage-key-type"),
+        ("lux = 50.0\n", "restoration-light"),
+    ],
+)
+def test_a_restoration_that_cannot_be_is_refused_before_anything_is_solved(
+    tmp_path: Path, calibrated: Calibrated, written: str, code: str
+) -> None:
+    with pytest.raises(UsageError) as refused:
+        requests_of(load(tmp_path, STAGE + RESTORATION + written), calibrated)
+    assert refused.value.code == code
+
+
+def test_the_light_of_a_large_picture_is_averaged_not_its_numbers(tmp_path: Path) -> None:
+    fine = np.zeros((400, 600, 3), np.uint8)
+    fine[::2, ::2] = fine[1::2, 1::2] = 255
+    Image.fromarray(fine).save(tmp_path / "t.png")
+    light, by = read_large_picture(tmp_path / "t.png", None, (60, 40))
+    assert by == 10
+    assert light.shape == (40, 60, 3)
+    np.testing.assert_allclose(light, 0.5, atol=1e-4)
