@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.play import presenting
+from controller.bundle.reader import Bundle
+from controller.bundle.signing import ANY_SIGNER
+from controller.play import cache, presenting
 from controller.play import presenting as pacing
 from controller.play.frames import FrameSet, OutputSize
 from controller.play.presenting import PendingPresentation, Presenter
 from tests.controller.play.conftest import OUTPUTS, write_noise
-from tests.controller.play.wire import Wire
+from tests.controller.play.wire import Wire, noise
+from tests.waiting import eventually
 
 SIZES = (OutputSize("P1", 2, 2),)
 RATE_HZ = 30.0
@@ -121,6 +125,51 @@ def test_a_picture_that_is_late_is_counted_once_and_the_next_are_on_the_grid_aga
     assert 3 < steps.max() < 5
     np.testing.assert_allclose(steps[12:], 1, atol=1e-6)
     np.testing.assert_allclose(ticks[12:], np.round(ticks[12:]), atol=1e-6)
+
+
+@pytest.mark.parametrize(("awaited", "paced", "late"), [(False, True, 1), (True, True, 0), (False, False, 0)])
+def test_late_counts_the_pictures_of_a_sequence_that_nobody_asks_for(
+    clocks: Clocks, *, awaited: bool, paced: bool, late: int
+) -> None:
+    presenter = Presenter(Slow(clocks, takes_s=[0.12]), SIZES, RATE_HZ)
+    black = FrameSet.black(SIZES)
+    results: list[object] = []
+    presenter.begin_sequence(RATE_HZ)
+    asked = results.append if awaited else None
+    coming = PendingPresentation("appearance", "a", black, presenter.soon(), asked, paced=paced)
+    assert presenter.present(coming, black, wait=True)
+    assert presenter.late == late
+
+
+@pytest.mark.parametrize("moment_s", [0.0, 1 / 3, 1000.0, 1000.001, 12345.6789, 12345.7])
+@pytest.mark.parametrize("rate_hz", [1.0, 24.0, RATE_HZ, 59.94])
+def test_a_tick_is_the_first_that_is_not_before_the_moment(moment_s: float, rate_hz: float) -> None:
+    grid = presenting.Grid(rate_hz)
+    tick = grid.after(moment_s)
+    assert grid.at_s(tick - 1) < moment_s - 1e-9 or tick == 0
+    assert grid.at_s(tick) >= moment_s - 1e-9
+    assert (grid.ticks(0), grid.ticks(2.4 / rate_hz), grid.ticks(2.6 / rate_hz)) == (1, 2, 3)
+
+
+def test_a_set_that_is_held_keeps_its_pixels_while_all_others_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "CACHE_BYTES", 0)
+    sizes = [OutputSize(*one) for one in OUTPUTS]
+    decoded = cache.DecodedAhead(Bundle.open_trusted(write_noise(tmp_path / "b.vel"), ANY_SIGNER), sizes, lambda: None)
+    held: list[FrameSet] = []
+    for name in "0123450123451":
+        decoded.want([name])
+        assert eventually(partial(decoded.take, name), every_s=0.001)
+        frames = decoded.take(name)
+        assert frames is not None
+        if len(held) < 2:  # as while one fades in over the other
+            held.append(frames)
+            decoded.hold(*held)
+        for seed, kept in enumerate(held):
+            expected = noise(OUTPUTS, seed).values()
+            assert all(np.array_equal(a, b) for a, b in zip(kept.pixels, expected, strict=True))
+    decoded.close()
 
 
 def test_a_fade_takes_its_time_however_slow_its_steps_are(clocks: Clocks) -> None:

@@ -198,7 +198,6 @@ def held_to(
     indirect = float(np.median(share[lit])) if lit.any() else 0.0
     of_tiles = TILES_SIGMA**2 + (TILES_SIGMA_OF_SHARE * indirect) ** 2
     change = of_tiles / (of_tiles + SIGMA**2 + sigma**2) * added
-    change[:, [0, -1]] = 0
     curves = [
         rising(curve + _between(at_levels, np.arccos(np.clip(1 - 2 * encoded, -1, 1))))
         for curve, at_levels, encoded in zip(radiometry.response, change, shown_with, strict=True)

@@ -5,6 +5,7 @@ import pytest
 
 from controller.core.errors import TroubleCode
 from controller.optics.capture.linearity import (
+    RawExposure,
     black_offset,
     camera_faults,
     check_series,
@@ -32,6 +33,18 @@ def test_the_ceiling_is_found_where_the_sensor_has_it_and_not_where_the_file_say
     series = [model.expose(LIGHT, t, n) for n, t in enumerate((0.01, 0.04, 0.16))]
     found = check_series(series, model.levels)
     assert np.all((found.clip > 3450) & (found.clip <= 3600))
+
+
+@pytest.mark.parametrize("well", [3850, 3700])
+def test_wells_that_differ_from_pixel_to_pixel_are_no_nonlinearity_below_them(well: int) -> None:
+    model, series = SensorModel(), []
+    for n, exposure_s in enumerate((0.01, 0.04, 0.16)):
+        seen = model.expose(LIGHT, exposure_s, n)
+        full = np.random.default_rng(9 + n).normal(well, 40, seen.samples.shape).astype(np.uint16)
+        series.append(RawExposure(np.minimum(seen.samples, full), exposure_s))
+    found = check_series(series, model.levels)
+    assert np.all((found.clip > well - 130) & (found.clip < well))
+    assert found.worst < 0.01
 
 
 def test_a_sensor_that_bends_before_it_clips_is_trusted_only_below() -> None:

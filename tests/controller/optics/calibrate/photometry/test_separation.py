@@ -122,6 +122,11 @@ def test_figures_are_of_pixels_that_the_projector_lights() -> None:
     np.testing.assert_allclose(indirect_figures(share, white), 0.1, rtol=1e-5)
 
 
+def test_figures_are_the_median_and_what_95_percent_of_the_pixels_do_not_exceed() -> None:
+    share = np.repeat(np.linspace(0, 0.5, 1001, dtype=np.float32)[None, :, None], 3, axis=2)
+    np.testing.assert_allclose(indirect_figures(share, np.ones_like(share)), (0.25, 0.475), atol=1e-4)
+
+
 def test_what_was_not_measured_is_like_its_surroundings() -> None:
     room = Room(most=0.3)
     white = room.white.copy()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from controller.config.defaults import SMOOTHNESS
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration, Metapixels
-from controller.optics.solve.bounded.engine import SolveContext
+from controller.optics.solve.bounded.engine import SolveContext, kkt_residual
 from controller.optics.solve.bounded.equations import (
     EDGE_WEIGHT_STEPS,
     Solution,
@@ -219,6 +219,24 @@ def test_a_warm_start_needs_fewer_iterations_for_the_same_answer(stage: Stage) -
     assert warm.objective == pytest.approx(again.objective, rel=1e-3)
 
 
+def test_momentum_reaches_the_tolerance_several_times_sooner_than_sweeps_alone(stage: Stage) -> None:
+    calibration = stage(3)
+    transport = build_transport(calibration)
+    target = 0.75 * random_target(transport, 3)
+    found = solve_bounded(transport, target, calibration.black, SolveSettings(smoothness=1e-4, tolerance=1e-4))
+    assert found.iterations < 80, "without momentum more than 300"
+
+
+def test_light_does_not_drift_from_the_frames_in_many_sweeps(stage: Stage) -> None:
+    calibration = stage(3)
+    transport = build_transport(calibration)
+    target = 0.75 * random_target(transport, 3)
+    settings = SolveSettings(smoothness=1e-4, tolerance=1e-12, most_iterations=600)
+    found = solve_bounded(transport, target, calibration.black, settings)
+    problem = build_problem(transport, target, calibration.black, 1e-4, None)
+    assert kkt_residual(problem, frame_planes(found.frames)) < 4e-6
+
+
 def test_the_same_problem_gives_the_same_bytes(stage: Stage) -> None:
     (_, first), (_, second) = solved(stage()), solved(stage())
     np.testing.assert_array_equal(frame_planes(first.frames), frame_planes(second.frames))
@@ -270,6 +288,23 @@ def test_the_weights_of_the_smoothness_equations_are_those_of_the_paper(stage: S
         np.testing.assert_allclose(below[:-1] / EDGE_WEIGHT_STEPS, edges.down**2, rtol=1e-4, atol=HALF_A_STEP + 1e-6)
         assert not right[:, -1].any()
         assert not below[-1].any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_pixel_in_shadow_ties_neither_the_pixel_before_it_nor_the_one_after(stage: Stage, axis: int) -> None:
+    calibration = stage()
+    size = build_transport(calibration).sizes[0]
+    places = np.indices(size)[axis]
+    dark = places == size[axis] // 2
+    part = calibration.projectors[0]
+    valid = part.metapixels.valid & ~dark
+    lit = dataclasses.replace(part, metapixels=dataclasses.replace(part.metapixels, valid=valid))
+    transport = build_transport(dataclasses.replace(calibration, projectors=(lit, *calibration.projectors[1:])))
+    edges = squared_edge_weights(transport, image_planes(random_target(transport, 1)))[1 - axis]
+    (own,) = plane_frames(edges[:, transport.span(0)].astype(np.float32), [size])
+    assert not own[dark].any(), "from the dark pixel to the next"
+    assert not own[places == size[axis] // 2 - 1].any(), "from the one before it"
+    assert own[places == size[axis] // 2 - 2].any()
 
 
 def test_the_reference_lets_go_where_the_target_has_an_edge_or_a_shadow() -> None:
