@@ -22,9 +22,9 @@ from hal.errors import DeviceError
 from lab.compare.api import ComparisonTarget
 from lab.compare.entries import Entry
 from lab.compare.metered_stage import MeteredStage, Shower, checked_frames
-from lab.study.experiments.adaptation import flip_of
 from lab.study.experiments.residual import brightest_first
 from lab.study.output.drawing import screen
+from lab.study.subject.likeness import flip_of
 from lab.study.subject.measuring import pixel_sets
 from lab.study.subject.subject import ReachableTarget, Subject
 from lab.study.subject.trial import photograph_target

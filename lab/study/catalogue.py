@@ -7,7 +7,6 @@ from typing import Final
 
 from controller.core.errors import UsageError
 from lab.study.experiments.ablation import ABLATION
-from lab.study.experiments.adaptation import ADAPTATION
 from lab.study.experiments.appearances.experiment import APPEARANCES
 from lab.study.experiments.drift import DRIFTING
 from lab.study.experiments.earlier import EARLIER
@@ -38,7 +37,6 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     EFFORT,
     DRIFTING,
     ROBUSTNESS,
-    ADAPTATION,
     LIVE,
 )
 

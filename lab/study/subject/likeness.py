@@ -1,4 +1,4 @@
-"""Figures of the paper that no stage reports: structural similarity, and colours as CIE L*a*b*."""
+"""Figures that no stage reports: structural similarity, FLIP, and colours as CIE L*a*b*."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
+from controller.stage.report.pictures import Crop
 
 SSIM_SIGMA_PX: Final = 1.5
 SSIM_RADIUS_PX: Final = 5
@@ -38,3 +39,14 @@ def structural_similarity(one: FloatImage, other: FloatImage) -> FloatImage:
     covariance = local_mean(one * other) - mean_one * mean_other
     likeness = (2 * mean_one * mean_other + c1) * (2 * covariance + c2)
     return np.asarray(likeness / ((mean_one**2 + mean_other**2 + c1) * (variances + c2)), np.float32)
+
+
+def flip_of(reference: ByteImage, picture: ByteImage, mask: Mask, crop: Crop) -> float | None:
+    """Mean of FLIP (Andersson et al. 2020) over a mask, of 8-bit pictures (rows, columns, 3); None if not installed."""
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None
+    pictures = [np.ascontiguousarray(one / np.float32(255), np.float32) for one in (reference, picture)]
+    found = np.asarray(flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)[0])
+    return float(found.reshape(*found.shape[:2], -1).mean(axis=2)[mask[crop.rows, crop.columns]].mean())

@@ -16,10 +16,8 @@ from controller.core.errors import CalibrationError, UsageError, WorkError
 from controller.optics.calibrate.verify.drift import Drift, DriftCause, ProjectorDrift
 from controller.optics.calibrate.verify.registration import Motion
 from controller.optics.solve.result.metrics import PixelSet
-from controller.optics.transport import build_transport
 from controller.stage.steps.modes import DotOptions
 from hal.errors import DeviceError
-from lab.study.experiments.adaptation import ADAPTED, CUT, adaptation
 from lab.study.experiments.drift import LEVELS_PX, BumpResult, _criteria, drifting
 from lab.study.experiments.effort import effort
 from lab.study.experiments.robustness import DISTURBANCES, DisturbanceResult, doubles_at, quantised, robustness
@@ -27,7 +25,7 @@ from lab.study.subject.measuring import Quality
 from lab.study.subject.subject import BenchChange, Dots, ReachableTarget, Recalibration, SessionParts, Subject
 from lab.study.subject.trial import Trial
 from lab.study.values import column
-from tests.lab.study.array_stage import CAMERA, ArrayLight, array_subject
+from tests.lab.study.array_stage import ArrayLight, array_subject
 
 
 def motion(rms_px: float) -> Motion:
@@ -233,30 +231,3 @@ def test_quantised_frames_have_as_many_values_as_their_bits_allow(bits: float) -
     (coarse,) = quantised([frame], bits)
     assert 2**bits - 1 <= len(np.unique(coarse)) <= 2**bits  # the lowest step of eight bits is narrower than a sample
     assert np.abs(coarse - frame).max() < 2.2 * 0.5 / (2**bits - 1) + 1e-6
-
-
-def painted_subject() -> Subject:
-    """The shell with soft spots of blue and yellow, wide enough for its projectors' pixels to follow."""
-    subject = array_subject()
-    y, x = np.mgrid[0 : CAMERA[0], 0 : CAMERA[1]]
-    blue = (0.5 + 0.5 * np.sin(2 * np.pi * x / 16) * np.sin(2 * np.pi * y / 16))[..., None]
-    paint = (blue * np.array([0.5, 0.6, 0.9]) + (1 - blue) * np.array([0.9, 0.85, 0.5])).astype(np.float32)
-    parts = tuple(dataclasses.replace(part, white=part.white * paint) for part in subject.calibration.projectors)
-    calibration = dataclasses.replace(subject.calibration, projectors=parts)
-    transport = build_transport(calibration)
-    light = ArrayLight(calibration, transport, np.random.default_rng(0))
-    return Subject(calibration, subject.geometry, transport, light)
-
-
-def test_adaptation_hides_the_objects_pattern_where_light_lacks() -> None:
-    result = adaptation(painted_subject())
-    (table,) = result.tables
-    names = ("asked to be in reach", "way", "ghosting, correlation", "mean L*")
-    rows = {(share, way): (ghost, light) for share, way, ghost, light in zip(*(column(table, n) for n in names),
-                                                                              strict=True)}  # fmt: skip
-    (before, lit), (after, dimmer) = rows[0.5, CUT], rows[0.5, ADAPTED]
-    assert float(str(after)) < 0.5 * float(str(before))
-    assert float(str(dimmer)) > 0.9 * float(str(lit))
-    assert len(result.criteria) == 8
-    left_out = column(table, "left out of in reach")
-    assert [float(str(value)) for value in left_out[::2]] == sorted(float(str(value)) for value in left_out[::2])
