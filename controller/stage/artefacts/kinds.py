@@ -22,6 +22,7 @@ class StepKind(enum.StrEnum):
     CODES = "codes"
     PIXELS = "pixels"
     INDIRECT = "indirect"
+    SHAPE = "shape"
     GEOMETRY = "geometry"
     DOTS = "dots"
     METAPIXELS = "metapixels"

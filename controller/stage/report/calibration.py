@@ -40,7 +40,7 @@ from controller.stage.report import plots
 from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.stage.report.pictures import Crop, crop_around, fitted, to_screen
-from controller.stage.report.words import When, moment, spent
+from controller.stage.report.words import SUPERPOSITION, When, moment, spent
 
 COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
@@ -83,7 +83,8 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     page = Page(
         title=f"{asked.stage}: calibration of {when(run.name)}",
         summary=f"{figures['photographs']} photographs, {figures['seconds']:.0f} s of work. "
-        f"By projector: {photographs_sentence(run, asked.projectors)}.{_apart(figures['colours_px'])}",
+        f"By projector: {photographs_sentence(run, asked.projectors)}.{_apart(figures['colours_px'])}"
+        + (f" {SUPERPOSITION}" if len(asked.projectors) == 1 else ""),
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
         tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),

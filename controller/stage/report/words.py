@@ -17,7 +17,7 @@ TIMES: Final[Mapping[str, tuple[str, ...]]] = {
     "Photographs of the patterns": (Kind.CODES, Kind.DOTS, Kind.STUDY_DOTS, Kind.EDGE_DOTS),
     "Where each projector pixel lands": (Kind.PIXELS, Kind.METAPIXELS, Kind.EDGES, Kind.EDGE_TERMS),
     "Direct and indirect light": (Kind.INDIRECT,),
-    "Geometry": (Kind.GEOMETRY,),
+    "Geometry": (Kind.SHAPE, Kind.GEOMETRY),
     "Check with a random pattern": (Kind.VERIFICATION_PHOTOGRAPHS, Kind.VERIFY),
     "Drift check": (Kind.DRIFT_PHOTOGRAPHS, Kind.DRIFT, Kind.PLAN),
     "Base image": (Kind.BASE,),
@@ -28,6 +28,11 @@ TIMES: Final[Mapping[str, tuple[str, ...]]] = {
     "Comparison with the targets": (Kind.COMPARE, Kind.PICTURES, Kind.CAUSES),
 }
 """By what the time of a step was spent on."""
+SUPERPOSITION: Final = (
+    "With one projector nothing is superimposed. A second one beside it adds its light, fills shadows, gives finer "
+    "detail between the pixels of the first, and shows the shape of an object that is not flat."
+)
+"""What more projectors would add."""
 OTHER: Final = "Lamps and all else"
 LEAST_S: Final = 0.05
 

@@ -21,6 +21,7 @@ from controller.optics.plan.target_object import AudienceView, TargetObject, rea
 from controller.optics.plan.values import Placement, PlanGoal, Surface
 from controller.run.progress import Reporter, Tracker
 from controller.stage.report.page import Goal, Page, ReportPicture, render
+from controller.stage.report.words import SUPERPOSITION
 
 HTML, MACHINE = "plan.html", "plan.json"
 SEED: Final = 1
@@ -97,7 +98,8 @@ def _page(
     return Page(
         title=f"Plan for {Path(tables.object.mesh).stem}",
         summary=f"{len(placements)} projectors in {places} places; {best.tried} sets compared. "
-        "Predicted from data sheets: vignetting, lamp age and paint are not included.",
+        "Predicted from data sheets: vignetting, lamp age and paint are not included."
+        + (f" {SUPERPOSITION}" if len(placements) == 1 else ""),
         goals=tuple(_goals(figures, goal)),
         rows=(),
         galleries=tuple(galleries),

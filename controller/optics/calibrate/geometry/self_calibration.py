@@ -17,7 +17,13 @@ from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
 from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
-from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction, parameter_names
+from controller.optics.calibrate.geometry.values import (
+    CameraPrior,
+    Reconstruction,
+    camera_lens,
+    parameter_names,
+    projector_lenses,
+)
 from controller.optics.calibrate.values import Correspondence
 
 JUMP_PX = 2.0
@@ -112,7 +118,6 @@ _TRIAL_POINTS = 600
 _FEWEST_POINTS = 200
 _LARGEST_SHAPE_SIGMA = 0.02
 _LARGEST_PRIOR_SIGMAS = 5.0
-_LENS_SIGMA = 0.03  # of a projector's k1 about 0: lenses of 0.06 to either side within two
 _CLEAR_MARGIN = 12.0  # of the halved chi-square between the best stage and any other, on _TRIAL_POINTS
 
 
@@ -218,22 +223,8 @@ def _problem(
                 "needed.",
                 remedy="Check that it is on, and turn it so that its light overlaps the others' on the object.",
             )
-    width, height = camera_size
-    x, y = prior.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
-    sigma = prior.principal_point_sigma_px or 0.005 * width
-    sizes = np.array(projector_sizes, dtype=np.float64)
-    # throw ratios of 0.9 to 3.5 within one sigma; no horizontal shift to speak of; any vertical one
-    zero = np.zeros(len(sizes))
-    shapes = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1], zero], axis=1)
-    widths = np.stack([np.full(len(sizes), 0.7), 0.02 * sizes[:, 0], 0.7 * sizes[:, 1], zero + _LENS_SIGMA], axis=1)
     return ba.AdjustmentProblem(
-        camera_px,
-        projector_px,
-        seen,
-        np.array([np.log(prior.focal_length_px), x, y, prior.distortion_k1, *prior.other_terms]),
-        np.array([prior.focal_length_rel_sigma, sigma, sigma, prior.distortion_sigma]),
-        shapes,
-        widths,
+        camera_px, projector_px, seen, *camera_lens(prior, camera_size), *projector_lenses(projector_sizes)
     )
 
 

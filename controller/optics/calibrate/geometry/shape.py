@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from controller.core.errors import CalibrationError
+from controller.optics.calibrate.geometry.planes import THICK, THIN, reconstruct_planes
 from controller.optics.calibrate.geometry.self_calibration import reconstruct
 from controller.optics.calibrate.geometry.values import CameraPrior, Reconstruction
 from controller.optics.calibrate.values import Correspondence
 
 AskedShape = Literal["auto", "surface", "plane", "unknown"]
 Shape = Literal["surface", "plane", "unknown"]
+
+SURE: Final = 0.01
+"""Share of their distance to which points of a plane are to be known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +49,31 @@ def find_shape(
     """
     if asked == "unknown":
         return FoundShape("unknown", camera_size)
+    seen = correspondences, camera_size, projector_sizes, prior
+    if asked == "plane":
+        return FoundShape("plane", camera_size, reconstruct_planes(*seen))
     try:
-        found = reconstruct(correspondences, camera_size, projector_sizes, prior, progress=progress)
-        return FoundShape("surface", camera_size, found)
+        return FoundShape("surface", camera_size, reconstruct(*seen, progress=progress))
     except CalibrationError as error:
         if asked == "surface":
             raise
-        return FoundShape("unknown", camera_size, why=error)
+        why = error
+    # Two planes fit any gentle curve if they may be thick.
+    for planes, thick in ((1, THICK), (2, THIN)):
+        with contextlib.suppress(CalibrationError):
+            return FoundShape("plane", camera_size, reconstruct_planes(*seen, most=planes, thick=thick), why)
+    return FoundShape("unknown", camera_size, why=why)
+
+
+def shape_sentence(found: FoundShape) -> str:
+    """For a technician: the shape, apart from why it is not a surface."""
+    known = found.reconstruction
+    if known is None:
+        return "No shape of the object is measured. Pictures, recolouring, live and refining work without one."
+    if found.shape == "surface":
+        return "The object's surface is measured."
+    turned = "" if known.shape_rel_sigma < SURE else (
+        f" How far it is turned is not certain (distances to {known.shape_rel_sigma:.1%}): four measured sides of it,"
+        " [[object.distances]] in stage.toml, say it."
+    )  # fmt: skip
+    return f"The object is flat, and has the shape of a plane.{turned}"

@@ -266,7 +266,7 @@ def object_points(stage: AdjustedStage, correspondences: Sequence[Correspondence
     Raises CalibrationError as ``metres_per_unit``, and "geometry-uncertain".
     """
     state = stage.state
-    rays = _ray_map(state.camera, stage.camera_size)
+    rays = ray_map(state.camera, stage.camera_size)
     seen = np.stack([c.valid & channels.finite(c.projector_px) for c in correspondences])
     slopes = projector_rays(np.stack([c.projector_px for c in correspondences]), np.ascontiguousarray(state.intrinsics))
     noise_px = max(stage.noise_px, LEAST_NOISE_PX)
@@ -293,9 +293,9 @@ def object_points(stage: AdjustedStage, correspondences: Sequence[Correspondence
     unit_m, unit_rel_sigma = metres_per_unit(points, prior.distance_m, prior.distance_rel_sigma, prior.distances)
     relative = np.hypot(np.maximum(residual, noise_px) * leverage / smooth, np.float32(stage.shape_rel_sigma))
     geometry = Geometry(
-        camera=_pinhole(state.camera, np.eye(3), np.zeros(3), stage.camera_size),
+        camera=camera_pinhole(state.camera, stage.camera_size),
         projectors=tuple(
-            _pinhole(state.intrinsics[n], state.rotations[n], state.centres[n] * unit_m, size)
+            pinhole(state.intrinsics[n], state.rotations[n], state.centres[n] * unit_m, size)
             for n, size in enumerate(stage.projector_sizes)
         ),
         points_m=(points * unit_m).astype(np.float32),
@@ -316,7 +316,7 @@ def _surface(raw: FloatImage, rays: FloatImage, focal_px: float) -> tuple[FloatI
     return smooth, normals
 
 
-def _ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
+def ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
     """(rows, columns, 2) float32 undistorted x, y at depth 1 of every camera pixel."""
     width, height = size
     rays = np.empty((height, width, 2), np.float32)
@@ -325,7 +325,13 @@ def _ray_map(camera: Float64, size: tuple[int, int]) -> FloatImage:
     return rays
 
 
-def _pinhole(lens: Float64, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:
+def camera_pinhole(lens: Float64, size: tuple[int, int]) -> Pinhole:
+    """The camera, which is the origin; ``lens`` as ``bundle_adjustment`` has it."""
+    return pinhole(lens, np.eye(3), np.zeros(3), size)
+
+
+def pinhole(lens: Float64, rotation: Float64, centre_m: Float64, size: tuple[int, int]) -> Pinhole:
+    """A camera or projector of a ``lens`` as ``bundle_adjustment`` has it."""
     lens = np.append(lens, np.zeros(8 - len(lens)))
     fx, fy = np.exp(lens[0]), np.exp(lens[0] + lens[7])
     matrix = np.array([[fx, 0.0, lens[1]], [0.0, fy, lens[2]], [0.0, 0.0, 1.0]])

@@ -154,6 +154,31 @@ class CameraPrior:
             )
 
 
+def camera_lens(prior: CameraPrior, size_px: tuple[int, int]) -> tuple[Float64, Float64]:
+    """log f, cx, cy, k1 and the other terms of the camera, and how sure the first four are (4,)."""
+    width, height = size_px
+    x, y = prior.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
+    sigma = prior.principal_point_sigma_px or 0.005 * width
+    lens = np.array([math.log(prior.focal_length_px), x, y, prior.distortion_k1, *prior.other_terms])
+    return lens, np.array([prior.focal_length_rel_sigma, sigma, sigma, prior.distortion_sigma])
+
+
+LENS_SIGMA: Final = 0.03
+"""Of a projector's k1 about 0: lenses of 0.06 to either side within two."""
+
+
+def projector_lenses(sizes_px: Sequence[tuple[int, int]]) -> tuple[Float64, Float64]:
+    """log f, cx, cy, k1 (N, 4) of usual projectors with pictures of (width, height), and how far they differ (N, 4).
+
+    Throw ratios of 0.9 to 3.5 within one sigma; no horizontal shift to speak of; any vertical one.
+    """
+    sizes = np.array(sizes_px, dtype=np.float64)
+    zero = np.zeros(len(sizes))
+    usual = np.stack([np.log(1.8 * sizes[:, 0]), (sizes[:, 0] - 1) / 2, 0.5 * sizes[:, 1], zero], axis=1)
+    sigmas = np.stack([zero + 0.7, 0.02 * sizes[:, 0], 0.7 * sizes[:, 1], zero + LENS_SIGMA], axis=1)
+    return usual, sigmas
+
+
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
     """The geometry, and how far to trust it.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +25,7 @@ from controller.optics.calibrate.correspondence.colour_alignment import (
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.geometry.lenses import bent
 from controller.optics.calibrate.geometry.self_calibration import jumps, one_projector
-from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape
+from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels
 from controller.optics.calibrate.photometry.glare import spread_by_lens
@@ -48,7 +49,7 @@ from controller.stage.steps.calibrate.indirect import indirect_step
 from controller.stage.steps.capture.camera import camera_step
 from controller.stage.steps.capture.patterns import capture_steps, code_step, light_step
 from controller.stage.steps.troubles import tell, tell_all
-from hal.notices import Notice
+from hal.notices import Level, Notice
 
 
 def calibration_steps(
@@ -72,9 +73,14 @@ def calibration_steps(
     for projector in rig.projectors:
         steps.append(light_step(rig, projector, options))
         steps.append(_radiometry_step(projector))
-    for projector in rig.projectors:
-        steps.append(code_step(rig, projector, options))
+    for number, projector in enumerate(rig.projectors):
+        code = code_step(rig, projector, options)
+        # What is asked for may be refused, so nothing more is photographed before that is known.
+        waits = number > 1 and shape in ("surface", "plane")
+        steps.append(replace(code, after=(*code.after, StepId(StepKind.SHAPE))) if waits else code)
         steps.append(_pixels_step(projector))
+        if number == 1 and len(rig.projectors) > 2 and shape != "unknown":
+            steps.append(_first_shape_step(rig, prior, shape))
         steps.append(indirect_step(projector))
     steps.append(
         Step(
@@ -87,6 +93,20 @@ def calibration_steps(
         )
     )
     return steps
+
+
+def _first_shape_step(rig: Rig, prior: CameraPrior, shape: AskedShape) -> Step:
+    """Which shape two projectors see, beside the photographs of the others."""
+    two = rig.projectors[:2]
+    return Step(
+        StepId(StepKind.SHAPE),
+        lambda context: _first_shape(two, prior, shape, context),
+        inputs={"prior": repr(prior), "shape": shape},
+        after=of_projectors([projector.name for projector in two], StepKind.PIXELS),
+        title="Finding which shape the object has",
+        weight=costs.geometry_s(costs.scale(projector.size_px for projector in two)),
+        calculates=True,
+    )
 
 
 def _radiometry_step(projector: RigProjector) -> Step:
@@ -200,32 +220,51 @@ def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     return [pixels.write(context.folder, projector.name), figures.write(context.folder, projector.name), said]
 
 
-def _reconstruct(rig: Rig, prior: CameraPrior, shape: AskedShape, context: Context) -> Sequence[Path]:
-    correspondences = [read_correspondence(context.folder, projector.name) for projector in rig.projectors]
+def _first_shape(
+    two: Sequence[RigProjector], prior: CameraPrior, shape: AskedShape, context: Context
+) -> Sequence[Path]:
+    """Raises CalibrationError as ``find_shape`` for what other projectors would see as well."""
+    try:
+        found, _ = _shape(two, prior, shape, context)
+    except CalibrationError as error:
+        if error.code in SEEN_BY_ALL:
+            raise
+        context.reporter.say(f"{error.what} The other projectors may show the shape.", Level.WARNING)
+        return ()
+    context.reporter.say(" and ".join(projector.name for projector in two) + f": {shape_sentence(found)}")
+    return ()
+
+
+SEEN_BY_ALL: Final = frozenset({"scene-flat", "not-flat", "camera-prior-contradicted", "surface-broken-up"})
+"""Why a shape that is asked for is missing, where another projector does not help."""
+
+
+def _shape(
+    projectors: Sequence[RigProjector], prior: CameraPrior, shape: AskedShape, context: Context
+) -> tuple[FoundShape, Sequence[Correspondence]]:
+    correspondences = [read_correspondence(context.folder, projector.name) for projector in projectors]
     rows, columns = correspondences[0].valid.shape
-    found = find_shape(
-        shape,
-        correspondences,
-        (columns, rows),
-        [projector.size_px for projector in rig.projectors],
-        prior,
-        progress=lambda fraction: context.advance(fraction, "geometry"),
-    )
+    sizes = [projector.size_px for projector in projectors]
+    tell = partial(context.advance, note="geometry")
+    return find_shape(shape, correspondences, (columns, rows), sizes, prior, progress=tell), correspondences
+
+
+def _reconstruct(rig: Rig, prior: CameraPrior, shape: AskedShape, context: Context) -> Sequence[Path]:
+    found, correspondences = _shape(rig.projectors, prior, shape, context)
+    context.reporter.say(shape_sentence(found))
     names = [projector.name for projector in rig.projectors]
-    stride = stride_of((rows, columns))
-    troubles = lens_troubles(context, rig.projectors, _depth_m(found, correspondences)[::stride, ::stride])
+    depth_m = _depth_m(found, correspondences)
+    stride = stride_of(depth_m.shape)
+    troubles = lens_troubles(context, rig.projectors, depth_m[::stride, ::stride])
     if found.shape == "surface" and found.reconstruction is not None:
         for name, lens in zip(names, found.reconstruction.geometry.projectors, strict=True):
             if (text := bent(name, lens)) is not None:
                 troubles.append(Notice.warning(TroubleCode.LENS_DISTORTION, text, about=name))
-    if found.shape == "unknown" and found.why is not None:
-        text = f"The calibration has no shape of the object. {found.why.what} {NO_SHAPE}"
+    if found.shape == "unknown" and found.why is not None and len(names) > 1:
+        text = f"{found.why.what} Wrapping, patterns, gloss, Blender and exports of the surface need a shape."
         troubles.append(Notice.warning(TroubleCode.SHAPE_UNKNOWN, text))
     said = tell_all(context, StepId(StepKind.GEOMETRY), troubles)
     return [*write_geometry(context.folder, names, found), said]
-
-
-NO_SHAPE: Final = "Only what needs one is missing: wrapping, patterns, gloss, Blender and exports of the surface."
 
 
 def _depth_m(found: FoundShape, correspondences: Sequence[Correspondence]) -> FloatImage:
