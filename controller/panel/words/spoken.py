@@ -63,12 +63,20 @@ EVENT_TEXTS: Final = (
     _("The stage follows the schedule again."), _("The system time is known again."),
     _("An operator asked to open the stage."), _("An operator asked to close the stage."),
     _("Frames for the loss of any single projector are ready."), _("The test shots are done. See the aiming page."),
+    _("The stage is powering: light is needed."), _("The stage is warming."), _("The stage is ready."),
+    _("The stage is playing: open."), _("The stage is playing: every projector gives light again."),
+    _("The stage is ready: closed."), _("The stage is cooling: closed."), _("The stage is cooling: nothing to do."),
+    _("The stage is off: every lamp is off or cooling by itself."), _("The player ended unexpectedly."),
+    _("The player did not answer."), _("The newest bundle plays again."), _("The room is dark again."),
+    _("The technician's keys work again."), _("Alerts are sent again."),
 )  # fmt: skip
 """Whole texts of the event log."""
 EVENT_PATTERNS: Final = (
     _("Started: {0}."), _("The player shows {0}."), _("The lamp of projector {0} is being switched on."),
     _("{0} logged in from {1}."), _("{0} logged out."), _("An operator chose the appearance {0}."),
-    _("A new bundle is installed: {0}."), _("{0} is connected again."),
+    _("A new bundle is installed: {0}."), _("{0} is connected again."), _("Mains on: {0}."), _("Mains off: {0}."),
+    _("The report of {0} is written. See the results."), _("Frames without {0} are ready."),
+    _("{0} waits, and is done later."), _("The disk has {0} GB of free space again."),
 )  # fmt: skip
 """Texts of the event log with names in them."""
 _MATCHES: Final = [(re.compile(re.sub(r"\\\{\d\\\}", "(.+)", re.escape(one))), one) for one in EVENT_PATTERNS]

@@ -109,6 +109,10 @@ def test_usual_events_are_said_in_the_language() -> None:
         assert spoken.event_text("The kiosk is starting.") == "Der Kiosk startet."
         assert spoken.event_text("Started: Test shots.") == "Begonnen: Testaufnahmen."
         assert spoken.event_text("anna logged in from ::1.") == "anna hat sich von ::1 angemeldet."
+        assert (
+            spoken.event_text("The stage is powering: light is needed.") == "Die Lampen gehen an: Licht wird gebraucht."
+        )
+        assert spoken.event_text("Mains off: left.") == "Netz aus: left."
         assert spoken.event_text("Something {0} else.") == "Something {0} else."
 
 
