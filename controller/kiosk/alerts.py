@@ -101,8 +101,6 @@ def _not_sent(who: str, error: Exception, secrets: Sequence[str] = ()) -> WorkEr
 
 
 def _when(row: EventRow) -> str:
-    import time
-
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(row.unix_s))
 
 

@@ -14,12 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from controller.kiosk.state import (
-    EventLevel,
-    EventRow,
-    Job,
-    KioskState,
-)
+from controller.kiosk.state import EventLevel, EventRow, Job, KioskState
 from controller.kiosk.values import (
     Aiming,
     Appearance,

@@ -58,8 +58,7 @@ KINDS: Final = {
         "`velatura kiosk identify` shows which projector is which.",
     ),
     "serial adapter": _Kind(
-        "The serial adapter",
-        "Plug it in where it was, or correct the port in stage.toml. `velatura doctor` finds it.",
+        "The serial adapter", "Plug it in where it was, or correct the port in stage.toml. `velatura doctor` finds it."
     ),
     "projector": _Kind("The projector", "If it was exchanged, calibrate the stage."),
     "projector firmware": _Kind("The firmware of projector", f"Check its picture settings. {_MEASURE}"),

@@ -74,12 +74,7 @@ _X: Final = {"DISPLAY": ":0", "XAUTHORITY": "/run/velatura-x11/cookie"}
 
 
 def install(
-    system: System,
-    *,
-    outputs_again: bool,
-    restart: bool,
-    say: Callable[[str], None],
-    prefix: Path = Path(sys.prefix),
+    system: System, *, outputs_again: bool, restart: bool, say: Callable[[str], None], prefix: Path = Path(sys.prefix)
 ) -> None:
     """Make this computer a kiosk, and start it. ``outputs_again``: look which projectors are plugged in, also where
     that was done before. ``restart``: the program is another version; controller and player start again.

@@ -48,16 +48,7 @@ from controller.kiosk.operations.arguments import (
     UpToNumber,
     WithPhotographs,
 )
-from controller.kiosk.operations.operation import (
-    Download,
-    Effect,
-    Jpeg,
-    Names,
-    Operation,
-    Page,
-    Picture,
-    operation,
-)
+from controller.kiosk.operations.operation import Download, Effect, Jpeg, Names, Operation, Page, Picture, operation
 from controller.kiosk.roles import Role
 from controller.kiosk.schedule import expanded
 from controller.kiosk.state import EventRow, Job, KioskState

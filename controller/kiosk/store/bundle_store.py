@@ -119,10 +119,7 @@ class BundleStore:
         shutil.rmtree(folder.parent, ignore_errors=True)
         # All or none, because the folder is not checked again. On a full disk there are no previews.
         fresh = folder.with_name(f"{folder.name}.part")
-        with (
-            contextlib.suppress(BundleError, VelaturaError, OSError),
-            Bundle.open_trusted(path, self._trust) as bundle,
-        ):
+        with contextlib.suppress(BundleError, VelaturaError, OSError), Bundle.open_trusted(path, self._trust) as bundle:
             fresh.mkdir(parents=True)
             for number, entry in enumerate(index.appearances):
                 if (data := bundle.thumbnail(entry.name)) is not None and (small := _as_jpeg(data)) is not None:
@@ -175,10 +172,7 @@ class BundleStore:
         if len(self._known) > 64:
             self._known.clear()
         index = None
-        with (
-            contextlib.suppress(BundleError, VelaturaError, OSError),
-            Bundle.open_trusted(path, self._trust) as bundle,
-        ):
+        with contextlib.suppress(BundleError, VelaturaError, OSError), Bundle.open_trusted(path, self._trust) as bundle:
             index = bundle.index
         self._known[path] = index, now_s + UNREAD_S
         return index

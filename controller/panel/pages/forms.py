@@ -321,23 +321,15 @@ class Setup:
     async def _find(self, _: Request, visitor: Visitor, sent: Sent) -> Response:
         """Search devices, and try the selected ones."""
         assert visitor.session is not None
-        chosen = sent.many.get("key", [])
+        chosen, name = sent.many.get("key", []), sent.texts.get("name", "")
+        kept: dict[str, Any] = {"found": None, "tried": {}, "name": name, "chosen": chosen, "here": "/setup"}
         try:
             devices = await self._panel.in_thread(lambda: list(self._panel.kiosk.find_devices()))
             tried = await self._panel.in_thread(lambda: self._tried(devices, chosen))
         except answers.FAILURES as error:
             visitor.session.notes.append(("error", f"{error.what} {error.remedy}"))
-            kept: dict[str, Any] = {
-                "found": None,
-                "tried": {},
-                "name": sent.texts.get("name", ""),
-                "chosen": chosen,
-                "here": "/setup",
-            }
             return await self._pages.show("setup.html", visitor, kept, answers.status_of(error))
-        name = sent.texts.get("name", "")
-        facts = {"found": devices, "tried": tried, "name": name, "chosen": chosen, "here": "/setup"}
-        return await self._pages.show("setup.html", visitor, facts)
+        return await self._pages.show("setup.html", visitor, kept | {"found": devices, "tried": tried})
 
     def _tried(self, devices: list[FoundDevice], chosen: list[str]) -> dict[str, TriedDevice]:
         tried: dict[str, TriedDevice] = {}

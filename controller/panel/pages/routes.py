@@ -121,21 +121,14 @@ class Pages:
             for op in self._panel.operations
             if not op.changes and op.answer in _SEEN
         ]
+        late = (
+            ("doctor", "late_doctor.html", self._found), ("reach/{target}", "late_reach.html", self._reached),
+            ("computed/{target}", "late_computed.html", self._computed),
+            ("scenes/{scene}", "late_reach.html", self._rendered),
+        )  # fmt: skip
         entries += [
-            Entry("GET", "/late/doctor", "session", Role.OPERATOR, self._late("late_doctor.html", self._found)),
-            Entry(
-                "GET", "/late/reach/{target}", "session", Role.OPERATOR, self._late("late_reach.html", self._reached)
-            ),
-            Entry(
-                "GET",
-                "/late/computed/{target}",
-                "session",
-                Role.OPERATOR,
-                self._late("late_computed.html", self._computed),
-            ),
-            Entry(
-                "GET", "/late/scenes/{scene}", "session", Role.OPERATOR, self._late("late_reach.html", self._rendered)
-            ),
+            Entry("GET", f"/late/{path}", "session", Role.OPERATOR, self._late(name, facts))
+            for path, name, facts in late
         ]
         entries.append(Entry("GET", "/shown/{run}", "session", Role.VIEWER, self._report))
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]

@@ -61,13 +61,17 @@ _CHOICES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SettingField:
-    """``name`` in the form; ``value``: its text now; ``rules``: what is allowed, as JSON schema."""
+    """``path`` in stage.toml; ``value``: its text now; ``rules``: what is allowed, as JSON schema."""
 
-    name: str
     path: KeyPath
     label: str
     value: str
     rules: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """In the form."""
+        return ".".join(map(str, self.path))
 
     @property
     def choices(self) -> dict[str, str]:
@@ -106,10 +110,7 @@ def groups(text: str) -> list[tuple[str, str, list[SettingField]]]:
         rules = model.model_json_schema()["properties"]
         for path, table in _tables(name, content):
             fields = [
-                SettingField(
-                    ".".join(map(str, (*path, key))), (*path, key), label, _text(table, key, rules), rules[key]
-                )
-                for key, label in labels.items()
+                SettingField((*path, key), label, _text(table, key, rules), rules[key]) for key, label in labels.items()
             ]
             found.append((heading, str(table.get("name", "")) if len(path) > 1 else "", fields))
     return found
