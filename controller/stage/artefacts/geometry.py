@@ -14,7 +14,7 @@ from controller.core.errors import UsageError
 from controller.optics.calibrate.geometry.shape import FoundShape, Shape
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.mesh import fill
+from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.names import json_path, npz_path, read_json, write_json
 
 
@@ -92,7 +92,9 @@ def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometr
     require_shape(run, "This")
     arrays = load_arrays(npz_path(run, StepKind.GEOMETRY))
     poses = read_geometry_figures(run)
-    points_m, normals = fill(run, arrays["points_m"], arrays["normals"])
+    points_m, normals, mesh = arrays["points_m"], arrays["normals"], RegisteredMesh.read(run)
+    if mesh is not None:
+        points_m, normals = mesh.fill(points_m, normals)
     geometry = Geometry(
         camera=_read_pinhole(poses["camera"]),
         projectors=tuple(_read_pinhole(row) for row in poses["projectors"].values()),

@@ -9,15 +9,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from controller.core.errors import UsageError
-from controller.core.storage import sha256_of
+from controller.core.storage import sha256_of, write_atomically
 from controller.optics.calibrate.mesh_alignment import Pairs, Pose
 from controller.run.progress import Reporter
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.sessions.calibrations import finished_calibration
-from controller.stage.steps.mesh import Guide, Surface, fill_from, lay_mesh, write_map
+from controller.stage.steps.mesh import Guide, Surface, filled, lay_mesh
 from hal.notices import Level
 from hal.runtime.mesh_file import MeshUnreadable, read_mesh
 
@@ -53,19 +55,22 @@ def register(stage: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str, 
     limit_m = None if order.limit_mm is None else 1e-3 * order.limit_mm
     mesh = lay_mesh(surface, mesh, Guide(None, pairs, limit_m))
     mesh = replace(mesh, figures={**mesh.figures, **_unit(mesh.pose.scale, order.unit, known=surface.scale_known)})
+    mesh = filled(surface, mesh) if order.fill else mesh
     mesh.write(run)
-    picture = run / "mesh.png"
-    write_map(picture, mesh)
     for sentence in _warnings(mesh):
         reporter.say(sentence, Level.WARNING)
-    filled = fill_from(run, surface, mesh) if order.fill else 0
-    figures = mesh.figures
+    picture, figures = run / "mesh.png", mesh.figures
+    # red before the mesh, blue behind it, white where both agree, grey elsewhere
+    level = np.clip(mesh.arrays["deviation_m"] / (1e-3 * figures["limit_mm"]), -1, 1)[..., None]
+    colours = 255 * (1 - np.abs(level) * np.where(level > 0, (1, 1, 0), (0, 1, 1)))
+    drawn = np.where(np.isfinite(level), colours, 96).astype(np.uint8)
+    write_atomically(picture, cv2.imencode(".png", drawn)[1].tobytes())
     return {
         "run": run,
         "differs": f"{figures['median_off_mm']:.2g} mm (median), {figures['most_off_mm']:.2g} mm (95 % of the points)",
         "size": figures["size"],
-        "differs_most": f"by {figures['worst_mm']:.2g} mm around camera pixel {tuple(figures['worst_px'])}",
-        "filled_pixels": filled,
+        "worst": f"around camera pixel {tuple(figures['worst_px'])}",
+        "filled_pixels": figures.get("filled_pixels", 0),
         "map": picture,
     }
 
@@ -87,11 +92,11 @@ def _read(path: Path) -> RegisteredMesh:
             what=f"{path} has no faces with an area, so there is no surface to lay on the object.",
             remedy="Export the object as a triangle mesh, not as a point cloud.",
         )
-    uv = None if mesh.uv is None else mesh.uv[full]
-    facts = {"file": path.name, "sha256": sha256_of(path)}
-    return RegisteredMesh(
-        mesh.vertices, mesh.faces[full], uv, Pose(1.0, np.eye(3), np.zeros(3)), np.zeros((0, 0), np.float32), facts
-    )
+    arrays: dict[str, npt.NDArray[Any]] = {"vertices": mesh.vertices, "faces": mesh.faces[full]}
+    if mesh.uv is not None:
+        arrays["uv"] = mesh.uv[full]
+    nowhere = Pose(1.0, np.eye(3), np.zeros(3))
+    return RegisteredMesh(arrays, nowhere, {"file": path.name, "sha256": sha256_of(path)})
 
 
 def _on_object(pairs: tuple[tuple[float, ...], ...], surface: Surface) -> Pairs:

@@ -42,23 +42,11 @@ def as_it_is(transport: LightTransport) -> FloatImage:
     return np.asarray(np.clip(light / brightest, 0, 1), np.float32)
 
 
-def camera_places(size_px: tuple[int, int]) -> Places:
-    """The sheet of an object without a mesh: the camera's picture, (width, height)."""
-    size = np.asarray(size_px, np.float64)
-
-    def places(px: Float64) -> tuple[Float64, Float64]:
-        at = (px + 0.5) / size
-        steps = np.broadcast_to(np.diag([1.0, -1.0]) / size, (len(px), 2, 2))
-        return np.stack([at[:, 0], 1 - at[:, 1]], axis=1), steps
-
-    return places
-
-
 def mesh_places(mesh: SolidMesh, uv: FloatImage, pose: Pose, camera: Pinhole) -> Places:
     """The sheet of a mesh; ``uv`` (faces, 3, 2): the places of each face's corners."""
 
     def places(px: Float64) -> tuple[Float64, Float64]:
-        rays = rays_of(camera, px)
+        rays = rays_of(camera, *px.T)
         face = mesh.met_by(rays, pose).face
 
         def on_sheet(rays: Float64) -> Float64:
@@ -66,23 +54,33 @@ def mesh_places(mesh: SolidMesh, uv: FloatImage, pose: Pose, camera: Pinhole) ->
 
         at = on_sheet(rays)
         # on the plane of the same face, so that no seam of the sheet lies between
-        steps = np.stack([on_sheet(rays_of(camera, px + step)) - at for step in ((1.0, 0.0), (0.0, 1.0))], axis=1)
+        steps = np.stack([on_sheet(rays_of(camera, *(px + step).T)) - at for step in ((1.0, 0.0), (0.0, 1.0))], axis=1)
         at[face < 0] = np.nan
         return at, np.nan_to_num(steps, posinf=1.0, neginf=-1.0)
 
     return places
 
 
-def texture(sheet: FloatImage, places: Places, own: FloatImage, mask: Mask) -> Target:
-    """The object with a sheet on it; ``own`` (rows, columns, 3): as it is, where the sheet is transparent or ends."""
-    painted = through_camera(Target(_painted(sheet, places, mask), mask))
-    image = painted.image[..., :3] + (1 - painted.image[..., 3:]) * own
-    return replace(painted, image=np.where(mask[..., None], image, 0).astype(np.float32))
+def texture(sheet: FloatImage, places: Places | None, own: FloatImage, mask: Mask) -> Target:
+    """The object with a sheet on it.
+
+    ``places``: None for a sheet that is the camera's picture; ``own`` (rows, columns, 3): the object as it is, where
+    the sheet is transparent or ends
+    """
+    light = np.dstack([sheet[..., :3] * sheet[..., 3:], sheet[..., 3]]).astype(np.float32)
+    if places is None:
+        way = cv2.INTER_AREA if sheet.shape[0] > mask.shape[0] else cv2.INTER_LINEAR
+        image = np.asarray(cv2.resize(light, mask.shape[::-1], interpolation=way), np.float32)
+    else:
+        image = _painted(light, places, mask)
+    painted = through_camera(Target(image, mask))
+    mixed = painted.image[..., :3] + (1 - painted.image[..., 3:]) * own
+    return replace(painted, image=np.where(mask[..., None], mixed, 0).astype(np.float32))
 
 
 def _painted(sheet: FloatImage, places: Places, mask: Mask) -> FloatImage:
-    """(rows, columns, 4): light times alpha, and alpha, each the mean over the pixel's area on the sheet."""
-    levels = [np.dstack([sheet[..., :3] * sheet[..., 3:], sheet[..., 3]]).astype(np.float32)]
+    """(rows, columns, 4) of a sheet of light times alpha, and alpha: the mean over each pixel's area on the sheet."""
+    levels = [sheet]
     while min(levels[-1].shape[:2]) > 1:
         rows, columns = levels[-1].shape[:2]
         half_px = max(1, columns // 2), max(1, rows // 2)

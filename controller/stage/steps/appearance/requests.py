@@ -29,13 +29,13 @@ from controller.optics.solve.targets.patterns import (
 )
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.restoration import RestorationLook, restored
-from controller.optics.solve.targets.sheets import as_it_is, camera_places, texture
+from controller.optics.solve.targets.sheets import as_it_is, texture
 from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_geometry, require_shape
-from controller.stage.artefacts.mesh import RegisteredMesh, filled_digest
+from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
@@ -108,8 +108,8 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         assert file is not None
         inputs["mesh"], is_whole = _check_sheet(table, file, options, calibrated)
         title += " (the sheet is nowhere transparent)" * is_whole
-    elif (digest := filled_digest(calibrated.folder)) and table.kind not in ("picture", "recolour"):
-        inputs["filled"] = digest
+    elif table.kind not in NEEDS_NO_SHAPE and (mesh := RegisteredMesh.read(calibrated.folder)) is not None:
+        inputs["filled"] = str(mesh.figures.get("filled_pixels", 0))
 
     def target() -> Target:
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
@@ -220,9 +220,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         if sheet.shape[2] == 3:
             sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
         mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
-        places = (
-            camera_places(mask.shape[::-1]) if mesh is None else mesh.places(read_geometry(calibrated.folder).camera)
-        )
+        places = None if mesh is None else mesh.places(read_geometry(calibrated.folder).camera)
         return texture(sheet, places, as_it_is(calibrated.transport), mask)
     geometry = read_geometry(calibrated.folder, calibrated.projectors)
     if kind == "photograph":

@@ -157,7 +157,9 @@ def test_clicks_that_are_off_by_5_pixels_are_enough(stage: Path, tmp_path: Path,
 
 
 def test_a_mesh_that_is_like_itself_needs_clicks(tmp_path: Path) -> None:
-    jar = trimesh.creation.revolve(np.array([[0, -90], [60, -90], [75, -20], [35, 40], [50, 90], [0, 90]]), sections=90)
+    jar = trimesh.creation.revolve(
+        1.6 * np.array([[0, -90], [60, -90], [75, -20], [35, 40], [50, 90], [0, 90]]), sections=90
+    )
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     rays = np.stack([(x - 160) / FOCAL, (y - 119) / FOCAL, np.ones(x.shape)], axis=2).reshape(-1, 3)
     at, ray, _ = placed(jar, TRUTH).ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)

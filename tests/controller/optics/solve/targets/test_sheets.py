@@ -13,7 +13,7 @@ import trimesh
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh
 from controller.optics.calibrate.values import Pinhole
-from controller.optics.solve.targets.sheets import camera_places, mesh_places, photographed, sheet_side, texture
+from controller.optics.solve.targets.sheets import mesh_places, photographed, sheet_side, texture
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = Pinhole(
@@ -168,5 +168,5 @@ def test_without_a_mesh_the_sheet_is_the_camera_s_picture() -> None:
     picture = np.random.default_rng(3).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(picture, (0, 0), 4), np.float32)
     mask = np.ones((HEIGHT, WIDTH), np.bool_)
-    image = texture(sheet_of(smooth), camera_places((WIDTH, HEIGHT)), np.zeros_like(picture), mask).image
+    image = texture(sheet_of(smooth), None, np.zeros_like(picture), mask).image
     np.testing.assert_allclose(image[4:-4, 4:-4], smooth[4:-4, 4:-4], atol=0.006)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +71,9 @@ def lay_wall(run: Path, *, uv: bool = True) -> None:
     faces, places = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     pose = Pose(1.0, np.eye(3), np.array([0.0, 0.0, 1.0]))
     facts = {"sha256": "0", "sheet_px": [80, 60]}
-    RegisteredMesh(corners, faces, places[faces] if uv else None, pose, np.zeros((1, 1), np.float32), facts).write(run)
+    arrays: dict[str, npt.NDArray[Any]] = {"vertices": corners, "faces": faces}
+    arrays |= {"uv": places[faces]} if uv else {}
+    RegisteredMesh(arrays, pose, facts).write(run)
 
 
 def painted(folder: Path, sheet: npt.NDArray[np.uint8]) -> None:
