@@ -170,7 +170,5 @@ def _check(deadline: Deadline) -> None:
 
 def _silent() -> DeviceTimeout:
     return DeviceTimeout(
-        "player-silent",
-        what="The player did not answer in time.",
-        remedy="If this happens again, restart the player.",
+        "player-silent", what="The player did not answer in time.", remedy="If this happens again, restart the player."
     )

@@ -276,13 +276,7 @@ class LibraryCamera:
 
     def __init__(self, module: str, library: str, *, start: tuple[Any, ...], serial: str, deadline: Deadline) -> None:
         self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
-        self.process = LibraryProcess(
-            module,
-            library,
-            start=start,
-            serial=serial,
-            note=self._notices.append,
-        )
+        self.process = LibraryProcess(module, library, start=start, serial=serial, note=self._notices.append)
         self._settings: ExposureSettings | None = None
         self._configured: int | None = None
         """The process that has these settings."""

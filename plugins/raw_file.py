@@ -88,13 +88,7 @@ def levels_of(settings: Mapping[str, Any]) -> Levels:
 
 
 def encoded(
-    data: bytes | memoryview,
-    size_px: tuple[int, int],
-    pixels: PixelFormat,
-    *,
-    maker: str,
-    model: str,
-    levels: Levels,
+    data: bytes | memoryview, size_px: tuple[int, int], pixels: PixelFormat, *, maker: str, model: str, levels: Levels
 ) -> bytes:
     """The file. ``data``: rows of little-endian samples.
 

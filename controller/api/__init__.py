@@ -27,15 +27,7 @@ from controller.api.calibration import CalibratedRun, calibrate, decode, fit_met
 from controller.api.captures import CaptureSet, Developed, develop, draw_patterns, merge_brackets, read_captures
 from controller.api.codes import decode_folder
 from controller.api.results import compare, export
-from controller.api.solving import (
-    ReachableTarget,
-    base_image,
-    encode,
-    reachable_target,
-    scale,
-    solve,
-    solve_base,
-)
+from controller.api.solving import ReachableTarget, base_image, encode, reachable_target, scale, solve, solve_base
 from controller.api.transport import (
     PairTransport,
     build_transport,

@@ -312,8 +312,6 @@ def read_run(folder: Path | str, projectors: Sequence[str] | None = None) -> Cal
     unknown = next((name for name in projectors or () if name not in found), None)
     if unknown is not None:
         raise UsageError(
-            "projector-unknown",
-            what=f"The run has no projector {unknown}.",
-            remedy=f"Choose from {', '.join(found)}.",
+            "projector-unknown", what=f"The run has no projector {unknown}.", remedy=f"Choose from {', '.join(found)}."
         )
     return CalibratedRun(folder, found if projectors is None else projectors)

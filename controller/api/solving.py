@@ -185,10 +185,7 @@ def scale(
 
 
 def encode(
-    frame: npt.ArrayLike,
-    radiometry: Radiometry,
-    *,
-    dither: Literal["diffusion", "blue-noise", "nearest"] = "diffusion",
+    frame: npt.ArrayLike, radiometry: Radiometry, *, dither: Literal["diffusion", "blue-noise", "nearest"] = "diffusion"
 ) -> ByteImage:
     """Device values of a linear frame: through the inverse of the projector's response, with dithering.
 

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from controller.cli import console
-from controller.cli.groups import (
-    StageFolder,
-    appearance_names,
-    projector_names,
-    typed_parameter,
-    with_signature,
-    work,
-)
+from controller.cli.groups import StageFolder, appearance_names, projector_names, typed_parameter, with_signature, work
 from controller.core.errors import UsageError
 from controller.core.text import printable
 from controller.kiosk.operations.fields import Field, Sent

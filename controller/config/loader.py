@@ -100,11 +100,7 @@ def _text(file: Path, kind: str) -> str:
     try:
         data = read_bytes(file, LARGEST_BYTES)
     except FileNotFoundError as error:
-        raise UsageError(
-            f"{kind}-missing",
-            what=f"There is no {file}.",
-            remedy=_EXAMPLES[kind],
-        ) from error
+        raise UsageError(f"{kind}-missing", what=f"There is no {file}.", remedy=_EXAMPLES[kind]) from error
     except UnfitFile as error:
         raise _unreadable(file, f"can't be read: {error.strerror}", "Give a text file.", kind) from error
     except OSError as error:

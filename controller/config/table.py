@@ -93,12 +93,7 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-_NAMES: Mapping[Any, str] = {
-    float: "a number",
-    int: "a whole number",
-    str: "text in quotes",
-    bool: "true or false",
-}
+_NAMES: Mapping[Any, str] = {float: "a number", int: "a whole number", str: "text in quotes", bool: "true or false"}
 
 
 def checked_arguments(place: Place, values: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:

@@ -159,9 +159,7 @@ class DouserConformance(DeviceConformance):
 
     def test_every_answer_and_error_is_of_its_type(self, douser: Douser) -> None:
         self.check_types(
-            douser,
-            lambda it: it.move(True, deadline=self.soon()),
-            lambda it: it.closed(deadline=self.soon()),
+            douser, lambda it: it.move(True, deadline=self.soon()), lambda it: it.closed(deadline=self.soon())
         )
 
 

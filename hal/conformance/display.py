@@ -74,9 +74,7 @@ class DisplayConformance(DeviceConformance):
 
     def test_every_answer_and_error_is_of_its_type(self, display: Display) -> None:
         self.check_types(
-            display,
-            lambda it: it.outputs(deadline=self.soon()),
-            lambda it: it.show({}, deadline=self.soon()),
+            display, lambda it: it.outputs(deadline=self.soon()), lambda it: it.show({}, deadline=self.soon())
         )
 
 

@@ -17,10 +17,7 @@ from hal.outlets import Outlets, outlets_driver, whole_number
 from hal.registry import setting
 
 PORT: Final = 161
-PDUS: Final = {
-    "apc": "1.3.6.1.4.1.318.1.1.12.3.3.1.1.4",
-    "apc-masterswitch": "1.3.6.1.4.1.318.1.1.4.4.2.1.3",
-}
+PDUS: Final = {"apc": "1.3.6.1.4.1.318.1.1.12.3.3.1.1.4", "apc-masterswitch": "1.3.6.1.4.1.318.1.1.4.4.2.1.3"}
 """Control column of each family: 1 switches on, 2 off, and reads the same."""
 _DESCRIPTION: Final = "1.3.6.1.2.1.1.1.0"
 _OID: Final = re.compile(r"\d+(?:\.\d+){3,60}")

@@ -90,11 +90,7 @@ class PjLinkConversation:
     """
 
     def __init__(
-        self,
-        connect: Callable[[Deadline], ByteLink],
-        name: str,
-        password: str | None,
-        profile: ProjectorProfile,
+        self, connect: Callable[[Deadline], ByteLink], name: str, password: str | None, profile: ProjectorProfile
     ) -> None:
         self._connect = connect
         self._name = name

@@ -307,12 +307,7 @@ def open_serial_projector(settings: Mapping[str, Any], context: OpenContext, dea
             return SerialLink(port, baud=baud, deadline=until, transcript=transcript)
         return open_url(port, baud=baud, deadline=until, transcript=transcript)
 
-    projector = SerialProjector(
-        line,
-        profile,
-        name=str(settings["port"]),
-        address=address,
-    )
+    projector = SerialProjector(line, profile, name=str(settings["port"]), address=address)
     projector.open(deadline)
     return projector
 

@@ -186,15 +186,11 @@ def device_error(error: OSError) -> DeviceError:
         )
     if error.errno == errno.EBUSY:
         return DeviceRefused(
-            "camera-taken",
-            what="Another program uses the camera.",
-            remedy="End it: `fuser /dev/video0` names it.",
+            "camera-taken", what="Another program uses the camera.", remedy="End it: `fuser /dev/video0` names it."
         )
     if error.errno in (errno.EACCES, errno.EPERM):
         return DeviceRefused(
-            "camera-not-opened",
-            what="This user may not open the camera.",
-            remedy="Put this user into the group video.",
+            "camera-not-opened", what="This user may not open the camera.", remedy="Put this user into the group video."
         )
     return DeviceRefused(
         "camera-refused",

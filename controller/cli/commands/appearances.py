@@ -29,8 +29,7 @@ class SolveChoice:
         str | None, typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786.")
     ] = None
     refine: Annotated[
-        int | None,
-        typer.Option(help="Photographs that correct each result (default: from stage.toml).", min=0, max=9),
+        int | None, typer.Option(help="Photographs that correct each result (default: from stage.toml).", min=0, max=9)
     ] = None
     device: Annotated[
         Literal["auto", "cpu", "gpu"] | None, typer.Option(help="What solves (default: from stage.toml).")
@@ -41,12 +40,10 @@ def appearance(
     stage: StageFolder,
     solve: SolveChoice,
     names: Annotated[
-        list[str] | None,
-        typer.Argument(help="Names from stage.toml (default: all).", autocompletion=appearance_names),
+        list[str] | None, typer.Argument(help="Names from stage.toml (default: all).", autocompletion=appearance_names)
     ] = None,
     blender: Annotated[
-        list[str] | None,
-        typer.Option(help="Instead: a scene for Blender, builtin:marble, ... or a .blend file."),
+        list[str] | None, typer.Option(help="Instead: a scene for Blender, builtin:marble, ... or a .blend file.")
     ] = None,
     accept_grade: AcceptGrade = False,
 ) -> None:
@@ -149,8 +146,7 @@ def live(
     stage: StageFolder,
     targets_shown: LiveTargets,
     into: Annotated[
-        Path | None,
-        typer.Option(help="Use no device: write to this frame file for another player."),
+        Path | None, typer.Option(help="Use no device: write to this frame file for another player.")
     ] = None,
     targets: Annotated[
         bool, typer.Option("--targets", help="With --into: write targets, for a player with shaders.")

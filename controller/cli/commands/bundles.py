@@ -102,8 +102,7 @@ def diff(
 
 
 def sign(
-    file: BundleFile,
-    key: Annotated[Path, typer.Option(help="A secret key file made by `velatura bundle key`.")],
+    file: BundleFile, key: Annotated[Path, typer.Option(help="A secret key file made by `velatura bundle key`.")]
 ) -> None:
     """Check every byte of a bundle and sign it with this key. An existing signature is replaced."""
     from controller.bundle.signing import load_signing_key
@@ -127,10 +126,7 @@ def rollback(stage: StageFolder) -> None:
     _show(rolled_back(stage))
 
 
-def export(
-    file: BundleFile,
-    out: Annotated[Path, typer.Option(help="An empty or new folder.")],
-) -> None:
+def export(file: BundleFile, out: Annotated[Path, typer.Option(help="An empty or new folder.")]) -> None:
     """Write every frame as a PNG picture, with an index.json. The signature is not checked."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:

@@ -54,8 +54,7 @@ def calibrate(
     patterns: PatternChoice,
     quick: Annotated[bool, typer.Option("--quick", help="Redo only what changed since the last calibration.")] = False,
     projector: Annotated[
-        str | None,
-        typer.Option(help="Recalibrate only this projector.", autocompletion=projector_names),
+        str | None, typer.Option(help="Recalibrate only this projector.", autocompletion=projector_names)
     ] = None,
     accept_grade: AcceptGrade = False,
 ) -> None:
@@ -112,8 +111,7 @@ def export(
         ),
     ],
     kind: Annotated[
-        FormatName,
-        typer.Option("--format", help="; ".join(f"{one.name}: {one.what}" for one in FORMATS) + "."),
+        FormatName, typer.Option("--format", help="; ".join(f"{one.name}: {one.what}" for one in FORMATS) + ".")
     ] = "glb",
     out: Annotated[Path | None, typer.Option(help="Output file or folder (default: in the run's folder).")] = None,
     step: Annotated[

@@ -27,8 +27,7 @@ def demo(
         Literal["small", "medium", "paper", "uhd"], typer.Option(help="Size of projectors and camera.")
     ] = "small",
     object: Annotated[  # noqa: A002 - the option's name is fixed
-        str | None,
-        typer.Option(help="painting, relief, statue, or a mesh, .obj or .ply (default: a vase and a bust)."),
+        str | None, typer.Option(help="painting, relief, statue, or a mesh, .obj or .ply (default: a vase and a bust).")
     ] = None,
     projectors: Annotated[int | None, typer.Option(help="How many projectors (default: 3, painting 2).", min=1)] = None,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),

@@ -128,8 +128,7 @@ def install(
         bool, typer.Option("--outputs", help="Look again which projectors are plugged in; all must be switched on.")
     ] = False,
     restart: Annotated[
-        bool,
-        typer.Option("--restart", help="Start controller and player again, for a new version. Lamps stay lit."),
+        bool, typer.Option("--restart", help="Start controller and player again, for a new version. Lamps stay lit.")
     ] = False,
 ) -> None:
     """Make this computer a kiosk, and start it. As root, on Debian 12 or 13: user, services, X server and panel."""

@@ -71,8 +71,7 @@ def doctor(
     ] = None,
     write: Annotated[bool, typer.Option("--write", help="Write the devices found to STAGE/stage.toml.")] = False,
     outputs: Annotated[
-        bool,
-        typer.Option("--outputs", help="Switch the lamps on and find which output each projector shows."),
+        bool, typer.Option("--outputs", help="Switch the lamps on and find which output each projector shows.")
     ] = False,
     network: Annotated[
         str,

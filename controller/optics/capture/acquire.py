@@ -155,10 +155,7 @@ class Acquirer:
     def _set(self, exposure_s: float, deadline: Deadline) -> ExposureSettings:
         if self._confirmed is None or self._confirmed[0] != exposure_s:
             settings = ExposureSettings(
-                exposure_s=exposure_s,
-                iso=self._iso,
-                aperture_f=self._aperture_f,
-                raw=self._camera.capabilities.raw,
+                exposure_s=exposure_s, iso=self._iso, aperture_f=self._aperture_f, raw=self._camera.capabilities.raw
             )
             self._confirmed = (exposure_s, self._camera.configure(settings, deadline=deadline.within(15.0)))
         return self._confirmed[1]

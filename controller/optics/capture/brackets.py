@@ -237,11 +237,7 @@ class ExposureChoice:
 
 
 def choose_exposure(
-    image: FloatImage,
-    exposure_s: float,
-    available_s: Sequence[float],
-    *,
-    lit: Mask | None = None,
+    image: FloatImage, exposure_s: float, available_s: Sequence[float], *, lit: Mask | None = None
 ) -> ExposureChoice:
     """The exposure at which white's brightest lit pixels reach ``TARGET`` of full scale and none much more.
 

@@ -47,12 +47,7 @@ class _Transforms(ctypes.Structure):
 
 
 class _Gamma(ctypes.Structure):
-    _fields_ = (
-        ("size", c_int),
-        ("red", POINTER(c_ushort)),
-        ("green", POINTER(c_ushort)),
-        ("blue", POINTER(c_ushort)),
-    )
+    _fields_ = (("size", c_int), ("red", POINTER(c_ushort)), ("green", POINTER(c_ushort)), ("blue", POINTER(c_ushort)))
 
 
 def _bind(name: str, result: Any, *arguments: Any) -> Any:

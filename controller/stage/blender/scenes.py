@@ -140,10 +140,7 @@ def _studio(body: Any, *, ambient: float) -> None:
     """A key light above the camera's left, a fill at its right, and some light from everywhere."""
     low, high = _bounds(body)
     middle, size = (low + high) / 2, _size(body)
-    for name, place, extent, strength in (
-        ("key", (-1.6, -1.8, 2.0), 1.2, 1.0),
-        ("fill", (2.2, -1.6, 0.4), 1.6, 0.25),
-    ):
+    for name, place, extent, strength in (("key", (-1.6, -1.8, 2.0), 1.2, 1.0), ("fill", (2.2, -1.6, 0.4), 1.6, 0.25)):
         light = bpy.data.lights.new(name, "AREA")
         light.shape, light.size = "DISK", extent * size
         offset = Vector(place) * size

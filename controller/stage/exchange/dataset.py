@@ -45,9 +45,7 @@ def write_dataset(content: Content, folder: Path) -> dict[str, int]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(
-            "dataset-exists",
-            what=f"{folder} exists already.",
-            remedy="Remove it, or name another folder with --out.",
+            "dataset-exists", what=f"{folder} exists already.", remedy="Remove it, or name another folder with --out."
         )
     run = content.folder
     photographs = [_pack(photograph, run, folder) for photograph in _photographs(run)]

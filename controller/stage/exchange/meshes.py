@@ -40,11 +40,7 @@ def write_glb_file(content: Content, path: Path) -> dict[str, int]:
         View(
             name,
             pose_matrix(own),
-            {
-                "camera_matrix": own.matrix.tolist(),
-                "distortion": own.distortion.tolist(),
-                "size_px": list(own.size_px),
-            },
+            {"camera_matrix": own.matrix.tolist(), "distortion": own.distortion.tolist(), "size_px": list(own.size_px)},
         )
         for name, own in content.views
     ]

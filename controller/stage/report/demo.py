@@ -140,10 +140,7 @@ def _figures(
         "appearances": [_appearance_figures(appearance) for appearance in judged],
         "bundle": {"bytes": bundle.bytes, "ratio": bundle.ratio},
         "playback": read_playback(run),
-        "machine": {
-            "cores": usable_cpus(),
-            "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        },
+        "machine": {"cores": usable_cpus(), "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")},
         "seconds": sum(steps.values()),
     }
 

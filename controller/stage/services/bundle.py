@@ -83,11 +83,7 @@ def verify(file: Path, *, stage: Path | None, trusted: Sequence[Path]) -> Mappin
     Raises BundleError as ``Bundle.open`` and ``Bundle.verify`` do; UsageError("trust-twice").
     """
     if stage is not None and trusted:
-        raise UsageError(
-            "trust-twice",
-            what="Both --stage and --trusted were given.",
-            remedy="Give only one of them.",
-        )
+        raise UsageError("trust-twice", what="Both --stage and --trusted were given.", remedy="Give only one of them.")
     trust = ANY_SIGNER
     accept: Callable[[Index], None] = _anything
     if stage is not None:

@@ -34,9 +34,7 @@ def write_example(path: Path) -> Mapping[str, Any]:
     """Write an example plan.toml. Raises UsageError("plan-exists"), WorkError("no-space", "cannot-write")."""
     if path.exists():
         raise UsageError(
-            "plan-exists",
-            what=f"{path} exists already.",
-            remedy="Give another name, or remove the file first.",
+            "plan-exists", what=f"{path} exists already.", remedy="Give another name, or remove the file first."
         )
     write_atomically(path, EXAMPLE.encode())
     return {"written": str(path)}

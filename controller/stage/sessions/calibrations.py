@@ -54,9 +54,7 @@ def finished_calibration(stage: Path) -> Path:
     if found:
         return found[0]
     raise UsageError(
-        "not-calibrated",
-        what="This stage has no finished calibration.",
-        remedy="Run `velatura calibrate` on it first.",
+        "not-calibrated", what="This stage has no finished calibration.", remedy="Run `velatura calibrate` on it first."
     )
 
 

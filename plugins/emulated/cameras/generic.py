@@ -7,13 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from plugins.emulated.cameras.body import JPEG, EmulatedBody, ExposedPicture
-from plugins.emulated.cameras.wire import (
-    BUSY,
-    NO_SUCH_PROPERTY,
-    WRONG_FORMAT,
-    WRONG_VALUE,
-    PtpOutcome,
-)
+from plugins.emulated.cameras.wire import BUSY, NO_SUCH_PROPERTY, WRONG_FORMAT, WRONG_VALUE, PtpOutcome
 from plugins.emulated.core.shot import ShotSettings
 
 DNG: Final = 0x3811

@@ -109,10 +109,7 @@ def _between(
             values.append(share[used])
     own = np.setdiff1d(np.arange(count), np.concatenate(rows))
     shares = sparse.csr_matrix(
-        (
-            np.concatenate([*values, np.ones(len(own))]),
-            (np.concatenate([*rows, own]), np.concatenate([*places, own])),
-        ),
+        (np.concatenate([*values, np.ones(len(own))]), (np.concatenate([*rows, own]), np.concatenate([*places, own]))),
         shape=(count, count),
     )
     shares = sparse.diags(1.0 / np.asarray(shares.sum(axis=1)).ravel()) @ shares

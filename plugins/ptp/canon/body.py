@@ -275,10 +275,7 @@ class EosBody:
         """Some bodies refuse it and expose all the same; one that needs it refuses the release, with its reason."""
         try:
             self._channel.request(
-                Operation.EOS_HOST_CAPACITY,
-                *_HOST_SPACE,
-                doing="accept this computer's free space",
-                deadline=deadline,
+                Operation.EOS_HOST_CAPACITY, *_HOST_SPACE, doing="accept this computer's free space", deadline=deadline
             )
         except DeviceRefused as error:
             if not self._space_refused:

@@ -181,13 +181,7 @@ def _add_up(
 
 @compiled(parallel=True)
 def _add(
-    image: FloatImage,
-    cosine: float,
-    sine: float,
-    steps: int,
-    along: FloatImage,
-    across: FloatImage,
-    light: FloatImage,
+    image: FloatImage, cosine: float, sine: float, steps: int, along: FloatImage, across: FloatImage, light: FloatImage
 ) -> None:
     a, b, one = np.float32(2 * cosine / steps), np.float32(2 * sine / steps), np.float32(1 / steps)
     for row in numba.prange(image.shape[0]):

@@ -166,11 +166,7 @@ def cost_of(problem: AdjustmentProblem, state: AdjustmentState) -> float:
 
 
 def adjust(
-    problem: AdjustmentProblem,
-    state: AdjustmentState,
-    *,
-    iterations: int = 40,
-    tolerance: float = 1e-8,
+    problem: AdjustmentProblem, state: AdjustmentState, *, iterations: int = 40, tolerance: float = 1e-8
 ) -> Adjusted:
     """Levenberg-Marquardt with the Schur complement over the points.
 

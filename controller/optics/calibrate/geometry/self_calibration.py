@@ -84,9 +84,7 @@ def _neighbours(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
 
 
 def no_position(
-    problem: ba.AdjustmentProblem,
-    sizes_px: Sequence[tuple[int, int]],
-    missing: Sequence[int],
+    problem: ba.AdjustmentProblem, sizes_px: Sequence[tuple[int, int]], missing: Sequence[int]
 ) -> CalibrationError:
     """The error where no position was found for the projectors ``missing``: the focal length, if another one gives any.
 
@@ -296,9 +294,7 @@ def _differs(one: ba.AdjustmentState, other: ba.AdjustmentState) -> bool:
 
 
 def _refine(
-    problem: ba.AdjustmentProblem,
-    correspondences: Sequence[Correspondence],
-    state: ba.AdjustmentState,
+    problem: ba.AdjustmentProblem, correspondences: Sequence[Correspondence], state: ba.AdjustmentState
 ) -> tuple[ba.AdjustmentProblem, ba.Adjusted, float]:
     """Adjust over all points, trim what does not fit, adjust again; the share of correspondences that were kept."""
     everything = int(problem.seen.sum())

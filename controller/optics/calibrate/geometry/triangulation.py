@@ -247,14 +247,7 @@ def _accumulate(
 
 @compiled()
 def _compare(
-    surface: Surface,
-    row: int,
-    other: int,
-    first: int,
-    shift: int,
-    place: Float64,
-    value: Float64,
-    weight: Float64,
+    surface: Surface, row: int, other: int, first: int, shift: int, place: Float64, value: Float64, weight: Float64
 ) -> None:
     """Where neighbours of pixels of a row lie, and their inverse depth; 0 with no weight for those that do not count.
 

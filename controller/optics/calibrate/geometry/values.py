@@ -46,10 +46,7 @@ def nearest_distance(points: FloatImage) -> float:
 
 
 def metres_per_unit(
-    points: FloatImage,
-    distance_m: float | None,
-    distance_rel_sigma: float,
-    between: Sequence[MeasuredDistance],
+    points: FloatImage, distance_m: float | None, distance_rel_sigma: float, between: Sequence[MeasuredDistance]
 ) -> tuple[float, float]:
     """Metres in one unit of ``points`` (rows, columns, 3), and its relative standard deviation.
 

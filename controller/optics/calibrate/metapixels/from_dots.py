@@ -37,10 +37,7 @@ GRAZING: Final = 0.1
 """Cosine between normal and projector below which its light carries no information."""
 
 
-def initial_metapixels(
-    correspondence: Correspondence,
-    size_px: tuple[int, int],
-) -> Metapixels:
+def initial_metapixels(correspondence: Correspondence, size_px: tuple[int, int]) -> Metapixels:
     """Centres from the inverse of the map, sizes from its slope and an assumed blur.
 
     ``size_px`` (width, height) of the projector.

@@ -171,13 +171,7 @@ def _regularize(centre: Float64, valid: Mask, limit: float, least_gain: float, m
 
 @compiled()
 def _neighbours(
-    centre: Float64,
-    valid: Mask,
-    row: int,
-    column: int,
-    limit: float,
-    found: Float64,
-    near: npt.NDArray[np.int64],
+    centre: Float64, valid: Mask, row: int, column: int, limit: float, found: Float64, near: npt.NDArray[np.int64]
 ) -> bool:
     """Centre and weight of the nearest valid pixel in each of eight directions; False when one has none."""
     rows, columns = valid.shape

@@ -96,12 +96,7 @@ class Wave:
 
 
 def coarse_waves(
-    captures: Captures,
-    plan: PatternPlan,
-    white: FloatImage,
-    phase_map: PhaseMap,
-    valid: Mask,
-    shown_with: Float64,
+    captures: Captures, plan: PatternPlan, white: FloatImage, phase_map: PhaseMap, valid: Mask, shown_with: Float64
 ) -> tuple[Wave, ...]:
     """What the photographs show of the coarse sinusoids, for ``held_to``; none where that is too little.
 

@@ -71,11 +71,7 @@ class CommonCauses:
 
 
 def equations(
-    transport: LightTransport,
-    frames: Sequence[FloatImage],
-    error: FloatImage,
-    stage: RefinedStage,
-    trusted: Mask,
+    transport: LightTransport, frames: Sequence[FloatImage], error: FloatImage, stage: RefinedStage, trusted: Mask
 ) -> Float64:
     """What one photograph says: (causes + 1, causes + 1) products of the causes' images and, last, of the ``error``.
 

@@ -57,12 +57,7 @@ def _spread(
 
 @compiled(parallel=True, fastmath=True)
 def forward_planes(
-    patches: Patches,
-    gain: FloatImage,
-    mixing: FloatImage,
-    p: FloatImage,
-    projectors: tuple[int, int],
-    out: FloatImage,
+    patches: Patches, gain: FloatImage, mixing: FloatImage, p: FloatImage, projectors: tuple[int, int], out: FloatImage
 ) -> None:
     """Write sum over the projectors n of ``gain``_n (.) G_n (M_n p_n) to ``out`` (3, rows, columns)."""
     height, width = patches.camera_shape
@@ -131,12 +126,7 @@ def _collect(
 
 @compiled(parallel=True, fastmath=True)
 def adjoint_planes(
-    patches: Patches,
-    gain: FloatImage,
-    mixing: FloatImage,
-    r: FloatImage,
-    projectors: tuple[int, int],
-    out: FloatImage,
+    patches: Patches, gain: FloatImage, mixing: FloatImage, r: FloatImage, projectors: tuple[int, int], out: FloatImage
 ) -> None:
     """Write M_n' G_n' (``gain``_n (.) r) for the projectors n to ``out`` (3, pixels of all projectors)."""
     height, width = patches.camera_shape

@@ -61,10 +61,7 @@ spread_lanes = cast(
 )
 """``spread_lanes(red, green, blue, at, weights, k, r, g, b)``: add weights[k:k+8], times r, g and b, to the planes."""
 
-collect_lanes = cast(
-    "Callable[[_Plane, _Plane, _Plane, int, _Weights, int, _Plane], None]",
-    intrinsic(_collect_lanes),
-)
+collect_lanes = cast("Callable[[_Plane, _Plane, _Plane, int, _Weights, int, _Plane], None]", intrinsic(_collect_lanes))
 """``collect_lanes(red, green, blue, at, weights, k, sums)``: add weights[k:k+8], times each plane, to the 3 x 8 sums.
 
 The planes are taken from ``at`` on. Both only from compiled code; the arrays are flat, indices unchecked.

@@ -96,12 +96,7 @@ def count_windows(sight: Sight, table: Profiles, small: SmallProfiles, counts: n
 
 @compiled(parallel=True)
 def write_windows(
-    sight: Sight,
-    table: Profiles,
-    small: SmallProfiles,
-    halo: int,
-    ahead: npt.NDArray[np.int64],
-    windows: WindowArrays,
+    sight: Sight, table: Profiles, small: SmallProfiles, halo: int, ahead: npt.NDArray[np.int64], windows: WindowArrays
 ) -> None:
     """Write the windows that ``count_windows`` counts.
 

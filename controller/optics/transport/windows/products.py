@@ -73,12 +73,7 @@ def see(windows: Windows, table: Profiles, small: SmallProfiles, cell: int, ligh
 
 @compiled(fastmath=True)
 def spread(
-    windows: Windows,
-    table: Profiles,
-    small: SmallProfiles,
-    cell: int,
-    values: FloatImage,
-    sums: FloatImage,
+    windows: Windows, table: Profiles, small: SmallProfiles, cell: int, values: FloatImage, sums: FloatImage
 ) -> None:
     """Add the ``values`` of the sites, times gain, in a cell's windows' shares to ``sums`` (side, side), all 0."""
     first = windows.first[SORTS * cell : SORTS * (cell + 1) + 1]

@@ -93,7 +93,7 @@ def solve_steps(
             after=tuple(after),
             title="Solving the base image",
             weight=costs.BASE_S * scale,
-        ),
+        )
     ]
     for request in requests:
         before = (*after, BASE)
