@@ -83,7 +83,8 @@ def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ())
 def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> AppearanceRequest:
     if table.kind not in TITLES:
         raise table.place.wrong_value("kind", table.kind, "is not a kind of appearance", f"one of {', '.join(TITLES)}")
-    if table.kind not in NEEDS_NO_SHAPE and calibrated.camera_px is not None:
+    has_none = stage.tables.object.shape == "unknown"
+    if table.kind not in NEEDS_NO_SHAPE and (has_none or calibrated.camera_px is not None):
         require_shape(calibrated.folder, f"The appearance {table.name} of kind {table.kind}")
     _ = table.hint_ms  # report its errors before an hour of solving
     wanted = _options(table.kind)

@@ -14,10 +14,12 @@ from PIL import Image, ImageCms
 from scipy import ndimage
 
 from controller.core.arrays import FloatImage
-from controller.core.errors import UsageError
+from controller.core.errors import CalibrationError, UsageError
+from controller.optics.calibrate.geometry.shape import FoundShape
 from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.solve.targets.files import read_large_picture, read_picture
 from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.geometry import write_geometry
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import Registered
 from controller.stage.services.export import export
@@ -63,6 +65,34 @@ def test_a_space_that_does_not_fit_is_refused_before_anything_is_solved(
     with pytest.raises(UsageError) as refused:
         requests_of(load(tmp_path, text), calibrated)
     assert refused.value.code == code
+
+
+@pytest.mark.parametrize("kind", ["photograph", "pattern", "checkerboard", "gloss", "blender"])
+def test_what_needs_a_shape_says_so_by_name_before_anything_is_computed(
+    tmp_path: Path, calibrated: Calibrated, kind: str
+) -> None:
+    asked = '\n[object]\nshape = "unknown"\n'
+    table = PICTURE.replace("KIND", kind).replace(
+        'file = "t.png"\n', "" if kind != "photograph" else 'file = "t.png"\n'
+    )
+    flat = CalibrationError("one-projector", what="One is not enough.", remedy="Use two.")
+    write_geometry(calibrated.folder, ("left", "right"), FoundShape("unknown", CAMERA[::-1], why=flat))
+    not_yet = Calibrated(tmp_path / "next", ("left", "right"))
+    for stage, at, remedy in ((STAGE, calibrated, "Use two."), (STAGE + asked, not_yet, "Set shape under")):
+        with pytest.raises(UsageError, match=f"appearance x of kind {kind} needs the shape") as refused:
+            requests_of(load(tmp_path, stage + table), at)
+        assert refused.value.code == "shape-unknown"
+        assert refused.value.remedy.startswith(remedy)
+    assert requests_of(load(tmp_path, STAGE + asked + PICTURE.replace("KIND", "picture")), calibrated)
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply", "blender", "usd", "colmap", "opencv", "mpcdi"])
+def test_an_export_of_a_shape_that_is_unknown_is_refused_by_name(calibrated: Calibrated, kind: str) -> None:
+    write_geometry(calibrated.folder, ("left", "right"), FoundShape("unknown", CAMERA[::-1]))
+    with pytest.raises(UsageError, match=f"format {kind} needs the shape") as refused:
+        export(run=calibrated.folder, kind=kind, out=None, step=None)
+    assert refused.value.code == "shape-unknown"
+    assert export(run=calibrated.folder, kind="st-maps", out=None, step=None)["maps"]
 
 
 def lay_wall(run: Path, *, uv: bool = True) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import CalibrationError, UsageError
+from controller.optics.calibrate.geometry.shape import AskedShape
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.capture.acquire import Acquirer
 from controller.optics.capture.patterns import Code, plan_patterns
@@ -263,6 +264,23 @@ def test_white_is_photographed_once_and_the_camera_measured_from_it(tmp_path: Pa
     assert {"white-0", "white-1", "gray-x-0"} <= stage.names()
     order = list(steps)
     assert order.index(white.id) < order.index(camera.id) < order.index(light.id)
+
+
+@pytest.mark.parametrize(("shape", "waits"), [("surface", True), ("plane", True), ("auto", False)])
+def test_no_third_code_is_photographed_before_two_have_shown_the_shape_that_is_asked_for(
+    tmp_path: Path, journal: Journal, shape: AskedShape, waits: bool
+) -> None:
+    rig = stage_of(tmp_path, SCENE, journal).rig
+    three = replace(rig, projectors=tuple(replace(rig.projectors[0], name=name) for name in ("a", "b", "c")))
+    steps = calibration_steps(three, cast("CameraPrior", None), longest_exposure_s=4.0, shape=shape)
+    ids = [step.id for step in steps]
+    first, third = StepId(StepKind.SHAPE), StepId(StepKind.CODES, "c")
+    assert ids.index(StepId(StepKind.PIXELS, "b")) < ids.index(first) < ids.index(third)
+    assert steps[ids.index(first)].calculates
+    assert (first in steps[ids.index(third)].after) is waits
+    with pytest.raises(CalibrationError) as refused:
+        calibration_steps(rig, cast("CameraPrior", None), longest_exposure_s=4.0, shape="surface")
+    assert refused.value.code == "one-projector"
 
 
 def test_a_code_waits_for_no_response_but_its_own(tmp_path: Path, journal: Journal) -> None:
