@@ -116,6 +116,17 @@ body.hide_render = True
 bpy.context.scene.unit_settings.scale_length = 0.001
 bpy.context.scene.view_settings.view_transform = "AgX"
 """
+PLAIN = 'bpy.context.scene.view_settings.view_transform = "Standard"\n'
+LAMP = """
+unit = 1 / bpy.context.scene.unit_settings.scale_length
+lamp = bpy.data.lights.new("lamp", "POINT")
+lamp.energy, lamp.shadow_soft_size = 10 * unit**2, 0.01 * unit
+place = bpy.data.objects.new("lamp", lamp)
+place.location = (0.2 * unit, 0, 0.2 * unit)
+bpy.context.scene.collection.objects.link(place)
+links.new(nodes.new("ShaderNodeBsdfDiffuse").outputs["BSDF"], out.inputs["Surface"])
+"""
+"""A lamp of one strength on the object, whatever the scene's unit."""
 MISSING = """
 picture = nodes.new("ShaderNodeTexImage")
 picture.image = bpy.data.images.new("wood", 4, 4)
@@ -125,19 +136,26 @@ picture.image.filepath = "/nowhere/wood.png"
 SAVE = "bpy.ops.wm.save_as_mainfile"
 
 
-def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_where_it_stands(
+def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_where_it_stands_as_bright(
     tmp_path: Path, blender: Blender
 ) -> None:
     geometry, light = ball()
-    mask = known(geometry)
-    (tmp_path / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{MOVED}{SAVE}"))
-    subprocess.run([blender.command[0], str(tmp_path / "make.py"), str(tmp_path / "moved.blend")], check=True)
-    write_job(tmp_path, geometry, mask, light, scene=tmp_path / "moved.blend", settings=QUICK)
-    notes: list[str] = []
-    rendered = render(blender, tmp_path, lambda share, note: notes.append(note))
-    target = as_seen(read_picture(rendered), geometry.camera, mask)
-    assert (target.image[mask].max(axis=1) > 0).mean() > 0.95
-    assert any("view transform" in note for note in notes)
+    mask, seen, notes = known(geometry), [], []
+    for name, changes in (("metres", PLAIN), ("millimetres", MOVED)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{changes}{LAMP}{SAVE}"))
+        subprocess.run([blender.command[0], str(folder / "make.py"), str(folder / "own.blend")], check=True)
+        write_job(folder, geometry, mask, light, scene=folder / "own.blend", settings=QUICK)
+        rendered = render(blender, folder, lambda share, note, name=name: notes.append((name, share, note)))
+        target = as_seen(read_picture(rendered), geometry.camera, mask)
+        seen.append(target.image[mask].max(axis=1))
+    assert all((one > 0).mean() > 0.95 for one in seen)
+    both = (seen[0] > 0) & (seen[1] > 0)
+    assert np.median(seen[1][both] / seen[0][both]) == pytest.approx(1, abs=0.02)
+    said = [(share, note) for name, share, note in notes if "omitted: view transform" in note and name != "metres"]
+    assert said[0][0] == 0, "it is said before the first sample"
+    assert not any("omitted" in note for name, _, note in notes if name == "metres")
 
 
 def test_a_scene_without_its_pictures_is_refused_by_their_name(tmp_path: Path, blender: Blender) -> None:
