@@ -81,7 +81,8 @@ def _layer(parts: Sequence[Any]) -> tuple[Any, list[str]]:
             by_layer.setdefault(layer, {})[channel.upper()] = name
         for layer, own in by_layer.items():
             colours = ["R", "G", "B"] if {"R", "G", "B"} <= set(own) else ["Y", "Y", "Y"]
-            if set(colours) <= set(own) and not {"RY", "BY"} & set(own):
+            # Y beside these is a colour's luminance, or a coordinate
+            if set(colours) <= set(own) and (colours[0] == "R" or not {"RY", "BY", "X"} & set(own)):
                 full_name = ".".join(filter(None, (part.name() if len(parts) > 1 else "", layer)))
                 layers[full_name] = part, [own[channel] for channel in (*colours, *({"A"} & set(own)))]
     first = next(iter(layers), "")

@@ -401,6 +401,9 @@ def test_an_exrs_layers_and_parts_are_found_or_named(tmp_path: Path) -> None:
     chroma = exr(tmp_path / "yc.exr", {"Y": SPLIT["R"], "RY": SPLIT["G"], "BY": SPLIT["B"]})
     with pytest.raises(UsageError, match="BY, RY, Y"):
         load_target(chroma, (COLUMNS, ROWS))
+    places = exr(tmp_path / "xyz.exr", {"X": SPLIT["R"], "Y": SPLIT["G"], "Z": SPLIT["B"]})
+    with pytest.raises(UsageError, match="X, Y, Z"):
+        load_target(places, (COLUMNS, ROWS))
 
 
 def test_an_exr_of_xyz_is_converted_as_the_published_samples(tmp_path: Path) -> None:

@@ -102,8 +102,8 @@ covariance = [
 def read_intrinsics(path: Path) -> CameraIntrinsics:
     """Read what ``write_intrinsics`` wrote, or a person or another program did.
 
-    OpenCV's YAML, XML and JSON, ROS's YAML and COLMAP's cameras.txt are read. A lens with a k3 is replaced by the one
-    without it that comes nearest over the picture, and what is left over widens the covariance.
+    OpenCV's YAML, XML and JSON, ROS's YAML and COLMAP's cameras.txt are read. A lens with more terms is replaced by the
+    one with k1, k2, p1 and p2 that comes nearest over the picture, and what is left over widens the covariance.
 
     Raises UsageError("camera-intrinsics-missing", "camera-intrinsics-unreadable", "camera-intrinsics-invalid").
     """
@@ -136,7 +136,7 @@ def _unreadable(path: Path, reason: str) -> UsageError:
 
 
 def _of_opencv(text: str) -> tuple[tuple[int, int], Float64, Float64]:
-    """Size, (3, 3) matrix and (5,) distortion from OpenCV's or ROS's file. Raises ValueError or cv2.error."""
+    """Size, (3, 3) matrix and (4,) to (14,) distortion of OpenCV's or ROS's file. Raises ValueError or cv2.error."""
     if not text.lstrip().startswith(("%YAML", "<", "{")):
         text = "%YAML:1.0\n---\n" + text
     file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -148,23 +148,25 @@ def _of_opencv(text: str) -> tuple[tuple[int, int], Float64, Float64]:
         data = None if where is None else where.getNode("data") if where.isMap() else where
         if data is None or data.empty():
             raise ValueError("it has no image_width, image_height, camera_matrix or distortion_coefficients")
-        return np.array([data.at(n).real() for n in range(data.size())], np.float64)
+        rows = [data.at(n) for n in range(data.size())]
+        cells = [one for row in rows for one in ([row.at(n) for n in range(row.size())] if row.isSeq() else [row])]
+        return np.array([cell.real() for cell in cells], np.float64)
 
     model = node("distortion_model")
-    if model is not None and model.string() != "plumb_bob":
+    if model is not None and model.string() not in ("plumb_bob", "rational_polynomial"):
         raise ValueError(f"its lens model {model.string()} is not known here")
     size = [node(name, name.title().replace("I", "i", 1)) for name in ("image_width", "image_height")]
     matrix = numbers(node("camera_matrix", "cameraMatrix", "Camera_Matrix", "K"))
-    bent = numbers(node("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D"))
-    if matrix.size != 9 or bent.size not in (4, 5) or None in size:
-        raise ValueError("it needs image_width, image_height, a 3x3 camera_matrix and 4 or 5 distortion_coefficients")
+    bent = numbers(node("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D"))
+    if matrix.size != 9 or bent.size not in (4, 5, 8, 12, 14) or None in size:
+        raise ValueError("it needs image_width, image_height, a 3x3 camera_matrix and 4 to 14 distortion_coefficients")
     width, height = (int(one.real()) for one in size)
-    return (width, height), matrix.reshape(3, 3), np.resize(np.append(bent, 0.0), 5)
+    return (width, height), matrix.reshape(3, 3), bent
 
 
 COLMAP: Final = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2", "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }  # fmt: skip
 
 
@@ -177,7 +179,7 @@ def _of_colmap(text: str) -> tuple[tuple[int, int], Float64, Float64]:
     has = dict(zip(names, map(float, lines[0][4:]), strict=True))
     fx, fy = has.get("fx", has.get("f", 0.0)), has.get("fy", has.get("f", 0.0))
     matrix = np.array([[fx, 0, has["cx"] - 0.5], [0, fy, has["cy"] - 0.5], [0, 0, 1]])
-    bent = np.array([has.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    bent = np.array([has.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
     return (int(lines[0][2]), int(lines[0][3])), matrix, bent
 
 
@@ -187,12 +189,14 @@ LEAST_SIGMAS: Final = (2e-3, 2.0, 2.0, 5e-3, 5e-3, 5e-4, 5e-4, 1e-4)
 
 
 def _simplified(path: Path, size_px: tuple[int, int], matrix: Float64, bent: Float64) -> CameraIntrinsics:
-    """The nearest lens without k3, by linear least squares over the picture."""
+    """The nearest lens with k1, k2, p1 and p2 alone, by linear least squares over the picture."""
     width, height = size_px
     seen = np.stack(np.meshgrid(np.linspace(0, width - 1, 17), np.linspace(0, height - 1, 13)), axis=2).reshape(-1, 2)
     if min(width, height, matrix[0, 0], matrix[1, 1]) <= 0 or not np.isfinite([*matrix.ravel(), *bent]).all():
         raise ValueError("its size or focal length is not above zero")
-    aspect = matrix[1, 1] / matrix[0, 0]
+    if matrix[0, 1]:
+        raise ValueError("its camera_matrix is skew")
+    aspect = float(matrix[1, 1] / matrix[0, 0])
     x, y = Pinhole(matrix, bent, np.eye(3), np.zeros(3), size_px).rays(seen).T
     r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
     across = np.stack([x, one, zero, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2], axis=1)

@@ -257,6 +257,24 @@ def test_lens_files_of_other_programs_are_read(tmp_path: Path, name: str) -> Non
     assert len(found.sigmas) == 8
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", '{"image_width": 1200, "image_height": 800, "camera_matrix": [[1300, 0, 610], [0, 1300, 390], '
+                   '[0, 0, 1]], "dist_coeffs": [[-0.1, 0.02, 0, 0, 0]]}'),
+        ("a.yaml", "image_width: 1200\nimage_height: 800\nK: [1300, 0, 610, 0, 1300, 390, 0, 0, 1]\n"
+                   "distortion_model: rational_polynomial\nD: [-0.1, 0.02, 0, 0, 0, 0, 0, 0]\n"),
+        ("a.txt", "1 FULL_OPENCV 1200 800 1300 1300 610.5 390.5 -0.1 0.02 0 0 0 0 0 0\n"),
+    ],
+)  # fmt: skip
+def test_lens_files_may_nest_their_lists_and_have_terms_that_are_zero(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    found = read_intrinsics(tmp_path / name)
+    np.testing.assert_allclose(
+        [found.focal_px, *found.centre_px, found.k1, found.other_terms[0]], [1300, 610, 390, -0.1, 0.02], rtol=1e-6
+    )
+
+
 def test_a_third_radial_term_is_explained_by_the_others_within_their_sigmas(tmp_path: Path) -> None:
     terms = (-0.2, 0.1, 0.0, 0.0, -0.06)
     matrix = [1300, 0, 610, 0, 1300, 390, 0, 0, 1]
@@ -284,6 +302,11 @@ def test_a_third_radial_term_is_explained_by_the_others_within_their_sigmas(tmp_
         ("a.json", "{}", "camera-intrinsics-unreadable"),
         ("a.txt", "1 FISHEYE 1200 800 1 2 3 4\n", "camera-intrinsics-unreadable"),
         ("a.txt", "1 OPENCV 1200 800 1300\n", "camera-intrinsics-unreadable"),
+        (
+            "a.yaml",
+            "image_width: 12\nimage_height: 8\nK: [13, 1, 6, 0, 13, 4, 0, 0, 1]\nD: [0, 0, 0, 0]\n",
+            "camera-intrinsics-unreadable",
+        ),
         ("a.txt", "1 OPENCV 1200 800 1300 1300 600 400 -3 0 0 0\n", "camera-lens-unlike"),
         ("a.txt", "1 SIMPLE_PINHOLE 1200 800 1300 61000 400\n", "camera-intrinsics-invalid"),
     ],
