@@ -93,8 +93,8 @@ class Kiosk(Protocol):
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
         """The picture ``target`` (PNG) fitted to the camera's view; unchanged while the view is unknown.
 
-        ``fit``: see ``store.targets.fitted``; "wrap" wraps it around the object. Raises UsageError("target-unreadable",
-        "not-calibrated").
+        ``fit``: see ``store.targets.fitted``; "wrap" wraps it around the object; "restore" lays it on what it
+        shows. Raises UsageError("target-unreadable", "not-calibrated", "restoration-not-matched").
         """
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -16,7 +16,7 @@ from controller.kiosk.state import EventLevel, Grade
 from hal.notices import Notice
 
 RecalibrationKind = Literal["full", "quick"]
-Fit = Literal["fit", "fill", "crop", "wrap"]
+Fit = Literal["fit", "fill", "crop", "wrap", "restore"]
 Unsubscribe = Callable[[], None]
 Turn: TypeAlias = tuple[str, float, float]
 """An appearance's name, the seconds for which it is shown, and those of them in which it fades in."""
@@ -58,6 +58,7 @@ class Reach:
     """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
     ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
     not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
+    ``light``: with so much of the light that the picture has by the settings, ``light_share`` of it is in reach.
     ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all. ``computes``: a graphics processor
     may be there for ``Computed``.
     """
@@ -69,6 +70,8 @@ class Reach:
     pictures: Pictures = field(default_factory=dict)
     coarse: int = 1
     computes: bool = False
+    light: float = 1.0
+    light_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,6 @@ from controller.kiosk.values import (
     Schedule,
     TriedDevice,
 )
-from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
 from hal.notices import Notice
 
@@ -138,10 +137,9 @@ class StageKiosk(AttachedKiosk):
         return self._previews.of(service.checked, target)
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
-        if fit == "wrap":
-            from controller.kiosk.store.targets import wrapped
-
-            return wrapped(finished_calibration(self.stage), self.service.checked.names, target)
+        if fit == "wrap" or fit == "restore":  # noqa: PLR1714 - so a type checker knows what is left
+            kind = "photograph" if fit == "wrap" else "restoration"
+            return targets.on_object(self.stage, self.service.checked.names, target, kind)
         picture, size_px = target.read_bytes(), self.view_px()
         return picture if size_px is None else targets.fitted(picture, size_px, fit)
 

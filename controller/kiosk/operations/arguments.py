@@ -48,7 +48,7 @@ TargetKey = Annotated[str, Field(pattern=r"^[0-9a-f]{24}$", description="the key
 PictureFile = Annotated[Path, Field(description="a PNG, JPEG, TIFF or WebP"), Sent.FILE]
 FitName = Annotated[Fit, Field(description=(
     "how a picture of another size is fitted to the camera's view: fit (whole picture), fill (edges are cut), "
-    "crop (original pixels) or wrap (around the object); default: fit"))]  # fmt: skip
+    "crop (original pixels), wrap (around the object) or restore (laid on what it shows); default: fit"))]  # fmt: skip
 Outline = Annotated[str, Field(max_length=1 << 16, description=(
     "regions as lists of corners [x, y], each from 0 to 1 of the picture, such as [[[0,0],[1,0],[1,1]]]")),
     TEXT]  # fmt: skip

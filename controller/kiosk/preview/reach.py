@@ -96,6 +96,7 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     from controller.kiosk.preview.preview_light import preview_light
     from controller.optics.solve.appearance import StageLight
+    from controller.optics.solve.reach.feasibility import with_less_light
     from controller.optics.solve.request import aim_at
     from controller.optics.solve.result.metrics import visible_object
     from controller.stage.steps.appearance.solving import options_of
@@ -103,7 +104,8 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     light = preview_light(checked.stage.folder, run, checked.names)
     wanted = _wanted(light, target)
     stage_light = StageLight(light.transport, light.black, light.indirect, light.drive)
-    aim = aim_at(stage_light, wanted.image, options_of(checked.stage.tables.solve))
+    options = options_of(checked.stage.tables.solve)
+    aim = aim_at(stage_light, wanted.image, options)
     lit = light.transport.object_mask
     seen = visible_object(lit)
     folder.mkdir(parents=True, exist_ok=True)
@@ -113,9 +115,13 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     area = max(1, int(seen.sum()))
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
     pictures = {name: folder / file for name, file in FILES.items()}
-    return Reach(
-        share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step)
+    less = with_less_light(
+        light.transport, wanted, light.black, share=options.share, drive=light.drive, indirect=light.indirect
     )
+    return Reach(
+        share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step),
+        light=less.light, light_share=less.then_share,
+    )  # fmt: skip
 
 
 def _wanted(light: PreviewLight, target: Path) -> Target:

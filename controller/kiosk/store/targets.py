@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError, VelaturaError
-from controller.stage.sessions.calibrations import finished_calibrations
+from controller.stage.sessions.calibrations import finished_calibration, finished_calibrations
 
 Region = tuple[tuple[float, float], ...]
 """Corners of one part of a target, as shares of its width and height."""
@@ -146,15 +146,15 @@ def _in_the_middle(picture: npt.NDArray[Any], size_px: tuple[int, int]) -> npt.N
     return view
 
 
-def wrapped(run: Path, names: tuple[str, ...], picture: Path) -> bytes:
-    """A PNG of the size of the camera's view, transparent beside the object; ``run``: a finished calibration.
+def on_object(stage: Path, names: tuple[str, ...], picture: Path, kind: str) -> bytes:
+    """A PNG of the size of the camera's view, transparent beside the object, by the newest finished calibration.
 
-    Raises UsageError("target-unreadable") and what reading a calibration raises.
+    ``kind``: of an appearance. Raises what ``make_target`` and ``finished_calibration`` raise.
     """
     from controller.core.colour import linear_to_srgb
     from controller.stage.artefacts.calibrated import Calibrated
     from controller.stage.steps.appearance.requests import make_target
 
-    made = make_target("photograph", picture, {}, Calibrated(run, names))
+    made = make_target(kind, picture, {}, Calibrated(finished_calibration(stage), names))
     seen = np.rint(255 * np.dstack([linear_to_srgb(made.image), made.mask])).astype(np.uint8)
     return _png(seen)

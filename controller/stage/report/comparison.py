@@ -19,7 +19,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.comparison import Compared, all_compared, compared_in, picture_path, read_images
 from controller.stage.artefacts.kinds import StepKind
-from controller.stage.artefacts.solved import read_solved
+from controller.stage.artefacts.solved import Registered, read_solved
 from controller.stage.report import plots
 from controller.stage.report.page import (
     Goal,
@@ -33,6 +33,7 @@ from controller.stage.report.page import (
     write_report,
 )
 from controller.stage.report.pictures import (
+    ERROR_SCALE_DELTA_E,
     crop_around,
     encoded,
     error_picture,
@@ -48,12 +49,14 @@ COMPARED: Final = 3
 SHOWN_RUNS: Final = 12
 LONGEST_PX: Final = 960
 GOAL_DELTA_E: Final = 4.0
+MOST_RESIDUAL_PX: Final = 3.0
 MOMENT: Final = "%d %B %Y, %H:%M"
 _SHOWN: Final = (
     ("before", "Before", "in white light"),
     ("target", "Target", ""),
     ("achieved", "Achieved", "photograph"),
     ("error", "Error", "CIEDE2000"),
+    ("registration", "Registration", "how far structure lies beside its place; black: none, bright: 3 camera pixels"),
     ("resolution", "Resolution", "violet: none of the target's edges are present; yellow: all; grey: too few edges"),
 )
 _FIGURES: Final[tuple[tuple[str, Callable[[Compared], float], str], ...]] = (
@@ -96,6 +99,10 @@ def _draw(calibrated: Calibrated, name: str, context: Context) -> Sequence[Path]
         "error": error_picture(images.error.astype(np.float32), mask),
         "resolution": sharpness_picture(images.resolution, one.window_px, on_object.shape, mask),
     }
+    if (registered := Registered.read(calibrated.folder, name)) is not None:
+        residual_px = registered.residual_px.astype(np.float32)
+        scaled = residual_px * (ERROR_SCALE_DELTA_E / MOST_RESIDUAL_PX)
+        drawn["registration"] = error_picture(scaled, np.isfinite(residual_px))
     paths = []
     for kind, whole in drawn.items():
         path = picture_path(context.folder, name, kind)

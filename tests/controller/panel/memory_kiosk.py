@@ -171,7 +171,7 @@ class MemoryKiosk(MemoryWork):
         return 240, 160
 
     def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
-        return targets.fitted(target.read_bytes(), (240, 160), "stretch" if fit == "wrap" else fit)
+        return targets.fitted(target.read_bytes(), (240, 160), fit if fit in ("fit", "fill", "crop") else "stretch")
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:
         settings.check_name(name)

@@ -48,7 +48,8 @@ REACH: Final = 0.08
 BLOCKS: Final = 24
 SMOOTHING: Final = 3e-3
 NODE_PX: Final = 8
-AROUND_RESIDUAL: Final = 0.02
+MEASURED: Final = 0.04
+"""Of the object's longer side: so far from the next feature the residual is measured."""
 FEWEST_POINTS: Final = 4
 ON_A_LINE: Final = 0.01
 """Of four points as far apart as they can be: below it, they are as good as on a line."""
@@ -155,8 +156,8 @@ def _relative(values: FloatImage, known: Mask) -> FloatImage:
     return np.asarray(off / np.sqrt(contrast + faint + 1e-8), np.float32)
 
 
-def _blurred(values: FloatImage, sigma_px: float = AROUND_PX) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma_px), np.float32)
+def _blurred(values: FloatImage) -> FloatImage:
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), AROUND_PX), np.float32)
 
 
 def _inside(known: Mask, window_px: int) -> Mask:
@@ -394,13 +395,11 @@ def _nodes(fit: _Fit, shape: tuple[int, ...], bend: _Bend | None) -> FloatImage:
     if bend is not None:
         nodes[:2] = bend(at_nodes).T.reshape(2, *x.shape)
         left = fit.off - bend(fit.at)
-    nodes[3] = np.reshape(KDTree(fit.at).query(at_nodes)[0], x.shape)
-    sums = np.zeros((2, *x.shape), np.float32)
-    column, row = np.clip(np.rint(fit.at / NODE_PX).astype(int), 0, np.array(x.shape)[::-1] - 1).T
-    np.add.at(sums[0], (row, column), np.hypot(*left.T))
-    np.add.at(sums[1], (row, column), 1)
-    total, count = (_blurred(part, AROUND_RESIDUAL * size_px / NODE_PX) for part in sums)
-    nodes[2] = np.where(nodes[3] <= 2 * AROUND_RESIDUAL * size_px, total / np.maximum(count, 1e-9), np.nan)
+    found = KDTree(fit.at).query(at_nodes, k=range(1, min(NEIGHBOURS, len(fit.at)) + 1))
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+    nodes[3] = distance[:, 0].reshape(x.shape)
+    beside = np.median(np.hypot(*left.T)[nearest], axis=1).reshape(x.shape)
+    nodes[2] = np.where(nodes[3] <= MEASURED * size_px, beside, np.nan)
     return nodes
 
 

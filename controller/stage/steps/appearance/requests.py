@@ -39,7 +39,7 @@ from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
-from controller.stage.steps.appearance.restoring import restoration_request
+from controller.stage.steps.appearance.restoring import Restoration, restoration_request
 from controller.stage.steps.appearance.solving import AppearanceRequest
 from controller.stage.steps.mesh import carried_mesh
 
@@ -209,6 +209,9 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
     mask = calibrated.transport.object_mask
     options = dict(options)
     colour = options.pop("colour", None)
+    if kind == "restoration":
+        assert file is not None
+        return Restoration(file, {**options, "colour": colour}, calibrated).made[0]
     if kind == "picture":
         assert file is not None
         rows, columns = mask.shape

@@ -29,7 +29,7 @@ TURNED_DEGREES: Final = 2.0
 WHOLE: Final = 0.995
 
 
-class _Restoration:
+class Restoration:
     """A restoration, registered once. ``made`` raises UsageError as ``register``."""
 
     def __init__(self, file: Path, options: Mapping[str, Any], calibrated: Calibrated) -> None:
@@ -97,7 +97,7 @@ def restoration_request(
     name: str, file: Path, options: Mapping[str, Any], calibrated: Calibrated, solve: SolveTable, inputs: dict[str, str]
 ) -> AppearanceRequest:
     """Registered at once, if there is a calibration that it was not registered on before. Raises as ``register``."""
-    restoration = _Restoration(file, options, calibrated)
+    restoration = Restoration(file, options, calibrated)
     about = {**inputs, "share": repr(solve.exposure_share)}
     known = Registered.read(calibrated.base_folder, name)
     if calibrated.camera_px is not None and (known is None or known.about != about):

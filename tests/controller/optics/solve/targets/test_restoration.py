@@ -11,8 +11,13 @@ import skimage.data
 from controller.core.arrays import FloatImage
 from controller.core.colour import srgb_to_linear
 from controller.core.errors import UsageError
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import feasibility, with_less_light
 from controller.optics.solve.targets.registration import Registration, register
 from controller.optics.solve.targets.restoration import LightName, RestorationLook, restored, without_margin
+from controller.optics.solve.targets.values import Target
+from controller.optics.transport import build_transport
+from tests.controller.optics.solve.conftest import plane_calibration
 
 CAMERA = (260, 340)
 """(rows, columns)"""
@@ -275,3 +280,21 @@ def test_only_an_even_margin_at_all_corners_is_left_out() -> None:
     assert (known == ours).mean() > 0.95
     even = np.full((20, 30, 3), 0.4, np.float32)
     np.testing.assert_array_equal(without_margin(even), even)
+
+
+def test_the_light_is_named_at_which_hardly_anything_is_too_bright() -> None:
+    calibration = plane_calibration()
+    transport, black = build_transport(calibration), calibration.black
+    slope = np.linspace(0.1, 0.5, transport.camera_shape[1])[:, None]
+    mask = np.zeros(transport.camera_shape, np.bool_)
+    mask[:, 20:60] = True
+    image = np.asarray(np.where(mask[..., None], slope, 0) * np.ones(3), np.float32)
+    less = with_less_light(transport, Target(image, mask, exposure=2.0), black, share=0.9, drive=DriveLevels(transport))
+
+    def shown(exposure: float) -> float:
+        return float(feasibility(transport, exposure * image, black).reachable[mask].mean())
+
+    assert less.share == pytest.approx(shown(2.0))
+    assert less.then_share == pytest.approx(shown(2.0 * less.light))
+    assert less.share < 0.9 < 0.98 < less.then_share
+    assert shown(2.1 * less.light) < less.then_share

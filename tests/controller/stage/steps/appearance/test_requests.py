@@ -23,7 +23,7 @@ from controller.stage.artefacts.geometry import write_geometry
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import Registered
 from controller.stage.services.export import export
-from controller.stage.steps.appearance.requests import requests_of
+from controller.stage.steps.appearance.requests import make_target, requests_of
 from tests.controller.config.test_stage_file import STAGE, load
 from tests.docs.synthetic_data import CAMERA, write_run
 
@@ -232,3 +232,9 @@ def test_the_light_of_a_large_picture_is_averaged_not_its_numbers(tmp_path: Path
     assert by == 10
     assert light.shape == (40, 60, 3)
     np.testing.assert_allclose(light, 0.5, atol=1e-4)
+
+
+def test_a_restoration_that_a_page_asks_for_is_refused_by_the_same_name(tmp_path: Path, calibrated: Calibrated) -> None:
+    with pytest.raises(UsageError) as refused:
+        make_target("restoration", tmp_path / "t.png", {}, calibrated)
+    assert refused.value.code == "restoration-not-matched"
