@@ -150,9 +150,9 @@ def register(
     """Lay a known mesh on the calibrated object. Textures are painted on it, and it can fill what was not measured."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
-        from controller.stage.services.register import MeshOrder, read_pairs, register
+        from controller.stage.services.register import MeshOrder, register
 
-        order = MeshOrder(mesh, unit, () if pairs is None else read_pairs(pairs), limit, fill)
+        order = MeshOrder(mesh, unit, pairs, limit, fill)
         return register(stage, order, reporter)
 
     work(do, stage=stage)

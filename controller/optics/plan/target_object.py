@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from controller.core.arrays import Float64, Mask
 from controller.core.errors import UsageError
+from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh
 from controller.optics.plan.values import Surface
 from hal.runtime.mesh_file import MeshUnreadable, read_mesh
 
@@ -29,11 +29,11 @@ FLATTEST: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TargetObject:
-    """A mesh in the room (see ``values``), with a scene for rays. ``vertices_m`` (V, 3), ``faces`` (F, 3)."""
+    """A mesh in the room (see ``values``). ``vertices_m`` (V, 3), ``faces`` (F, 3)."""
 
     vertices_m: Float64
     faces: npt.NDArray[np.int32]
-    scene: Any
+    solid: SolidMesh
 
     @property
     def size_m(self) -> float:
@@ -47,12 +47,9 @@ class TargetObject:
         """
         if not len(directions):
             return np.zeros(0), np.zeros((0, 3))
-        origins = np.broadcast_to(from_m.astype(np.float32), directions.shape).copy()
-        found = self.scene.run(origins, np.ascontiguousarray(directions, np.float32), output=1)
-        hit = found["primID"] >= 0
-        cross = _crosses(self.vertices_m, self.faces[np.where(hit, found["primID"], 0)])
-        normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
-        return np.where(hit, np.asarray(found["tfar"], np.float64), AFTER_M), np.where(hit[:, None], normals, 0.0)
+        met = self.solid.met_by(directions, Pose(1.0, np.eye(3), -from_m))
+        normals = met.normals * np.where(met.outside, 1.0, -1.0)[:, None]
+        return np.nan_to_num(met.depth, nan=AFTER_M), np.where(met.face[:, None] >= 0, normals, 0.0)
 
     def hidden(self, from_m: Float64, points_m: Float64) -> Mask:
         """``optics.Shadows``."""
@@ -86,11 +83,7 @@ def read_target_object(path: Path, *, height_m: float | None, up: str, front: st
         if height < FLATTEST * float((high - low).max()):
             raise _no_size(path, f"the object has no height along {up}, so height_m can't be applied")
         placed *= height_m / height
-    embree: Any = importlib.import_module("embreex.rtcore_scene")
-    meshes: Any = importlib.import_module("embreex.mesh_construction")
-    scene = embree.EmbreeScene(robust=True)
-    meshes.TriangleMesh(scene, placed.astype(np.float32), faces)
-    return TargetObject(placed, faces, scene)
+    return TargetObject(placed, faces, SolidMesh(placed, faces))
 
 
 def sampled(target_object: TargetObject, count: int, audience_m: Float64, seed: int) -> Surface:

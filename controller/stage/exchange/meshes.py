@@ -188,9 +188,9 @@ def write_sheet(content: Content, path: Path) -> dict[str, object]:
     if mesh is None or mesh.uv is None:
         uv, sheet = "camera", np.dstack([picture, mask])
     else:
-        camera = content.geometry.camera
-        side = sheet_side(mesh.places(camera), mask)
-        uv, sheet = "mesh", photographed(picture, camera, mesh.solid, mesh.uv, mesh.pose, side)
+        places = mesh.places(content.geometry.camera)
+        side = sheet_side(places, mask)
+        uv, sheet = "mesh", photographed(picture, places, mask, side)
         replace(mesh, figures={**mesh.figures, "sheet_px": [side, side]}).write_figures(content.folder)
     shown = np.dstack([linear_to_srgb(sheet[..., :3]), sheet[..., 3]])
     image = Image.fromarray(np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8), "RGBA")

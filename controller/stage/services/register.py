@@ -19,7 +19,7 @@ from controller.optics.calibrate.mesh_alignment import Pairs, Pose
 from controller.run.progress import Reporter
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.sessions.calibrations import finished_calibration
-from controller.stage.steps.mesh import Guide, Surface, filled, lay_mesh
+from controller.stage.steps.mesh import Surface, filled, lay_mesh
 from hal.notices import Level
 from hal.runtime.mesh_file import MeshUnreadable, read_mesh
 
@@ -32,12 +32,12 @@ FARTHEST_PX: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class MeshOrder:
-    """``unit`` of ``UNITS``, None: guessed; ``pairs``: (x, y, z of the mesh's file, x, y in the camera's picture);
-    ``limit_mm``: most that the mesh may differ; ``fill``: whether it fills what no two projectors measured"""
+    """``unit`` of ``UNITS``, None: guessed; ``pairs``: a JSON file (docs/how-to/known-mesh.md); ``limit_mm``: most that
+    the mesh may differ; ``fill``: whether it fills what no two projectors measured"""
 
     mesh: Path
     unit: str | None = None
-    pairs: tuple[tuple[float, ...], ...] = ()
+    pairs: Path | None = None
     limit_mm: float | None = None
     fill: bool = False
 
@@ -45,15 +45,15 @@ class MeshOrder:
 def register(stage: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str, Any]:
     """Lay the mesh on the object, and write it with its figures into the run of the newest calibration.
 
-    Raises UsageError("mesh-unreadable", "mesh-no-faces", "mesh-unit-wrong", "mesh-pair-beside"), and as ``lay_mesh``,
-    ``Surface.read`` and ``finished_calibration``. Nothing is written then.
+    Raises UsageError("mesh-unreadable", "mesh-no-faces", "mesh-unit-wrong", "mesh-pairs-file", "mesh-pair-beside"), and
+    as ``lay_mesh``, ``Surface.read`` and ``finished_calibration``. Nothing is written then.
     """
     mesh = _read(order.mesh)
     run = finished_calibration(stage)
     surface = Surface.read(run)
-    pairs = _on_object(order.pairs, surface) if order.pairs else None
+    pairs = None if order.pairs is None else _pairs(order.pairs, surface)
     limit_m = None if order.limit_mm is None else 1e-3 * order.limit_mm
-    mesh = lay_mesh(surface, mesh, Guide(None, pairs, limit_m))
+    mesh = lay_mesh(surface, mesh, pairs, limit_m)
     mesh = replace(mesh, figures={**mesh.figures, **_unit(mesh.pose.scale, order.unit, known=surface.scale_known)})
     mesh = filled(surface, mesh) if order.fill else mesh
     mesh.write(run)
@@ -99,20 +99,28 @@ def _read(path: Path) -> RegisteredMesh:
     return RegisteredMesh(arrays, nowhere, {"file": path.name, "sha256": sha256_of(path)})
 
 
-def _on_object(pairs: tuple[tuple[float, ...], ...], surface: Surface) -> Pairs:
-    known_y, known_x = np.nonzero(surface.mask & np.isfinite(surface.points_m[..., 2]))
-    places = []
-    for number, (*_, x, y) in enumerate(pairs, start=1):
-        far = np.hypot(known_x - x, known_y - y)
-        nearest = int(far.argmin()) if len(far) else 0
-        if not len(far) or far[nearest] > FARTHEST_PX:
+def _pairs(path: Path, surface: Surface) -> Pairs:
+    try:
+        pairs = np.array(json.loads(path.read_text("utf-8")), np.float64)
+        why = "" if pairs.shape[1:] == (5,) and np.isfinite(pairs).all() else "it is no list of lists of five numbers"
+    except (OSError, ValueError, TypeError) as error:
+        why = str(error)
+    if why:
+        raise UsageError(
+            "mesh-pairs-file",
+            what=f"{path} has no pairs of points ({why}).",
+            remedy="Write [[x, y, z, column, row], ...]: a point of the mesh, and the camera pixel that shows it.",
+        )
+    known = np.argwhere(surface.mask & np.isfinite(surface.points_m[..., 2]))
+    far = np.linalg.norm(known[None] - pairs[:, None, :2:-1], axis=2)
+    for number, far_px in enumerate(far.min(axis=1, initial=np.inf), start=1):
+        if far_px > FARTHEST_PX:
             raise UsageError(
                 "mesh-pair-beside",
-                what=f"Nothing of the object was measured around camera pixel ({x:.0f}, {y:.0f}) of pair {number}.",
+                what=f"Nothing of the object was measured near the camera pixel of pair {number} in {path}.",
                 remedy="Choose a place on the object that two projectors light, not at its edge.",
             )
-        places.append(surface.points_m[known_y[nearest], known_x[nearest]])
-    return Pairs(np.array([pair[:3] for pair in pairs]), np.array(places, np.float64))
+    return Pairs(pairs[:, :3], surface.points_m[tuple(known[far.argmin(axis=1)].T)].astype(np.float64))
 
 
 def _unit(scale: float, named: str | None, *, known: bool) -> dict[str, Any]:
@@ -120,21 +128,17 @@ def _unit(scale: float, named: str | None, *, known: bool) -> dict[str, Any]:
     if not known:
         return {"unit": named, "size": "not known: no length of the stage was measured"}
     nearest = min(UNITS, key=lambda unit: abs(math.log(scale / UNITS[unit])))
-    is_near = abs(math.log(scale / UNITS[nearest])) < NEAR_UNIT
-    if named is not None and abs(math.log(scale / UNITS[named])) > NEAR_UNIT:
+    unit = named or nearest
+    larger = UNITS[unit] / scale
+    is_near = abs(math.log(larger)) < NEAR_UNIT
+    if named is not None and not is_near:
         raise UsageError(
             "mesh-unit-wrong",
-            what=f"In {named} the mesh would be {UNITS[named] / scale:.3g} times as large as the object.",
-            remedy=f"Give --unit {nearest}." if is_near else "Leave out --unit, or check the mesh's scale.",
+            what=f"In {named} the mesh would be {larger:.3g} times as large as the object.",
+            remedy=f"Leave out --unit, or give --unit {nearest} if its numbers are in {nearest}.",
         )
-    unit = named or (nearest if is_near else None)
-    if unit is None:
-        return {"unit": None, "size": f"1 in the file is {1e3 * scale:.4g} mm, which is no usual unit"}
-    larger = 100 * (UNITS[unit] / scale - 1)
-    return {
-        "unit": unit,
-        "size": f"in {unit}, {abs(larger):.2f} % {'larger' if larger > 0 else 'smaller'} than measured",
-    }
+    size = f"in {unit}, {larger:.4f} times as large as the object"
+    return {"unit": unit if is_near else None, "size": size if is_near else f"1 in the file is {1e3 * scale:.4g} mm"}
 
 
 def _warnings(mesh: RegisteredMesh) -> list[str]:
@@ -153,19 +157,3 @@ def _warnings(mesh: RegisteredMesh) -> list[str]:
     elif mesh.uv.min() < -1e-3 or mesh.uv.max() > 1 + 1e-3:
         said.append("The mesh's UV lies on several tiles. One sheet repeats on all of them.")
     return said
-
-
-def read_pairs(path: Path) -> tuple[tuple[float, ...], ...]:
-    """Pairs in a JSON file, each five numbers as in ``MeshOrder``. Raises UsageError("mesh-pairs-file")."""
-    try:
-        pairs = tuple(tuple(float(number) for number in pair) for pair in json.loads(path.read_text("utf-8")))
-        if len(pairs) >= 3 and all(len(pair) == 5 and all(map(math.isfinite, pair)) for pair in pairs):
-            return pairs
-        why = "it needs three or more lists of five numbers"
-    except (OSError, ValueError, TypeError) as error:
-        why = str(error)
-    raise UsageError(
-        "mesh-pairs-file",
-        what=f"{path} has no pairs of points ({why}).",
-        remedy="Write [[x, y, z, column, row], ...]: a point of the mesh, and the camera pixel that shows it.",
-    )

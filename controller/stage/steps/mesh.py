@@ -82,25 +82,18 @@ class Surface:
         return [self.mask, *(labels == n for n in large if len(large) > 1)]
 
 
-@dataclass(frozen=True, slots=True)
-class Guide:
-    """What is known of the pose before: ``start``, or ``pairs``; neither: nothing. ``limit_m``: how far mesh and object
-    may differ, None: ``LIMIT_SHARE``."""
-
-    start: Pose | None = None
-    pairs: Pairs | None = None
-    limit_m: float | None = None
-
-
-def lay_mesh(surface: Surface, mesh: RegisteredMesh, guide: Guide) -> RegisteredMesh:
+def lay_mesh(
+    surface: Surface, mesh: RegisteredMesh, guide: Pose | Pairs | None = None, limit_m: float | None = None
+) -> RegisteredMesh:
     """``mesh`` where it fits what was measured, with its figures.
 
+    ``guide``: where it stood, or pairs of points; ``limit_m``: how far both may differ, None: ``LIMIT_SHARE``
     Raises UsageError("mesh-mirrored", "mesh-pairs-flat", "mesh-pairs-wrong"), WorkError("mesh-does-not-fit",
     "mesh-ambiguous").
     """
     solid = mesh.solid
     best, fine = _best(surface, solid, guide)
-    limit_m = guide.limit_m or LIMIT_SHARE * fine.size_m
+    limit_m = limit_m or LIMIT_SHARE * fine.size_m
     met = solid.met_by(fine.rays, best.pose)
     front = met.outside[met.face >= 0]
     figures = {
@@ -116,14 +109,14 @@ def lay_mesh(surface: Surface, mesh: RegisteredMesh, guide: Guide) -> Registered
     beside = float(np.mean(off_m > limit_m)) if len(off_m) else 1.0
     place = _worst(deviation_m) * figures["step"]
     if best.cost > MOST_COST or beside > MOST_BESIDE:
-        if guide.pairs is not None and _best(surface, solid)[0].cost < MOST_COST:
+        if isinstance(guide, Pairs) and _best(surface, solid, refuse=False)[0].cost < MOST_COST:
             raise UsageError(
                 "mesh-pairs-wrong",
                 what="The mesh fits the object, but not where the pairs of points say.",
                 remedy="Choose them again: the same places on the mesh and in the camera's picture.",
             )
         mirror = SolidMesh(mesh.arrays["vertices"] * (-1.0, 1.0, 1.0), mesh.arrays["faces"])
-        if _best(surface, mirror)[0].cost < min(MOST_COST, 0.7 * best.cost):
+        if _best(surface, mirror, refuse=False)[0].cost < min(MOST_COST, 0.7 * best.cost):
             raise mirrored()
         raise WorkError(
             "mesh-does-not-fit",
@@ -140,14 +133,16 @@ def lay_mesh(surface: Surface, mesh: RegisteredMesh, guide: Guide) -> Registered
     return replace(mesh, arrays={**mesh.arrays, "deviation_m": deviation_m}, figures=figures)
 
 
-def _best(surface: Surface, solid: SolidMesh, guide: Guide | None = None) -> tuple[Alignment, Measured]:
-    """The best pose, and the measured points that it is judged by. Without a guide nothing is refused."""
-    pairs = None if guide is None else guide.pairs
+def _best(
+    surface: Surface, solid: SolidMesh, guide: Pose | Pairs | None = None, *, refuse: bool = True
+) -> tuple[Alignment, Measured]:
+    """The best pose, and the measured points that it is judged by."""
+    pairs = guide if isinstance(guide, Pairs) else None
     found: list[tuple[Alignment, Measured]] = []
     for mask in surface.parts():
         coarse, fine = (measured(surface.camera, surface.points_m, mask, n) for n in (COARSE_POINTS, FINE_POINTS))
-        if guide is not None and guide.start is not None:
-            starts = [guide.start]
+        if isinstance(guide, Pose):
+            starts = [guide]
         elif pairs is not None:
             starts = [refined(solid, coarse, pose_by_pairs(pairs), pairs=pairs, reach=0.25).pose]
         else:
@@ -157,7 +152,7 @@ def _best(surface: Surface, solid: SolidMesh, guide: Guide | None = None) -> tup
             break
     found.sort(key=lambda one: (one[0].cost > MOST_COST, one[0].looseness < LOOSEST, one[0].cost))
     best, fine = found[0]
-    if guide is None or guide.start is not None or pairs is not None or best.cost > MOST_COST:
+    if guide is not None or not refuse or best.cost > MOST_COST:
         return best, fine
     is_loose = best.looseness < LOOSEST
     if is_loose or any(
@@ -231,7 +226,7 @@ def carried_mesh(run: Path) -> RegisteredMesh | None:
     mesh = last_mesh(run)
     if mesh is not None and RegisteredMesh.read(run) is None:
         surface = Surface.read(run)
-        mesh = lay_mesh(surface, mesh, Guide(start=mesh.pose, limit_m=1e-3 * mesh.figures["limit_mm"]))
+        mesh = lay_mesh(surface, mesh, mesh.pose, 1e-3 * mesh.figures["limit_mm"])
         mesh = filled(surface, mesh) if "filled_at" in mesh.arrays else mesh
         mesh.write(run)
     return mesh

@@ -6,17 +6,15 @@ light, and alpha, with which the light is not multiplied.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 
-from controller.core import channels
 from controller.core.arrays import Float64, FloatImage, Mask, strips
 from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh, rays_of
-from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Pinhole
 from controller.optics.solve.targets.values import Target, through_camera
 from controller.optics.solve.targets.wrap import sampled
@@ -29,9 +27,6 @@ these change (N, 2, 2) one camera pixel to the right, and one down."""
 _SUBPIXELS: Final = 4
 _BESIDE_PX: Final = 8
 """Pixels of a sheet around its parts that get their colours, so that a soft brush and a filter find no black there."""
-_BEHIND: Final = 2e-3
-"""Of the mesh's size: a point this much farther away than what the camera sees there is hidden."""
-_MOST_GRAZING: Final = 0.15
 SIDES_PX: Final = (512, 4096)
 
 
@@ -108,14 +103,19 @@ def _mean(sheet: FloatImage, at: Float64, steps: Float64) -> FloatImage:
     """(N, 4): of 4 x 4 positions in each pixel."""
     rows, columns = sheet.shape[:2]
     total = np.zeros((len(at), 4), np.float32)
+    for *_, u, v in _positions(at, steps):
+        x, y = (u % 1) * columns - 0.5, ((1 - v) % 1) * rows - 0.5
+        total += sampled(sheet, x.astype(np.float32), y.astype(np.float32), border=cv2.BORDER_WRAP)
+    return total / np.float32(_SUBPIXELS**2)
+
+
+def _positions(at: Float64, steps: Float64) -> Iterator[tuple[float, float, Float64, Float64]]:
+    """4 x 4 positions in each camera pixel: to the right and down from its middle, and u, v; beyond 1 it repeats."""
     offsets = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
     for down in offsets:
         for right in offsets:
             u, v = (at + right * steps[:, 0] + down * steps[:, 1]).T
-            # a place beyond the sheet is on a repetition of it
-            x, y = (u % 1) * columns - 0.5, ((1 - v) % 1) * rows - 0.5
-            total += sampled(sheet, x.astype(np.float32), y.astype(np.float32), border=cv2.BORDER_WRAP)
-    return total / np.float32(_SUBPIXELS**2)
+            yield right, down, u, v
 
 
 def sheet_side(places: Places, mask: Mask) -> int:
@@ -129,41 +129,21 @@ def sheet_side(places: Places, mask: Mask) -> int:
     return int(2 ** np.ceil(np.log2(np.clip(side, *SIDES_PX))))
 
 
-def photographed(
-    picture: FloatImage, camera: Pinhole, mesh: SolidMesh, uv: FloatImage, pose: Pose, side: int
-) -> FloatImage:
-    """The sheet (side, side, 4) with the camera's ``picture`` (rows, columns, 3) where it sees the mesh, else clear."""
+def photographed(picture: FloatImage, places: Places, mask: Mask, side: int) -> FloatImage:
+    """The sheet (side, side, 4) with ``picture`` (rows, columns, 3) of the object in ``mask``, clear elsewhere."""
     from scipy.ndimage import distance_transform_edt
 
-    corners = uv - np.floor(uv.mean(axis=1, keepdims=True))
-    flat = SolidMesh(
-        np.pad(corners.reshape(-1, 2).astype(np.float64), ((0, 0), (0, 1))),
-        np.arange(3 * len(uv), dtype=np.int32).reshape(-1, 3),
-    )
-    # the sheet lies in the plane z = 0, and is seen from above its middle
-    above = Pose(1.0, np.diag([1.0, -1.0, -1.0]), np.array([-0.5, 0.5, 1.0]))
-    sheet: FloatImage = np.zeros((side, side, 4), np.float32)
-    across = (np.arange(side) + 0.5) / side - 0.5
-    for rows in strips(side):
-        y, x = (grid.ravel() for grid in np.meshgrid(across[rows], across, indexing="ij"))
-        rays = np.stack([x, y, np.ones_like(x)], axis=1)
-        face = flat.met_by(rays, above).face
-        use = np.flatnonzero(face >= 0)
-        if not len(use):
-            continue
-        share = flat.weights(rays[use], above, face[use])
-        points_m = pose.placed(np.einsum("nc,nck->nk", share, mesh.vertices[mesh.faces[face[use]]]))
-        px, depth = project(camera, points_m)
-        met = mesh.met_by(points_m / depth[:, None], pose)
-        facing = -channels.total(met.normals * points_m) / np.linalg.norm(points_m, axis=1)
-        with np.errstate(invalid="ignore"):
-            shown = (met.depth > depth - _BEHIND * mesh.size * pose.scale) & (facing > _MOST_GRAZING)
-            shown &= channels.every((px > -0.5) & (px < np.array(picture.shape[1::-1]) - 0.5))
-        colours = sampled(picture, px[shown, 0].astype(np.float32), px[shown, 1].astype(np.float32))
-        part = sheet[rows].reshape(-1, 4)
-        part[use[shown]] = np.column_stack([colours, np.ones(len(colours), np.float32)])
-    seen = sheet[..., 3] > 0
-    if seen.any():
-        far, nearest = distance_transform_edt(~seen, return_indices=True)
-        sheet = np.where((far <= _BESIDE_PX)[..., None], sheet[tuple(nearest)], sheet)
-    return sheet
+    total = np.zeros((side * side, 4))
+    for rows in strips(len(mask)):
+        y, x = np.nonzero(mask[rows])
+        at, steps = places(np.stack([x, y + rows.start], axis=1).astype(np.float64))
+        on = np.isfinite(at[:, 0])
+        for right, down, u, v in _positions(at[on], steps[on]):
+            texel = (((1 - v) % 1) * side).astype(np.int64) * side + ((u % 1) * side).astype(np.int64)
+            px_x, px_y = (x[on] + right).astype(np.float32), (y[on] + rows.start + down).astype(np.float32)
+            colours = sampled(picture, px_x, px_y)
+            for channel, values in enumerate([*colours.T, np.ones(len(texel))]):
+                total[:, channel] += np.bincount(texel, values, side * side)
+    sheet = (total / np.maximum(total[:, 3:], 1)).astype(np.float32).reshape(side, side, 4)
+    far, nearest = distance_transform_edt(sheet[..., 3] == 0, return_indices=True)
+    return np.where((far <= _BESIDE_PX)[..., None], sheet[tuple(nearest)], sheet)

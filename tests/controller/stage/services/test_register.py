@@ -25,7 +25,7 @@ from controller.run.progress import Silent
 from controller.run.step_id import StepId
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.artefacts.mesh import RegisteredMesh
-from controller.stage.services.register import MeshOrder, read_pairs, register
+from controller.stage.services.register import MeshOrder, register
 from controller.stage.steps.mesh import carried_mesh
 from hal.notices import Level
 
@@ -127,8 +127,7 @@ def off_px(stage: Path, factor: float = 1.0) -> Float64:
 def test_a_mesh_finds_its_place_by_itself(stage: Path, tmp_path: Path) -> None:
     figures = register(stage, MeshOrder(file_of(tmp_path, np.asarray(stone().vertices), name="stone.glb")), Silent())
     assert np.median(off_px(stage)) < 0.1
-    assert "in mm, 1.9" in figures["size"]
-    assert "smaller" in figures["size"]
+    assert "in mm, 0.980" in figures["size"]
     assert figures["map"].is_file()
 
 
@@ -144,15 +143,20 @@ def clicked(rng: np.random.Generator, vertices: Float64) -> list[list[float]]:
     return [[*vertices[n], px[n, 0] + one.real, px[n, 1] + one.imag] for n, one in zip(some, beside, strict=True)]
 
 
-def clicks(vertices: Float64) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, clicked(np.random.default_rng(5), vertices)))
+def pairs_file(folder: Path, pairs: Any) -> Path:
+    (folder / "pairs.json").write_text(json.dumps(np.asarray(pairs).tolist()))
+    return folder / "pairs.json"
+
+
+def clicks(folder: Path, vertices: Float64) -> Path:
+    return pairs_file(folder, clicked(np.random.default_rng(5), vertices))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_clicks_that_are_off_by_5_pixels_are_enough(stage: Path, tmp_path: Path, seed: int) -> None:
     vertices = 1.02 * np.asarray(stone().vertices)
-    (tmp_path / "pairs.json").write_text(json.dumps(clicked(np.random.default_rng(seed), vertices)))
-    register(stage, MeshOrder(file_of(tmp_path, vertices), pairs=read_pairs(tmp_path / "pairs.json")), Silent())
+    pairs = pairs_file(tmp_path, clicked(np.random.default_rng(seed), vertices))
+    register(stage, MeshOrder(file_of(tmp_path, vertices), pairs=pairs), Silent())
     assert np.median(off_px(stage, 1.02)) < 0.1
 
 
@@ -175,7 +179,7 @@ def test_a_mesh_that_is_like_itself_needs_clicks(tmp_path: Path) -> None:
     ]
     spots = points[some]
     file_places = (spots - TRUTH.shift_m) @ TRUTH.rotation / TRUTH.scale
-    pairs = tuple((*mine, *theirs) for mine, theirs in zip(file_places, px_of(spots), strict=True))
+    pairs = pairs_file(tmp_path, np.hstack([file_places, px_of(spots)]))
     register(stage, MeshOrder(file, pairs=pairs), Silent())
     mesh = RegisteredMesh.read(next((stage / "runs").glob("*")))
     assert mesh is not None
@@ -193,15 +197,15 @@ def test_a_mesh_of_another_object_is_refused_with_the_place(stage: Path, tmp_pat
 def test_a_mirrored_mesh_is_named(stage: Path, tmp_path: Path) -> None:
     mirror = np.asarray(stone().vertices) * (1, -1, 1)
     assert refused(stage, MeshOrder(file_of(tmp_path, mirror))).code == "mesh-mirrored"
-    pairs = tuple(
-        (pair[0], -pair[1], *pair[2:]) for pair in clicked(np.random.default_rng(5), np.asarray(stone().vertices))
+    pairs = np.array(clicked(np.random.default_rng(5), np.asarray(stone().vertices))) * (1, -1, 1, 1, 1)
+    assert (
+        refused(stage, MeshOrder(file_of(tmp_path, mirror), pairs=pairs_file(tmp_path, pairs))).code == "mesh-mirrored"
     )
-    assert refused(stage, MeshOrder(file_of(tmp_path, mirror), pairs=pairs)).code == "mesh-mirrored"
 
 
 def test_a_wrong_unit_is_told_with_the_right_one(stage: Path, tmp_path: Path) -> None:
     inches = np.asarray(stone().vertices) / 25.4
-    order = MeshOrder(file_of(tmp_path, inches), unit="mm", pairs=clicks(inches))
+    order = MeshOrder(file_of(tmp_path, inches), unit="mm", pairs=clicks(tmp_path, inches))
     error = refused(stage, order)
     assert (error.code, "inch" in error.remedy) == ("mesh-unit-wrong", True)
     assert "in inch" in register(stage, replace(order, unit=None), Silent())["size"]
@@ -211,7 +215,11 @@ def test_flipped_faces_and_holes_are_told_and_do_no_harm(stage: Path, tmp_path: 
     vertices, faces = np.asarray(stone().vertices), np.asarray(stone().faces)
     facing = np.linalg.norm(TRUTH.placed(vertices)[faces].mean(axis=1) - TRUTH.shift_m + (0, 0, 0.09), axis=1)
     said = Said()
-    register(stage, MeshOrder(file_of(tmp_path, vertices, faces[facing > 0.035, ::-1]), pairs=clicks(vertices)), said)
+    register(
+        stage,
+        MeshOrder(file_of(tmp_path, vertices, faces[facing > 0.035, ::-1]), pairs=clicks(tmp_path, vertices)),
+        said,
+    )
     assert np.median(off_px(stage)) < 0.1
     assert any("inwards" in text for text in said.warnings)
     assert any("holes" in text for text in said.warnings)
@@ -225,7 +233,7 @@ def test_what_is_not_measured_is_filled_only_when_asked_and_only_where_both_agre
     changed[118:122, 158:162] = np.nan
     write_run(stage, run.name, changed)
     vertices = np.asarray(stone().vertices)
-    order = MeshOrder(file_of(tmp_path, vertices), pairs=clicks(vertices))
+    order = MeshOrder(file_of(tmp_path, vertices), pairs=clicks(tmp_path, vertices))
     said = Said()
     register(stage, order, said)
     assert any("the measurement counts" in text for text in said.warnings)
@@ -245,7 +253,7 @@ def test_what_is_not_measured_is_filled_only_when_asked_and_only_where_both_agre
 
 def test_a_later_calibration_takes_the_mesh_over(stage: Path, tmp_path: Path) -> None:
     vertices = np.asarray(stone().vertices)
-    register(stage, MeshOrder(file_of(tmp_path, vertices), pairs=clicks(vertices)), Silent())
+    register(stage, MeshOrder(file_of(tmp_path, vertices), pairs=clicks(tmp_path, vertices)), Silent())
     later = write_run(stage, "20260102-000000-recalibrate", measured() * np.float32(1.005))
     mesh = carried_mesh(later)
     assert mesh is not None
@@ -267,14 +275,23 @@ def test_a_file_without_a_surface_is_named(stage: Path, tmp_path: Path, text: st
 
 
 def test_pairs_that_are_none_are_named(stage: Path, tmp_path: Path) -> None:
-    path = tmp_path / "pairs.json"
-    for text in ("", "[[1, 2, 3, 4, 5]]", "[[1, 2, 3], [1, 2, 3], [1, 2, 3]]", '{"a": 1}', '[["a"], ["b"], ["c"]]'):
+    vertices, path = np.asarray(stone().vertices), tmp_path / "pairs.json"
+    order = MeshOrder(file_of(tmp_path, vertices), pairs=path)
+    assert refused(stage, order).code == "mesh-pairs-file", "it is missing"
+    for text in (
+        "",
+        "[]",
+        "[[1, 2, 3], [1, 2, 3], [1, 2, 3]]",
+        '{"a": 1}',
+        '[["a"], ["b"], ["c"]]',
+        "[[1, 2, 3, 4, NaN]]",
+    ):
         path.write_text(text)
-        with pytest.raises(VelaturaError) as error:
-            read_pairs(path)
-        assert error.value.code == "mesh-pairs-file"
-    beside = ((0.0, 0.0, 0.0, 5.0, 5.0), (1.0, 0.0, 0.0, 9.0, 5.0), (0.0, 1.0, 0.0, 9.0, 9.0))
-    assert (
-        refused(stage, MeshOrder(file_of(tmp_path, np.asarray(stone().vertices)), pairs=beside)).code
-        == "mesh-pair-beside"
-    )
+        assert refused(stage, order).code == "mesh-pairs-file", text
+    pairs_file(tmp_path, [[0, 0, 0, 5, 5], [1, 0, 0, 9, 5], [0, 1, 0, 9, 9]])
+    assert refused(stage, order).code == "mesh-pair-beside"
+    right = clicked(np.random.default_rng(5), vertices)
+    pairs_file(tmp_path, right[:2])
+    assert refused(stage, order).code == "mesh-pairs-flat"
+    pairs_file(tmp_path, np.hstack([np.array(right)[:, :3], np.roll(right, 1, axis=0)[:, 3:]]))
+    assert refused(stage, order).code in ("mesh-pairs-wrong", "mesh-mirrored")

@@ -156,7 +156,7 @@ def test_an_exported_sheet_brings_the_object_back_as_it_was() -> None:
     places = mesh_places(MESH, UV, POSE, CAMERA)
     side = sheet_side(places, met)
     assert side == 512
-    sheet = photographed(picture, CAMERA, MESH, UV, POSE, side)
+    sheet = photographed(picture, places, met, side)
     assert 0.2 < sheet[..., 3].mean() < 0.7, "the far side is clear"
     image = texture(sheet, places, picture, met).image
     inside = cv2.erode(met.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
