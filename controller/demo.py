@@ -8,7 +8,7 @@ import re
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from controller.stage.artefacts.solved import RequestedTarget, read_solved
 from controller.stage.report.demo import write_demo_report
 from controller.stage.rig.rig import Rig
 from controller.stage.services.calibrate import calibrating, publishing
+from controller.stage.services.register import MeshOrder, register_in
 from controller.stage.sessions.bench import BenchProcess, bench_of
 from controller.stage.sessions.calibrations import KEY_FILE, worst_grade
 from controller.stage.sessions.check import Checked, check_stage
@@ -71,6 +72,9 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "checkerboard", "kind": "checkerboard"},
     {"name": "gloss", "kind": "gloss"},
 )
+PAINTED: tuple[dict[str, Any], ...] = ({"name": "painted", "kind": "texture", "file": "colours.png"}, *APPEARANCES[2:])
+"""Of a statue: its old colours on the sheet of its scan, which is laid on it before."""
+SCAN = "statue.glb"
 IN_OTHER_LIGHT: tuple[dict[str, Any], ...] = (
     {"name": "evening", "kind": "recolour", "tint": [1.0, 0.62, 0.36]},
     {"name": "moonlight", "kind": "recolour", "tint": [0.42, 0.60, 1.0]},
@@ -98,7 +102,9 @@ class DemoStage:
 
     @property
     def appearances(self) -> tuple[dict[str, Any], ...]:
-        return IN_OTHER_LIGHT if self.projectors == 1 or self.built_in not in (None, "statue") else APPEARANCES
+        if self.projectors == 1 or self.built_in not in (None, "statue"):
+            return IN_OTHER_LIGHT
+        return APPEARANCES if self.built_in is None else PAINTED
 
     @property
     def object_file(self) -> Path | None:
@@ -229,7 +235,11 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
     """Calibrate, solve, refine, publish, photograph, compare with one projector, swap."""
     stage = checked.stage
     calibrated = Calibrated(run, checked.names, engine)
-    requests = requests_of(stage, calibrated)
+    scan = stage.path(SCAN)
+    requests = [
+        replace(one, prepare=partial(_lay_scan, scan)) if one.inputs["kind"] == "texture" else one
+        for one in requests_of(stage, calibrated)
+    ]
     names = [request.name for request in requests]
     table = stage.tables.solve
     options = options_of(table)
@@ -257,6 +267,11 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
         playback_step(rig, names, seconds=PLAYBACK_S),
         marker("played", "Played", leave=Event.PAUSE),
     ]
+
+
+def _lay_scan(scan: Path, context: Context) -> Sequence[Path]:
+    """Lay the mesh that the object's owner has of it on the object. Raises as ``register_in``."""
+    return [register_in(context.folder, MeshOrder(scan), context.reporter)["map"]]
 
 
 def _one_projector_steps(

@@ -43,13 +43,17 @@ class MeshOrder:
 
 
 def register(stage: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str, Any]:
-    """Lay the mesh on the object, and write it with its figures into the run of the newest calibration.
+    """Lay the mesh on the object of the newest calibration. Raises as ``register_in`` and ``finished_calibration``."""
+    return register_in(finished_calibration(stage), order, reporter)
+
+
+def register_in(run: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str, Any]:
+    """Lay the mesh on the object, and write it with its figures into ``run``, whose geometry is known.
 
     Raises UsageError("mesh-unreadable", "mesh-no-faces", "mesh-unit-wrong", "mesh-pairs-file", "mesh-pair-beside"), and
-    as ``lay_mesh``, ``Surface.read`` and ``finished_calibration``. Nothing is written then.
+    as ``lay_mesh`` and ``Surface.read``. Nothing is written then.
     """
     mesh = _read(order.mesh)
-    run = finished_calibration(stage)
     surface = Surface.read(run)
     pairs = None if order.pairs is None else _pairs(order.pairs, surface)
     limit_m = None if order.limit_mm is None else 1e-3 * order.limit_mm

@@ -177,7 +177,8 @@ def _check_sheet(
     sheet = read_picture(file, options.get("colour"), soft=True)
     height, width = sheet.shape[:2]
     size_px, identity = calibrated.camera_px, "camera"
-    if options.get("uv", "mesh") == "mesh":
+    # A run that calibrates first has neither camera picture nor mesh yet.
+    if options.get("uv", "mesh") == "mesh" and size_px is not None:
         require_shape(calibrated.folder, "A texture on a mesh")
         mesh = carried_mesh(calibrated.folder)
         if mesh is None or mesh.uv is None:
