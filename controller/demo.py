@@ -72,14 +72,21 @@ APPEARANCES: tuple[dict[str, Any], ...] = (
     {"name": "checkerboard", "kind": "checkerboard"},
     {"name": "gloss", "kind": "gloss"},
 )
-PAINTED: tuple[dict[str, Any], ...] = ({"name": "painted", "kind": "texture", "file": "colours.png"}, *APPEARANCES[2:])
-"""Of a statue: its old colours on the sheet of its scan, which is laid on it before."""
-SCAN = "statue.glb"
 IN_OTHER_LIGHT: tuple[dict[str, Any], ...] = (
     {"name": "evening", "kind": "recolour", "tint": [1.0, 0.62, 0.36]},
     {"name": "moonlight", "kind": "recolour", "tint": [0.42, 0.60, 1.0]},
 )
-"""Of an object whose shape is not measured: one that is flat, or that one projector lights."""
+"""Of an object whose shape may not be measured: by one projector, or because it has none to speak of."""
+RESTORED = (
+    {"name": "restored", "kind": "restoration", "file": "original.png", "outside": "as-is"},
+    *IN_OTHER_LIGHT[:1],
+)
+PAINTED = ({"name": "painted", "kind": "texture", "file": "colours.png"}, *APPEARANCES[2:])
+"""Of a statue: its old colours on the sheet of its scan, which is laid on it before."""
+SCAN = "statue.glb"
+OF_OBJECT: Mapping[str | None, tuple[dict[str, Any], ...]] = {
+    None: APPEARANCES, "painting": RESTORED, "relief": RESTORED, "statue": PAINTED,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +109,8 @@ class DemoStage:
 
     @property
     def appearances(self) -> tuple[dict[str, Any], ...]:
-        if self.projectors == 1 or self.built_in not in (None, "statue"):
-            return IN_OTHER_LIGHT
-        return APPEARANCES if self.built_in is None else PAINTED
+        its = OF_OBJECT.get(self.built_in, IN_OTHER_LIGHT)
+        return IN_OTHER_LIGHT if self.projectors == 1 and its is not RESTORED else its
 
     @property
     def object_file(self) -> Path | None:

@@ -176,22 +176,20 @@ def statue() -> Model:
 
 def corner() -> Model:
     """Two walls of a room that meet at 110 degrees."""
-
-    def walls(u: Floats, v: Floats) -> tuple[Floats, ...]:
-        across = 0.18 * (2 * u - 1)
-        return across, 0.14 * (2 * v - 1), np.abs(across) / np.tan(0.5 * OPENING)
-
-    return Model(_facets(_sheet(2, 3, walls)), _marble(0.15))
+    deep = 0.18 / np.tan(0.5 * OPENING)
+    walls = _sheet(2, 3, lambda u, v: (0.18 * (2 * u - 1), 0.14 * (2 * v - 1), deep * np.abs(2 * u - 1)))
+    return Model(_facets(walls), _marble(0.15))
 
 
 def cylinder(radius: float = 0.1, high: float = 0.28, x: float = 0.0) -> Model:
     """A column."""
-    return Model((_round(lambda v: (radius + 0 * v, high * (v - 0.5)), x),), _marble(0.15))
+    return Model((_round(x, lambda v: radius + 0 * v, lambda v: high * (v - 0.5)),), _marble(0.15))
 
 
 def sphere(radius: float = 0.14, x: float = 0.0) -> Model:
     """A ball."""
-    return Model((_round(lambda v: (radius * np.sin(np.pi * v), -radius * np.cos(np.pi * v)), x),), _marble(0.15))
+    part = _round(x, lambda v: radius * np.sin(np.pi * v), lambda v: -radius * np.cos(np.pi * v))
+    return Model((part,), _marble(0.15))
 
 
 def two_objects() -> Model:
@@ -224,14 +222,10 @@ def _facets(part: Part) -> tuple[Part, ...]:
     return tuple(Part(part.points[at] + step, part.uv[at]) for at, step in zip(windows, out, strict=True))
 
 
-def _round(profile: Callable[[Floats], tuple[Floats, Floats]], x: float) -> Part:
-    """A surface of revolution: ``profile`` gives radius and height."""
-
-    def surface(u: Floats, v: Floats) -> tuple[Floats, ...]:
-        radius, height = profile(v)
-        return x - radius * np.sin(2 * np.pi * u), height, -radius * np.cos(2 * np.pi * u)
-
-    return _sheet(120, 241, surface)
+def _round(x: float, radius: Callable[[Floats], Floats], height: Callable[[Floats], Floats]) -> Part:
+    """A surface of revolution."""
+    turn = 2.0 * np.pi
+    return _sheet(120, 241, lambda u, v: (x - radius(v) * np.sin(turn * u), height(v), -radius(v) * np.cos(turn * u)))
 
 
 def _marble(strength: float) -> Rgb:

@@ -150,7 +150,7 @@ def test_a_bare_word_is_a_built_in_object_and_all_else_a_mesh(bench: ModelBench,
     assert bench.settings == [{"room": DEFAULT_ROOM, "object": "painting", "projectors": 2}]
     tables = load_stage(stage).tables
     assert tables.stage.name == "demo small painting"
-    assert [one.kind for one in tables.appearances] == ["recolour", "recolour"]
+    assert [one.kind for one in tables.appearances] == ["restoration", "recolour"]
     assert prepared(tmp_path / "out", thing="painting", projectors=2) == stage
     with pytest.raises(UsageError):
         prepared(tmp_path / "out", thing="statue", projectors=2)
@@ -158,6 +158,25 @@ def test_a_bare_word_is_a_built_in_object_and_all_else_a_mesh(bench: ModelBench,
         with pytest.raises(UsageError) as refused:
             prepared(tmp_path / "other", thing=path)
         assert refused.value.code == "object-missing"
+
+
+@pytest.mark.parametrize(
+    ("thing", "kinds"),
+    [
+        (None, {"photograph", "pattern", "checkerboard", "gloss"}),
+        ("painting", {"restoration", "recolour"}),
+        ("relief", {"restoration", "recolour"}),
+        ("statue", {"texture", "checkerboard", "gloss"}),
+        ("corner", {"recolour"}),
+    ],
+)
+def test_each_object_gets_appearances_of_its_own_and_none_that_needs_a_shape_from_one_projector(
+    bench: ModelBench, tmp_path: Path, thing: str | None, kinds: set[str]
+) -> None:
+    stages = [prepared(tmp_path / str(count), thing=thing, projectors=count) for count in (None, 1)]
+    whole, alone = ({one.kind for one in load_stage(stage).tables.appearances} for stage in stages)
+    assert whole == kinds
+    assert alone == (kinds if "restoration" in kinds else {"recolour"})
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, get_type_hints
@@ -77,7 +78,9 @@ def requests_of(stage: Stage, calibrated: Calibrated, names: Sequence[str] = ())
             if tables
             else 'Add one with name and kind, for example kind = "gloss".',
         )
-    return [_request(stage, tables[name], calibrated) for name in (names or tables)]
+    made = [_request(stage, tables[name], calibrated) for name in (names or tables)]
+    titles = [one.title for one in made]
+    return [replace(one, title=f"{one.title}: {one.name}") if titles.count(one.title) > 1 else one for one in made]
 
 
 def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> AppearanceRequest:
