@@ -83,7 +83,7 @@ RESTORED = (
 )
 PAINTED = ({"name": "painted", "kind": "texture", "file": "colours.png"}, *APPEARANCES[2:])
 """Of a statue: its old colours on the sheet of its scan, which is laid on it before."""
-SCAN = "statue.glb"
+SCAN, LAY_S = "statue.glb", 10.0
 OF_OBJECT: Mapping[str | None, tuple[dict[str, Any], ...]] = {
     None: APPEARANCES, "painting": RESTORED, "relief": RESTORED, "statue": PAINTED,
 }  # fmt: skip
@@ -243,7 +243,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
     calibrated = Calibrated(run, checked.names, engine)
     scan = stage.path(SCAN)
     requests = [
-        replace(one, prepare=partial(_lay_scan, scan)) if one.inputs["kind"] == "texture" else one
+        replace(one, prepare=partial(_lay_scan, scan), prepare_s=LAY_S) if one.inputs["kind"] == "texture" else one
         for one in requests_of(stage, calibrated)
     ]
     names = [request.name for request in requests]

@@ -73,7 +73,7 @@ def _rows(folder: Path, size: str, thing: str, seeds: Sequence[int]) -> list[Row
             continue
         shape = read_geometry_figures(run).get("shape", "surface")
         said.append(f"grade {grade_figures(run)['grade']} and {shape} with {len(check_stage(stage).names)} projectors")
-        figures.append(judged(stage, run, (PICTURE,), REFINED))
+        figures.append(judged(stage, run, (PICTURE,), tuple(REFINED)))
     rows = [at_least(f"{thing}, calibrated", len(figures), len(seeds), unit="stages", how="; ".join(said))]
     for photographs, goals in REFINED.items() if figures else ():
         for key, goal in zip(("median", "95"), goals, strict=True):
