@@ -269,10 +269,11 @@ class CalibratedRun:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """Poses and surface: ``points_m`` (camera rows, columns, 3) float32, metres in the camera's frame."""
-        geometry = read_geometry(self.folder)
-        poses = dict(zip(projectors_of(self.folder), geometry.projectors, strict=True))
-        return replace(geometry, projectors=tuple(poses[name] for name in self.projectors))
+        """Poses and surface: ``points_m`` (camera rows, columns, 3) float32, metres in the camera's frame.
+
+        Errors: ``shape-unknown``.
+        """
+        return read_geometry(self.folder, self.projectors)
 
     @cached_property
     def camera(self) -> CameraProfile | None:

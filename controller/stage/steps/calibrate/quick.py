@@ -120,7 +120,7 @@ def reuse_of(step: StepId, drift: Drift, mode: str = "fast") -> Reuse:
         return Reuse.KEEP
     if step.kind == StepKind.BLACK:
         return Reuse.RUN
-    if step.kind == StepKind.GEOMETRY:
+    if step.kind in (StepKind.SHAPE, StepKind.GEOMETRY):
         return Reuse.RUN if drift.moved else Reuse.KEEP
     for moved in drift.projectors:
         if step.projector == moved.name:

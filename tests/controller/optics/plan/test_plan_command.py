@@ -37,6 +37,7 @@ def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball
     assert 0 < figures["wave_mm_all"] <= figures["wave_mm_one"]
     page = Path(result["plan"]).read_text()
     assert "Finest wave" in page
+    assert "nothing is superimposed" not in page
     assert not re.search(r"https?:|<script|<link", page)
     assert page.count("data:image/") == 1 + 5
     assert all(one["place"] in page for one in figures["projectors"])
@@ -54,4 +55,5 @@ def test_a_sheet_that_one_place_of_the_audience_sees_edge_on_is_planned_and_that
     result = plan(file=file, out=tmp_path, reporter=Listening(), cancel=threading.Event())
     page = Path(result["plan"]).read_text()
     assert page.count("no surface of it is visible") == 1
+    assert "With one projector nothing is superimposed" in page
     assert page.count("data:image/") == 1 + 5

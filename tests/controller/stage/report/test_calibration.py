@@ -15,10 +15,12 @@ import pytest
 
 from controller.bundle.describe import png
 from controller.core.arrays import save_arrays
-from controller.core.errors import TroubleCode, UsageError
+from controller.core.errors import CalibrationError, TroubleCode, UsageError
+from controller.optics.calibrate.geometry.shape import FoundShape
 from controller.run.journal import Journal
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_calibration
+from controller.stage.artefacts.geometry import write_geometry
 from controller.stage.artefacts.grade import ErrorMaps, write_grade, write_troubles
 from controller.stage.artefacts.projectors import Light, PixelFigures, write_radiometry_figures
 from controller.stage.report import plots
@@ -151,6 +153,21 @@ def test_the_finest_projector_gives_the_resolution(run: Path) -> None:
     found = resolution_px(read_calibration(run, NAMES))
     assert np.nanmedian(found) == pytest.approx(1.0, abs=0.02)
     assert float(size_px(np.array([4.0, 0.0, 9.0], np.float32))) == pytest.approx(6**0.5)
+
+
+def test_a_report_says_why_there_is_no_shape_and_shows_no_depth(tmp_path: Path) -> None:
+    made = write_run(tmp_path / "runs", "20260103-100000-calibrate", (2.0, 3.0))
+    why = CalibrationError("scene-flat", what="The scene is flat.", remedy="Add depth.")
+    write_geometry(made, NAMES, FoundShape("unknown", CAMERA[::-1], why=why))
+    seen = Seen()
+    seen.feed(write_calibration_report(made, ASKED).read_text())
+    text = re.sub(r"\s+", " ", seen.text)
+    assert "Shape unknown" in text
+    assert "The scene is flat. Add depth." in text
+    assert "metres from the camera" not in text
+    figures = json.loads((made / "report.json").read_text())
+    assert figures["shape"]["code"] == "scene-flat"
+    assert figures["geometry"]["reprojection_rms_px"] is None
 
 
 def test_a_run_without_a_grade_is_refused(tmp_path: Path) -> None:
