@@ -42,17 +42,14 @@ MOST_SIGMAS: Final = 4.0
 LEAST_SIGMAS: Final = np.array([3e-4, 0.3, 0.3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
 """What a printed board that is not quite flat leaves uncertain of ``PARAMETERS``, however many corners there are."""
 TERMS: Final = {
-    "stretch": ((8,), 0),
-    "aspect": ((7,), cv2.CALIB_FIX_ASPECT_RATIO),
+    "aspect": ((7, 8), cv2.CALIB_FIX_ASPECT_RATIO),
     "tangential": ((5, 6), cv2.CALIB_ZERO_TANGENT_DIST),
     "k2": ((4,), cv2.CALIB_FIX_K2),
 }
 """What a fit can have beside focal length, centre and k1: columns of ``_LensFit.columns``, OpenCV's flag without it.
 
-Stretch is the board's: a printer that makes one side longer.
+The aspect is that of the pixels and that of the board, of which a printer may make one side longer.
 """
-UNDECIDED: Final = 10.0
-"""Difference of two information criteria below which the corners do not choose between two causes."""
 
 Grey = npt.NDArray[np.uint8]
 
@@ -90,7 +87,7 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
     corners, or "camera-lens-unlike": they are off in whole areas, or two causes explain them alike).
     """
     _require_enough(views)
-    fit = _fit_lens(views, size_px, ("aspect", "tangential", "k2"))
+    fit = _fit_lens(views, size_px, tuple(TERMS))
     scatter = float(np.sqrt(np.mean([np.mean(off**2) for off in fit.off_px])))
     kept = [_trimmed(view, off, MOST_SIGMAS * max(scatter, 0.02)) for view, off in zip(views, fit.off_px, strict=True)]
     kept = [view for view in kept if len(view.board) >= FEWEST_CORNERS]
@@ -112,7 +109,7 @@ def calibrate_views(views: Sequence[BoardView], size_px: tuple[int, int]) -> Cam
             "separated.",
             remedy="Turn the board by 20 to 45 degrees to the left, right, up and down between photographs.",
         )
-    used = 8 if set(fit.terms) - {"stretch"} else 4
+    used = 8 if fit.terms else 4
     return CameraIntrinsics(
         size_px=size_px,
         focal_px=float(fit.matrix[0, 0]),
@@ -143,27 +140,23 @@ class _LensFit:
         """Columns that were fitted."""
         return [0, 1, 2, 3, *sorted(column for name in self.terms for column in TERMS[name][0])]
 
-    @property
-    def criterion(self) -> float:
-        """Schwarz's information criterion: of two fits of the same corners the lower is the likelier one."""
-        return self._criterion(0.0, len(self.free))
+    def criterion(self, *, with_all: bool = False) -> float:
+        """Schwarz's information criterion: of two fits of the same corners the lower is the likelier one.
 
-    @property
-    def asks_for_more(self) -> bool:
-        """Whether all terms together would be likelier, by how the squares fall where they begin."""
-        inverse, gradient = self.inverse(range(9))
-        return self._criterion(float(gradient @ inverse @ gradient), 9) < self.criterion
-
-    def _criterion(self, less: float, terms: int) -> float:
-        off = np.concatenate([off.ravel() for off in self.off_px])
-        return float(off.size * np.log(max(np.sum(off**2) - less, 1e-12)) + terms * np.log(off.size))
+        ``with_all``: of the fit with all terms, as far as the slope of the squares tells it
+        """
+        off, terms = np.concatenate([off.ravel() for off in self.off_px]), len(self.free)
+        squares = float(np.sum(off**2))
+        if with_all:
+            inverse, gradient = self.inverse(range(9))
+            squares, terms = squares - float(gradient @ inverse @ gradient), 9
+        return float(off.size * np.log(max(squares, 1e-12)) + terms * np.log(off.size))
 
     def columns(self, view: BoardView, turn: Float64, move: Float64) -> tuple[Float64, Float64]:
         """Derivatives of a view's corners by its pose (n, 6), and (n, 9) by ``PARAMETERS`` and the board's stretch."""
-        places, jacobian = cv2.projectPoints(view.board, turn, move, self.matrix, self.distortion)
-        longer = view.board * np.array([1 + STEP, 1, 1], np.float32)
-        moved = cv2.projectPoints(longer, turn, move, self.matrix, self.distortion)[0]
-        stretch = np.asarray((moved - places).reshape(-1, 1) / STEP, np.float64)
+        _, jacobian = cv2.projectPoints(view.board, turn, move, self.matrix, self.distortion)
+        # a corner that moves along the board does as if the board moved
+        stretch = (jacobian[:, 3:6] @ cv2.Rodrigues(turn)[0][:, :1]) * np.repeat(view.board[:, :1], 2, axis=0)
         by_aspect = jacobian[:, 7:8] * self.matrix[1, 1]
         focal = jacobian[:, 6:7] * self.matrix[0, 0] + by_aspect
         return np.asarray(jacobian[:, :6]), np.hstack([focal, jacobian[:, 8:14], by_aspect, stretch])
@@ -179,7 +172,7 @@ class _LensFit:
             information += lens.T @ lens - cross.T @ np.linalg.solve(pose.T @ pose, cross)
         scale = 1.0 / np.sqrt(np.diag(information))
         inverse = np.zeros((9, 9))
-        solved = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        solved = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True)
         inverse[np.ix_(free, free)] = solved * np.outer(scale, scale)
         return inverse, gradient
 
@@ -190,30 +183,19 @@ class _LensFit:
         return self.inverse(self.free)[0][:8, :8] * squares / max(measured, 1)
 
 
-STEP: Final = 1e-3
-
-
 def _simplest(views: Sequence[BoardView], size_px: tuple[int, int]) -> _LensFit:
     """The lens with as many terms as the corners ask for.
 
     Raises CalibrationError("camera-lens-unlike") where they do not tell a stretched board from pixels not square.
     """
     fit = _fit(views, size_px)
-    if not fit.asks_for_more:
-        return fit
-    fit = min(fit, _fit(views, size_px, tuple(TERMS)), key=lambda one: one.criterion)
+    if fit.criterion(with_all=True) < fit.criterion():
+        fit = min(fit, _fit(views, size_px, tuple(TERMS)), key=_LensFit.criterion)
     for name in fit.terms:
         less = _fit(views, size_px, tuple(term for term in fit.terms if term != name))
-        if less.criterion <= fit.criterion:
-            fit = less
-    if ("stretch" in fit.terms) == ("aspect" in fit.terms):
+        fit = min(less, fit, key=_LensFit.criterion)
+    if fit.covariance()[7, 7] < LARGEST_FOCAL_REL_SIGMA**2:
         return fit
-    other = {"stretch": "aspect", "aspect": "stretch"}
-    if _fit(views, size_px, tuple(other.get(name, name) for name in fit.terms)).criterion > fit.criterion + UNDECIDED:
-        return fit
-    both = _fit(views, size_px, tuple(name for name in TERMS if name in (*fit.terms, *other)))
-    if both.covariance()[7, 7] < LARGEST_FOCAL_REL_SIGMA**2:
-        return both
     raise CalibrationError(
         "camera-lens-unlike",
         what="Either the camera's pixels are not square, or the board is longer on one side than the other.",
@@ -270,7 +252,7 @@ def _require_enough(views: Sequence[BoardView]) -> None:
 
 def _fit(views: Sequence[BoardView], size_px: tuple[int, int], terms: tuple[str, ...] = ()) -> _LensFit:
     fit = _fit_lens(views, size_px, terms)
-    for _ in range(3 * ("stretch" in terms)):
+    for _ in range(3 * ("aspect" in terms)):
         inverse, gradient = fit.inverse(fit.free)
         longer = np.array([np.clip(1 - inverse[8, 8] * gradient[8], 0.9, 1.1), 1, 1], np.float32)
         fit = _fit_lens([BoardView(view.board * longer, view.seen_px) for view in fit.views], size_px, terms)

@@ -140,14 +140,17 @@ def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_whe
     tmp_path: Path, blender: Blender
 ) -> None:
     geometry, light = ball()
-    mask, seen, notes = known(geometry), [], []
+    mask, seen = known(geometry), []
+    notes: list[tuple[str, float, str]] = []
     for name, changes in (("metres", PLAIN), ("millimetres", MOVED)):
         folder = tmp_path / name
         folder.mkdir()
         (folder / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{changes}{LAMP}{SAVE}"))
         subprocess.run([blender.command[0], str(folder / "make.py"), str(folder / "own.blend")], check=True)
         write_job(folder, geometry, mask, light, scene=folder / "own.blend", settings=QUICK)
-        rendered = render(blender, folder, lambda share, note, name=name: notes.append((name, share, note)))
+        told: list[tuple[float, str]] = []
+        rendered = render(blender, folder, lambda share, note, told=told: told.append((share, note)))
+        notes += [(name, share, note) for share, note in told]
         target = as_seen(read_picture(rendered), geometry.camera, mask)
         seen.append(target.image[mask].max(axis=1))
     assert all((one > 0).mean() > 0.95 for one in seen)
