@@ -47,7 +47,9 @@ def test_indirect_light_goes_with_one_photograph_and_a_kill_costs_none(
         assert len(taken) == 3
         outcome = velatura("appearance", stage, NAME, "--refine", "1")
         assert outcome.code == 0, outcome.records[-1]
-        assert shots(run) == taken, "the killed run's photographs are used"
+        kept = shots(run)
+        assert {file: kept[file] for file in taken} == taken, "the killed run's photographs are used"
+        assert len(kept) == 2 * 3, "one photograph corrects, the next one confirms"
         assert outcome.records[-1]["result"]["refined"].startswith(f"Refined {NAME}: ")
         assert photographed(stage) < LEFT * undisturbed
         assert set(powers(stage).values()) <= {Power.OFF, Power.COOLING}
