@@ -372,3 +372,46 @@ def test_the_filter_drops_noise_and_keeps_an_edge_better_than_one_gaussian() -> 
     kept, blurred = without_noise(step + noise, sigma, mask), masked_blur(step + noise, mask, 2.0)
     assert np.abs(kept - step).mean() < np.abs(blurred - step).mean()
     assert (kept[:, 61] - kept[:, 58]).mean() > (blurred[:, 61] - blurred[:, 58]).mean()
+
+
+def looked_at(found: Result, light: FloatImage) -> tuple[Mask, str | None]:
+    """What of a photograph of this light is trusted, and why it is refused."""
+    seen = found.photograph(found.frames, lambda _: light)
+    predicted = found.predicted(found.frames)
+    parts = [found.transport.forward_part(n, frame) for n, frame in enumerate(found.frames)]
+    trusted = trusted_pixels(seen, predicted, found.stage, found.mask, parts)
+    return trusted, refusal(seen, predicted, found.stage, found.mask, trusted)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.9])
+@pytest.mark.parametrize("projector", [0, 1])
+def test_somebody_in_a_projector_s_light_is_not_believed_even_before_most_of_the_object(
+    share: float, projector: int
+) -> None:
+    found = result()
+    columns = round(share * CAMERA[1])
+    light = found.seen(found.frames)
+    light[:, :columns] -= 0.95 * found.transport.forward_part(projector, found.frames[projector])[:, :columns]
+    trusted, why = looked_at(found, light)
+    assert trusted[:, : columns - 4].mean() < 0.05
+    assert (why is not None) is (share > 0.3)
+
+
+@pytest.mark.parametrize("first", [12, 40])
+@pytest.mark.parametrize("brightness", [0.45, 1.6])
+def test_somebody_before_most_of_the_object_is_not_believed(brightness: float, first: int) -> None:
+    found = result()
+    light = found.seen(found.frames)
+    light[:, first:] = brightness * float(np.median(light))
+    _, why = looked_at(found, light)
+    assert why is not None
+
+
+@pytest.mark.parametrize("gains", [(0.75, 0.75), (0.6, 1.0), (1.1, 1.1)])
+def test_lamps_that_are_darker_or_brighter_everywhere_are_believed(gains: tuple[float, float]) -> None:
+    found = result()
+    parts = [np.float32(gain) * found.transport.forward_part(n, frame)
+             for n, (gain, frame) in enumerate(zip(gains, found.frames, strict=True))]  # fmt: skip
+    trusted, why = looked_at(found, np.asarray(parts[0] + parts[1] + found.calibration.black, np.float32))
+    assert why is None
+    assert trusted[found.mask].mean() > 0.9

@@ -249,6 +249,14 @@ def test_a_correction_that_made_it_worse_is_taken_back(stage: Stage) -> None:
     assert same(stage.present(), stage.solved)
 
 
+def test_a_correction_that_no_photograph_confirms_is_taken_back(stage: Stage) -> None:
+    stage.camera.lights = [indirect, dark]
+    figures = stage.refine(1)
+    assert figures["photographs"][1:] == [{"refused": "it is too dark"}]
+    assert same(stage.present(), stage.solved)
+    assert stage.told.said[-1] == f"{NAME} stays as it was: no photograph confirmed a correction (2 photographs)."
+
+
 def test_light_that_passes_over_all_of_the_object_is_not_burnt_in(stage: Stage) -> None:
     """It is no outlier anywhere; the next photograph, without it, puts that right."""
 
