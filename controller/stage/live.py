@@ -136,7 +136,6 @@ class VideoSource:
 
 
 UNLIKE_SRGB: Final = re.compile("2020|2084|2100|428|431|P3|PQ|HLG|XYZ|Adobe|Linear|Log", re.IGNORECASE)
-"""Of the names of colours in ``pymediainfo``."""
 
 
 def _opened(path: Path) -> cv2.VideoCapture:

@@ -115,6 +115,8 @@ def _text(data: bytes) -> str:
 
 def plain_obj(text: str) -> str:
     """A Wavefront OBJ file whose faces are triangles with absolute indices, and whose colours are in [0, 1]."""
+    if re.search(r"(?m)^[ \t]*f[^\n#]*\s0(?=[/\s]|$)", text):
+        raise MeshUnreadable("a face has the corner 0, and OBJ counts from 1")
     counts = {"v": 0, "vt": 0, "vn": 0}
     points: dict[int, list[str]] = {}
     polygons: dict[int, list[str]] = {}
@@ -261,6 +263,8 @@ def _of_ply(data: bytes) -> MeshFile | None:
         return MeshFile(vertices, np.zeros((0, 3), np.int32))
     name = next((name for name in ("vertex_indices", "vertex_index") if name in face["properties"]), None)
     lists = _column(face, name or next(iter(face["properties"])))
+    if len(lists) < face["length"]:
+        raise MeshUnreadable("its end is missing")
     faces, source = _triangulated(vertices, [np.asarray(one, np.int64) for one in lists])
     places = next((names for names in _PLACES if set(names) <= set(vertex["properties"])), ())
     columns = [np.asarray(_column(vertex, name), np.float32).reshape(-1) for name in places]

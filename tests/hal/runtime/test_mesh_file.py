@@ -187,6 +187,23 @@ def test_a_texture_that_can_not_be_used_is_named_where_colours_count(
     assert len(read_mesh(tmp_path / "m.obj", coloured=False).faces) == 1
 
 
+@pytest.mark.parametrize("lost", [8, 40, 100])
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_a_ply_that_was_cut_off_is_refused_and_not_half_an_object(tmp_path: Path, encoding: str, lost: int) -> None:
+    data = trimesh.creation.box((1, 2, 3)).export(file_type="ply", encoding=encoding, vertex_normal=False)
+    (tmp_path / "a.ply").write_bytes(data[:-lost])
+    with pytest.raises(MeshUnreadable):
+        read_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", " f\t1/1 2/2 0/3", "f 1//1 0//1 2//1"])
+def test_an_obj_that_counts_from_zero_is_refused(tmp_path: Path, face: str) -> None:
+    corners = "".join(f"v {x} {y} 0\nvt {x} {y}\nvn 0 0 1\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+    (tmp_path / "a.obj").write_text(corners + face + "\n")
+    with pytest.raises(MeshUnreadable, match="counts from 1"):
+        read_mesh(tmp_path / "a.obj")
+
+
 def test_strips_are_refused_by_name(tmp_path: Path) -> None:
     text = ply(TRIANGLE).replace("element face 1", "element tristrips 1")
     (tmp_path / "m.ply").write_text(text)

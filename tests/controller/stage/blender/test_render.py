@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,10 @@ picture.image.filepath = "/nowhere/wood.png"
 SAVE = "bpy.ops.wm.save_as_mainfile"
 
 
+def told_of(notes: list[tuple[str, float, str]], name: str, share: float, note: str) -> None:
+    notes.append((name, share, note))
+
+
 def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_where_it_stands_as_bright(
     tmp_path: Path, blender: Blender
 ) -> None:
@@ -148,9 +153,7 @@ def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_whe
         (folder / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{changes}{LAMP}{SAVE}"))
         subprocess.run([blender.command[0], str(folder / "make.py"), str(folder / "own.blend")], check=True)
         write_job(folder, geometry, mask, light, scene=folder / "own.blend", settings=QUICK)
-        told: list[tuple[float, str]] = []
-        rendered = render(blender, folder, lambda share, note, told=told: told.append((share, note)))
-        notes += [(name, share, note) for share, note in told]
+        rendered = render(blender, folder, partial(told_of, notes, name))
         target = as_seen(read_picture(rendered), geometry.camera, mask)
         seen.append(target.image[mask].max(axis=1))
     assert all((one > 0).mean() > 0.95 for one in seen)
