@@ -90,11 +90,12 @@ class Kiosk(Protocol):
     def view_px(self) -> tuple[int, int] | None:
         """(width, height) of the camera's view; None while it is unknown."""
 
-    def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+    def fitted(self, target: Path, fit: Fit = "fit", points: str = "") -> bytes:
         """The picture ``target`` (PNG) fitted to the camera's view; unchanged while the view is unknown.
 
         ``fit``: see ``store.targets.fitted``; "wrap" wraps it around the object; "restore" lays it on what it
-        shows. Raises UsageError("target-unreadable", "not-calibrated", "restoration-not-matched").
+        shows, or by ``points`` (see ``operations.arguments.PointPairs``). Raises UsageError("target-unreadable",
+        "not-calibrated", "restoration-not-matched", "restoration-points").
         """
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

@@ -28,7 +28,7 @@ UPLOADED = "uploaded"
 
 LONGEST_REASON = 300
 
-Fitted = Callable[[Path, Fit], bytes]
+Fitted = Callable[[Path, Fit, str], bytes]
 """Fits a PNG file to the camera's view."""
 
 
@@ -95,7 +95,7 @@ class Targets:
         limits: UploadLimits,
         *,
         most: int = 20,
-        fitted: Fitted = lambda file, fit: file.read_bytes(),
+        fitted: Fitted = lambda file, fit, points: file.read_bytes(),
         view_px: Callable[[], tuple[int, int] | None] = lambda: None,
     ) -> None:
         self._folder, self._limits, self._most = folder, limits, most
@@ -107,7 +107,7 @@ class Targets:
     def limits(self) -> UploadLimits:
         return self._limits
 
-    def add(self, uploaded: Path, fit: Fit = "fit") -> str:
+    def add(self, uploaded: Path, fit: Fit = "fit", points: str = "") -> str:
         """Decode ``uploaded``, fit it to the camera's view, and return the key of the target made from it.
 
         Raises as ``decode_picture``.
@@ -118,7 +118,7 @@ class Targets:
             key = secrets.token_hex(12)
             file = self._folder / f"{key}.png"
             write_atomically(file, png, mode=0o600)
-            write_atomically(file, self._fitted(file, fit), mode=0o600)
+            write_atomically(file, self._fitted(file, fit, points), mode=0o600)
             write_atomically(self._uploaded(key), uploaded.read_bytes(), mode=0o600)
             kept = sorted(self._folder.glob("*.png"), key=lambda file: file.stat().st_mtime, reverse=True)
             for old in kept[self._most :]:
@@ -127,13 +127,16 @@ class Targets:
                     part.unlink(missing_ok=True)
         return key
 
-    def fit_again(self, key: str, fit: Fit) -> str:
-        """The key of a target made of the same upload with another fit. Raises UsageError("target-unknown")."""
-        self.path(key)
-        uploaded = self._uploaded(key)
+    def fit_again(self, key: str, fit: Fit, points: str = "") -> str:
+        """The key of a target made of the same upload with another fit. Raises UsageError("target-unknown").
+
+        ``points`` are places in the target as it is.
+        """
+        whole = self.path(key)
+        uploaded = whole if points else self._uploaded(key)
         if not uploaded.is_file():
             raise UsageError("target-unknown", what="This picture no longer exists.", remedy="Upload it again.")
-        again = self.add(uploaded, fit)
+        again = self.add(uploaded, fit, points)
         self.propose(again, self.proposed(key))
         return again
 

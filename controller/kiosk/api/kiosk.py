@@ -136,10 +136,10 @@ class StageKiosk(AttachedKiosk):
                             remedy="Look at the picture again when the job has ended.")  # fmt: skip
         return self._previews.of(service.checked, target)
 
-    def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+    def fitted(self, target: Path, fit: Fit = "fit", points: str = "") -> bytes:
         if fit == "wrap" or fit == "restore":  # noqa: PLR1714 - so a type checker knows what is left
             kind = "photograph" if fit == "wrap" else "restoration"
-            return targets.on_object(self.stage, self.service.checked.names, target, kind)
+            return targets.on_object(self.stage, self.service.checked.names, target, kind, points)
         picture, size_px = target.read_bytes(), self.view_px()
         return picture if size_px is None else targets.fitted(picture, size_px, fit)
 

@@ -52,6 +52,9 @@ FitName = Annotated[Fit, Field(description=(
 Outline = Annotated[str, Field(max_length=1 << 16, description=(
     "regions as lists of corners [x, y], each from 0 to 1 of the picture, such as [[[0,0],[1,0],[1,1]]]")),
     TEXT]  # fmt: skip
+PointPairs = Annotated[str, Field(max_length=1 << 14, description=(
+    "for restore: at least four [x, y, x, y], a place in the picture and the same one in the camera's view, each "
+    "number from 0 to 1; default: found by what both show")), TEXT]  # fmt: skip
 SceneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,47}$", max_length=48, description=(
     "a scene's name, as `scenes` lists it")), TEXT]  # fmt: skip
 ReachPicture = Annotated[Literal["target", "result", "map"], Field(description="target, result or map")]

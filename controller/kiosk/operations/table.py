@@ -37,6 +37,7 @@ from controller.kiosk.operations.arguments import (
     Paused,
     Percent,
     PictureFile,
+    PointPairs,
     ProjectorName,
     ReachPicture,
     RunName,
@@ -79,7 +80,7 @@ class Targets(Protocol):
     """The uploaded targets of a panel; ``controller.panel.uploads`` has them."""
 
     def add(self, uploaded: Path, fit: Fit = "fit") -> str: ...
-    def fit_again(self, key: str, fit: Fit) -> str: ...
+    def fit_again(self, key: str, fit: Fit, points: str) -> str: ...
     def restrict(self, key: str, text: str) -> None: ...
     def path(self, key: str) -> Path: ...
 
@@ -271,9 +272,9 @@ def upload_target(targets: Targets, file: PictureFile, fit: FitName = "fit") -> 
 
 @operation("POST /targets/{target}/fit", OPERATOR, CHANGES, done="The picture is fitted again.",
            names=Names(name="fit-target", part_of="kiosk add"))  # fmt: skip
-def fit_target(targets: Targets, target: TargetKey, fit: FitName) -> NewTarget:
+def fit_target(targets: Targets, target: TargetKey, fit: FitName, points: PointPairs = "") -> NewTarget:
     """Make another target of an uploaded picture, with another fit."""
-    return NewTarget(targets.fit_again(target, fit))
+    return NewTarget(targets.fit_again(target, fit, points))
 
 
 @operation("GET /targets/{target}", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))

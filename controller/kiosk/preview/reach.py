@@ -115,12 +115,12 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     area = max(1, int(seen.sum()))
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
     pictures = {name: folder / file for name, file in FILES.items()}
-    less = with_less_light(
+    _, less, less_share = with_less_light(
         light.transport, wanted, light.black, share=options.share, drive=light.drive, indirect=light.indirect
     )
     return Reach(
         share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step),
-        light=less.light, light_share=less.then_share,
+        light=less, light_share=less_share,
     )  # fmt: skip
 
 

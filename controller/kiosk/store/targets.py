@@ -146,15 +146,28 @@ def _in_the_middle(picture: npt.NDArray[Any], size_px: tuple[int, int]) -> npt.N
     return view
 
 
-def on_object(stage: Path, names: tuple[str, ...], picture: Path, kind: str) -> bytes:
+def on_object(stage: Path, names: tuple[str, ...], picture: Path, kind: str, points: str = "") -> bytes:
     """A PNG of the size of the camera's view, transparent beside the object, by the newest finished calibration.
 
-    ``kind``: of an appearance. Raises what ``make_target`` and ``finished_calibration`` raise.
+    ``kind``: of an appearance; ``points``: of a restoration. Raises UsageError("restoration-points") and what
+    ``make_target`` and ``finished_calibration`` raise.
     """
     from controller.core.colour import linear_to_srgb
     from controller.stage.artefacts.calibrated import Calibrated
     from controller.stage.steps.appearance.requests import make_target
 
-    made = make_target(kind, picture, {}, Calibrated(finished_calibration(stage), names))
+    calibrated = Calibrated(finished_calibration(stage), names)
+    options = {}
+    if points and kind == "restoration":
+        sides = np.array([*png_size(picture.read_bytes()), *calibrated.transport.camera_shape[::-1]])
+        try:
+            options["points"] = (np.array(json.loads(points), np.float64).reshape(-1, 4) * sides - 0.5).tolist()
+        except (ValueError, TypeError, RecursionError):
+            raise UsageError(
+                "restoration-points",
+                what="The points are not pairs of places.",
+                remedy="Choose at least four places in the picture and on the object.",
+            ) from None
+    made = make_target(kind, picture, options, calibrated)
     seen = np.rint(255 * np.dstack([linear_to_srgb(made.image), made.mask])).astype(np.uint8)
     return _png(seen)

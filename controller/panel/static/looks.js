@@ -53,6 +53,8 @@
     });
     place.querySelector("#clear").addEventListener("click", () => { regions = []; draw(); });
     field.addEventListener("change", typed);
+    const blink = place.querySelector("#blink");
+    blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
     const fade = () => over.style.setProperty("opacity", String(through.value / 100));
     through.addEventListener("input", fade);
     place.hidden = false;
@@ -85,8 +87,62 @@
     else for (const canvas of ways.querySelectorAll("canvas")) canvas.hidden = true;
   });
 
-  const place = document.getElementById("on-object");
+  // Places in a picture, and the same ones on the object, with a loupe on the last one.
+  function pairs(place) {
+    const form = place.querySelector("form"), field = form.elements.points, sides = [...place.querySelectorAll(".overlay")];
+    const loupe = place.querySelector("canvas"), points = [[], []], order = [], WIDE = 20;
+    const put = (side) => {
+      const lost = points[side].length - 1, image = sides[side].querySelector("img");
+      field.value = JSON.stringify(points[0].slice(0, points[1].length).map((at, n) => [...at, ...points[1][n]]));
+      form.querySelector(".main").disabled = Math.min(points[0].length, points[1].length) < 4 || points[0].length !== points[1].length;
+      sides[side].querySelector("svg").replaceChildren(...points[side].flatMap(([x, y], n) => {
+        const [cross, label] = ["path", "text"].map((name) => document.createElementNS("http://www.w3.org/2000/svg", name));
+        cross.setAttribute("d", `M${1000 * x - 14} ${1000 * y}h28m-14 -21v42`);
+        label.setAttribute("x", 1000 * x + 16);
+        label.setAttribute("y", 1000 * y - 12);
+        label.textContent = String(n + 1);
+        return [cross, label];
+      }));
+      const paper = loupe.getContext("2d");
+      paper.fillRect(0, 0, loupe.width, loupe.height);
+      if (lost < 0) return;
+      const [x, y] = points[side][lost], half = WIDE / 2, scale = loupe.width / WIDE;
+      paper.imageSmoothingEnabled = false;
+      paper.drawImage(image, x * image.naturalWidth - half, y * image.naturalHeight - half, WIDE, WIDE, 0, 0, loupe.width, loupe.height);
+      paper.strokeStyle = "#ff3b30";
+      paper.strokeRect((half - 0.5) * scale, (half - 0.5) * scale, scale, scale);
+    };
+    const inside = (value) => Math.round(1e6 * Math.min(1, Math.max(0, value))) / 1e6;
+    const add = (side, x, y) => { points[side].push([inside(x), inside(y)]); order.push(side); put(side); };
+    sides.forEach((side, n) => {
+      const image = side.querySelector("img");
+      side.addEventListener("click", (event) => {
+        const box = image.getBoundingClientRect();
+        add(n, (event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+      });
+      side.addEventListener("keydown", (event) => {
+        const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key], last = points[n].at(-1);
+        if (event.key === "Enter") add(n, 0.5, 0.5);
+        else if (way && last) {
+          const by = event.shiftKey ? 10 : 1;
+          last[0] = inside(last[0] + by * way[0] / image.naturalWidth);
+          last[1] = inside(last[1] + by * way[1] / image.naturalHeight);
+          put(n);
+        } else return;
+        event.preventDefault();
+      });
+    });
+    place.querySelector("#point-back").addEventListener("click", () => {
+      const side = order.pop();
+      if (side === undefined) return;
+      points[side].pop();
+      put(side);
+    });
+    place.hidden = false;
+  }
+  const place = document.getElementById("on-object"), byPoints = document.getElementById("by-points");
   if (place) outline(place);
+  if (byPoints) pairs(byPoints);
 
   // Of the live picture, as small as the eye needs: the energy of its edges, and how many pixels have which level.
   const live = document.getElementById("live-view"), camera = document.getElementById("camera");

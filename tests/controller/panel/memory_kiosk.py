@@ -170,7 +170,9 @@ class MemoryKiosk(MemoryWork):
     def view_px(self) -> tuple[int, int] | None:
         return 240, 160
 
-    def fitted(self, target: Path, fit: Fit = "fit") -> bytes:
+    def fitted(self, target: Path, fit: Fit = "fit", points: str = "") -> bytes:
+        if points:
+            self.asked.append(("points", points))
         return targets.fitted(target.read_bytes(), (240, 160), fit if fit in ("fit", "fill", "crop") else "stretch")
 
     def compute(self, name: str, target: Path, fit: Fit = "fit") -> Job:

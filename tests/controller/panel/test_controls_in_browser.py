@@ -115,6 +115,37 @@ def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served,
         expect(page.get_by_role("button", name="Play now")).to_be_hidden()
 
 
+def test_points_in_the_picture_and_on_the_object_lay_it(fresh: Served, browser: Browser) -> None:
+    out = io.BytesIO()
+    Image.new("RGB", (240, 160), "white").save(out, "PNG")
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.goto("/appearances/new")
+        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        page.get_by_role("button", name="Upload").click()
+        lay = page.get_by_role("button", name="Lay it by these points")
+        for name in ("The uploaded target", "The object in white light"):
+            place = page.get_by_role("application", name=name)
+            place.scroll_into_view_if_needed()
+            box = place.bounding_box()
+            assert box is not None
+            assert lay.is_disabled()
+            for x, y in ((0.1, 0.1), (0.9, 0.1), (0.9, 0.9)):
+                place.click(position={"x": x * box["width"], "y": y * box["height"]})
+            place.press("Enter")
+            place.press("ArrowLeft")
+            place.press("Shift+ArrowDown")
+        assert not violations(page)
+        page.get_by_role("button", name="Blink").click()
+        lay.click()
+        expect(page.get_by_text("The picture is fitted again.")).to_be_visible()
+    ((_, sent),) = [one for one in kiosk_of(fresh).asked if one[0] == "points"]
+    pairs = json.loads(str(sent))
+    assert len(pairs) == 4
+    assert pairs[1] == pytest.approx([0.9, 0.1, 0.9, 0.1], abs=0.01)
+    assert pairs[3][:2] == pytest.approx([0.5 - 1 / 240, 0.5 + 10 / 160], abs=1e-4)
+
+
 COLOUR_AT = """([way, x, y]) => {
   const canvas = document.querySelector(`input[value=${way}] ~ .way canvas`);
   return [...canvas.getContext("2d").getImageData(x * canvas.width / 96, y * canvas.height / 80, 1, 1).data];

@@ -183,27 +183,17 @@ def expose_target(
     return ExposedTarget(found, wanted, needed, possible, following / found)
 
 
-@dataclass(frozen=True, slots=True)
-class LessLight:
-    """How much of a picture, as shares of its pixels, is in reach: ``share`` at the light that is wanted, and
-    ``then_share`` at ``light`` of it, the most at which hardly any is too bright; 1 where none is.
-    """
-
-    share: float
-    light: float
-    then_share: float
-
-
 HARDLY_ANY: Final = 0.99
 
 
 def with_less_light(
     transport: LightTransport, target: Target, black: FloatImage, *,
     share: float, drive: DriveLevels, indirect: IndirectLight | None = None,
-) -> LessLight:  # fmt: skip
+) -> tuple[float, float, float]:  # fmt: skip
     """Whether more of a target is in reach with less light than its exposure, or that by ``share`` where it has none.
 
-    Raises what ``choose_exposure`` raises.
+    Gives the share of its pixels in reach at its light; the share of this light at which hardly any is too bright, 1
+    where none is; and the share of its pixels in reach then. Raises what ``choose_exposure`` raises.
     """
     exposed = partial(exposures, transport, target.image, black, drive=drive, indirect=indirect)
     asked = drive.mask & target.mask
@@ -215,7 +205,7 @@ def with_less_light(
         direct = direct_part(transport, np.float32(level) * target.image, black, indirect)
         reachable = feasibility(transport, direct, black, drive=drive).reachable
         shares.append(float(reachable[asked].mean()) if asked.any() else 0.0)
-    return LessLight(shares[0], min(most / wanted, 1.0), shares[1])
+    return shares[0], min(most / wanted, 1.0), shares[1]
 
 
 def direct_part(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,7 +62,7 @@ class Restoration:
     def figures(self, share: float) -> dict[str, Any]:
         """As of ``Registered``. ``share``: see ``SolveOptions``"""
         (target, registration), light = self.made, self._calibrated.light
-        less = with_less_light(
+        share, less, then_share = with_less_light(
             light.transport, target, light.black,
             share=share, drive=light.drive or DriveLevels(light.transport), indirect=light.indirect,
         )  # fmt: skip
@@ -71,7 +71,8 @@ class Restoration:
         matched = float(registration.matched.sum() / max(1, registration.inside.sum()))
         return {
             "turned_degrees": registration.turned_degrees, "by_points": registration.by_points,
-            "residual_px": middle, "residual_px_p95": most, "matched_share": matched, **asdict(less),
+            "residual_px": middle, "residual_px_p95": most, "matched_share": matched,
+            "share": share, "light": less, "then_share": then_share,
         }  # fmt: skip
 
 

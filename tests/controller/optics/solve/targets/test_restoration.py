@@ -289,12 +289,13 @@ def test_the_light_is_named_at_which_hardly_anything_is_too_bright() -> None:
     mask = np.zeros(transport.camera_shape, np.bool_)
     mask[:, 20:60] = True
     image = np.asarray(np.where(mask[..., None], slope, 0) * np.ones(3), np.float32)
-    less = with_less_light(transport, Target(image, mask, exposure=2.0), black, share=0.9, drive=DriveLevels(transport))
+    target, drive = Target(image, mask, exposure=2.0), DriveLevels(transport)
+    share, less, then_share = with_less_light(transport, target, black, share=0.9, drive=drive)
 
     def shown(exposure: float) -> float:
         return float(feasibility(transport, exposure * image, black).reachable[mask].mean())
 
-    assert less.share == pytest.approx(shown(2.0))
-    assert less.then_share == pytest.approx(shown(2.0 * less.light))
-    assert less.share < 0.9 < 0.98 < less.then_share
-    assert shown(2.1 * less.light) < less.then_share
+    assert share == pytest.approx(shown(2.0))
+    assert then_share == pytest.approx(shown(2.0 * less))
+    assert share < 0.9 < 0.98 < then_share
+    assert shown(2.1 * less) < then_share
