@@ -89,13 +89,20 @@ def player_pid(stage: Path) -> int:
 
 
 def watched(stage: Path, seconds: float) -> list[dict[str, Any]]:
-    """What the player says, again and again."""
+    """What the player says, again and again, with the time of each (``at_s``): under load they are uneven."""
     ends_s, seen = time.monotonic() + seconds, []
     with Wire(runtime_folder(stage) / "player.sock") as wire:
         while time.monotonic() < ends_s:
-            seen.append(wire.ask("status"))
+            seen.append({**wire.ask("status"), "at_s": time.monotonic()})
             time.sleep(0.02)
     return seen
+
+
+def settled(stage: Path, appearance: str) -> bool:
+    """Whether the player itself shows only this one: the kiosk says so as soon as it has asked for it."""
+    with Wire(runtime_folder(stage) / "player.sock") as wire:
+        now = wire.ask("status")
+    return bool(now["appearance"] == appearance and not now["fading"])
 
 
 def every_day(appearance: str) -> dict[str, Any]:
@@ -117,10 +124,11 @@ def test_appearances_in_turn_a_damaged_bundle_and_changed_settings(tmp_path: Pat
         assert until(stage, playing)["in_turn"] is True
         seen = watched(stage, 3.5 * SHOWN_MS / 1000)
         assert len({one["appearance"] for one in seen}) == 3
-        share = np.mean([one["fading"] for one in seen])
+        share = np.average([one["fading"] for one in seen], weights=np.gradient([one["at_s"] for one in seen]))
         assert 0.1 < share < 0.7, "a third of the time one fades into the next"
         call_kiosk(stage, "play", name="new-2")
         until(stage, lambda now: now["playing"] == "new-2" and not now["in_turn"])
+        wait_for(lambda: settled(stage, "new-2"))
         assert {one["appearance"] for one in watched(stage, 1.5 * SHOWN_MS / 1000)} == {"new-2"}
         call_kiosk(stage, "rotate")
         until(stage, lambda now: now["playing"] in ("new-1", "new-3"))
