@@ -21,6 +21,7 @@ from controller.core.arrays import load_arrays
 from controller.core.colour import srgb_to_linear
 from controller.core.errors import UsageError, WorkError
 from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.preview.preview_light import view_picture
 from controller.kiosk.service import Service
 from controller.kiosk.state import Job
 from controller.kiosk.store.event_log import EventLog
@@ -51,10 +52,18 @@ LONG_MS = 800_000
 HEAD = "\n[[appearances]]"
 
 
+@pytest.fixture(scope="module")
+def seen_stage(finished_demo: FinishedDemo, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's, with what a kiosk keeps of its calibration for previews: that takes as long as a whole test."""
+    stage = copied(finished_demo.stage, tmp_path_factory.mktemp("seen") / "stage")
+    view_picture(stage, finished_calibration(stage), check_stage(stage).names)
+    return stage
+
+
 @pytest.fixture
-def kiosk(finished_demo: FinishedDemo, tmp_path: Path) -> Iterator[StageKiosk]:
+def kiosk(seen_stage: Path, tmp_path: Path) -> Iterator[StageKiosk]:
     """Over its service on the demo's calibration; a test moves it by hand, and no device is opened."""
-    stage = copied(finished_demo.stage, tmp_path / "stage")
+    stage = copied(seen_stage, tmp_path / "stage")
     toml = stage / "stage.toml"
     # What the demo solved stays in every bundle; solving that again would test nothing here.
     toml.write_text(toml.read_text().partition(HEAD)[0] + f'{HEAD}\nname = "checkerboard"\nkind = "checkerboard"\n')
