@@ -182,29 +182,11 @@ class Alignment(NamedTuple):
 
 
 def pose_by_pairs(pairs: Pairs) -> Pose:
-    """The pose with the least squared distances. Raises UsageError("mesh-pairs-flat", "mesh-mirrored")."""
+    """The pose with the least squared distances between the pairs."""
     registration: Any = importlib.import_module("trimesh.registration")
-    sizes = np.linalg.svd(pairs.on_mesh - pairs.on_mesh.mean(axis=0), compute_uv=False)
-    if len(sizes) < 3 or sizes[1] < 1e-3 * sizes[0]:
-        raise UsageError(
-            "mesh-pairs-flat",
-            what="The pairs of points lie on one line, or are fewer than three.",
-            remedy="Give four pairs that lie far from each other and not on one line.",
-        )
-    matrix, _, off = registration.procrustes(*pairs, reflection=False)
-    if registration.procrustes(*pairs)[2] < 0.1 * off and off > 0.01 * np.var(pairs.on_object_m, axis=0).sum():
-        raise mirrored()
+    matrix = registration.procrustes(*pairs, reflection=False)[0]
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     return Pose(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-
-
-def mirrored() -> UsageError:
-    """The error of a mesh that is the object's mirror image."""
-    return UsageError(
-        "mesh-mirrored",
-        what="The mesh is the mirror image of the object.",
-        remedy="Export it again without a negative scale, and with the axes of a right-handed frame.",
-    )
 
 
 def refined(

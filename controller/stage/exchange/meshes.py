@@ -16,7 +16,7 @@ from controller.core.errors import UsageError
 from controller.core.storage import stream_atomically, write_atomically
 from controller.optics.calibrate.mesh import View, scene_script, write_glb, write_ply
 from controller.optics.calibrate.values import Pinhole
-from controller.optics.solve.targets.sheets import as_it_is, photographed, sheet_side
+from controller.optics.solve.targets.sheets import as_it_is, photographed
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.exchange.content import Content
 
@@ -189,7 +189,8 @@ def write_sheet(content: Content, path: Path) -> dict[str, object]:
         uv, sheet = "camera", np.dstack([picture, mask])
     else:
         places = mesh.places(content.geometry.camera)
-        side = sheet_side(places, mask)
+        # twice as fine as the camera sees it, if a half of the sheet is seen
+        side = int(2 ** np.clip(np.round(np.log2(2.8 * np.sqrt(mask.sum()))), 9, 12))
         uv, sheet = "mesh", photographed(picture, places, mask, side)
         replace(mesh, figures={**mesh.figures, "sheet_px": [side, side]}).write_figures(content.folder)
     shown = np.dstack([linear_to_srgb(sheet[..., :3]), sheet[..., 3]])

@@ -106,7 +106,8 @@ def _read(path: Path) -> RegisteredMesh:
 def _pairs(path: Path, surface: Surface) -> Pairs:
     try:
         pairs = np.array(json.loads(path.read_text("utf-8")), np.float64)
-        why = "" if pairs.shape[1:] == (5,) and np.isfinite(pairs).all() else "it is no list of lists of five numbers"
+        right = len(pairs) > 2 and pairs.shape[1:] == (5,) and np.isfinite(pairs).all()
+        why = "" if right else "it needs three or more lists of five numbers"
     except (OSError, ValueError, TypeError) as error:
         why = str(error)
     if why:

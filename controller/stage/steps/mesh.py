@@ -28,7 +28,6 @@ from controller.optics.calibrate.mesh_alignment import (
     SolidMesh,
     aligned,
     measured,
-    mirrored,
     pose_by_pairs,
     rays_of,
     refined,
@@ -88,8 +87,7 @@ def lay_mesh(
     """``mesh`` where it fits what was measured, with its figures.
 
     ``guide``: where it stood, or pairs of points; ``limit_m``: how far both may differ, None: ``LIMIT_SHARE``
-    Raises UsageError("mesh-mirrored", "mesh-pairs-flat", "mesh-pairs-wrong"), WorkError("mesh-does-not-fit",
-    "mesh-ambiguous").
+    Raises UsageError("mesh-mirrored", "mesh-pairs-wrong"), WorkError("mesh-does-not-fit", "mesh-ambiguous").
     """
     solid = mesh.solid
     best, fine = _best(surface, solid, guide)
@@ -117,7 +115,11 @@ def lay_mesh(
             )
         mirror = SolidMesh(mesh.arrays["vertices"] * (-1.0, 1.0, 1.0), mesh.arrays["faces"])
         if _best(surface, mirror, refuse=False)[0].cost < min(MOST_COST, 0.7 * best.cost):
-            raise mirrored()
+            raise UsageError(
+                "mesh-mirrored",
+                what="The mesh is the mirror image of the object.",
+                remedy="Export it again without a negative scale, and with the axes of a right-handed frame.",
+            )
         raise WorkError(
             "mesh-does-not-fit",
             what=f"The mesh does not fit the object: {100 * beside:.0f} % of the measured points are more than "

@@ -27,7 +27,6 @@ these change (N, 2, 2) one camera pixel to the right, and one down."""
 _SUBPIXELS: Final = 4
 _BESIDE_PX: Final = 8
 """Pixels of a sheet around its parts that get their colours, so that a soft brush and a filter find no black there."""
-SIDES_PX: Final = (512, 4096)
 
 
 def as_it_is(transport: LightTransport) -> FloatImage:
@@ -116,17 +115,6 @@ def _positions(at: Float64, steps: Float64) -> Iterator[tuple[float, float, Floa
         for right in offsets:
             u, v = (at + right * steps[:, 0] + down * steps[:, 1]).T
             yield right, down, u, v
-
-
-def sheet_side(places: Places, mask: Mask) -> int:
-    """The side in pixels, a power of two, of a sheet as fine as the camera's picture of the object in ``mask``."""
-    y, x = np.nonzero(mask)
-    some = np.linspace(0, len(y) - 1, min(len(y), 20_000)).astype(np.int64)
-    at, steps = places(np.stack([x, y], axis=1)[some].astype(np.float64))
-    area = np.abs(np.linalg.det(steps[np.isfinite(at[:, 0])]))
-    area = area[area > 0]
-    side = 1 / np.sqrt(np.median(area)) if len(area) else 1.0
-    return int(2 ** np.ceil(np.log2(np.clip(side, *SIDES_PX))))
 
 
 def photographed(picture: FloatImage, places: Places, mask: Mask, side: int) -> FloatImage:

@@ -197,10 +197,6 @@ def test_a_mesh_of_another_object_is_refused_with_the_place(stage: Path, tmp_pat
 def test_a_mirrored_mesh_is_named(stage: Path, tmp_path: Path) -> None:
     mirror = np.asarray(stone().vertices) * (1, -1, 1)
     assert refused(stage, MeshOrder(file_of(tmp_path, mirror))).code == "mesh-mirrored"
-    pairs = np.array(clicked(np.random.default_rng(5), np.asarray(stone().vertices))) * (1, -1, 1, 1, 1)
-    assert (
-        refused(stage, MeshOrder(file_of(tmp_path, mirror), pairs=pairs_file(tmp_path, pairs))).code == "mesh-mirrored"
-    )
 
 
 def test_a_wrong_unit_is_told_with_the_right_one(stage: Path, tmp_path: Path) -> None:
@@ -292,6 +288,6 @@ def test_pairs_that_are_none_are_named(stage: Path, tmp_path: Path) -> None:
     assert refused(stage, order).code == "mesh-pair-beside"
     right = clicked(np.random.default_rng(5), vertices)
     pairs_file(tmp_path, right[:2])
-    assert refused(stage, order).code == "mesh-pairs-flat"
+    assert refused(stage, order).code == "mesh-pairs-file"
     pairs_file(tmp_path, np.hstack([np.array(right)[:, :3], np.roll(right, 1, axis=0)[:, 3:]]))
     assert refused(stage, order).code in ("mesh-pairs-wrong", "mesh-mirrored")

@@ -13,7 +13,7 @@ import trimesh
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh
 from controller.optics.calibrate.values import Pinhole
-from controller.optics.solve.targets.sheets import mesh_places, photographed, sheet_side, texture
+from controller.optics.solve.targets.sheets import mesh_places, photographed, texture
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = Pinhole(
@@ -154,9 +154,7 @@ def test_an_exported_sheet_brings_the_object_back_as_it_was() -> None:
     )
     met = object_mask()
     places = mesh_places(MESH, UV, POSE, CAMERA)
-    side = sheet_side(places, met)
-    assert side == 512
-    sheet = photographed(picture, places, met, side)
+    sheet = photographed(picture, places, met, 512)
     assert 0.2 < sheet[..., 3].mean() < 0.7, "the far side is clear"
     image = texture(sheet, places, picture, met).image
     inside = cv2.erode(met.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
