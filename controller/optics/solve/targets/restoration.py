@@ -74,7 +74,7 @@ def _wrong_light(what: str) -> UsageError:
 def without_margin(picture: FloatImage) -> FloatImage:
     """``picture`` (height, width, 3) linear, NaN where the colour of all four corners continues, a margin."""
     encoded = np.sqrt(np.clip(np.nan_to_num(picture), 0, 1))
-    alike = channels.every(np.abs(encoded - encoded[0, 0]) < EVEN)
+    alike = channels.every(np.abs(encoded - encoded[0, 0]) < EVEN) & channels.finite(picture)
     corners = (0, 0, -1, -1), (0, -1, 0, -1)
     if not alike[corners].all():
         return picture

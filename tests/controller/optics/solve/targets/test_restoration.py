@@ -278,6 +278,9 @@ def test_only_an_even_margin_at_all_corners_is_left_out() -> None:
     assert not known[[0, 0, -1, -1], [0, -1, 0, -1]].any()
     ours = cv2.warpPerspective(np.ones((200, 260), np.float32), to_scan, known.shape[::-1]) > 0.5
     assert (known == ours).mean() > 0.95
+    cut = np.zeros((40, 50, 3), np.float32)
+    cut[:5] = cut[-5:] = np.nan
+    np.testing.assert_array_equal(without_margin(cut), cut, err_msg="black beside what is transparent is the picture's")
     even = np.full((20, 30, 3), 0.4, np.float32)
     np.testing.assert_array_equal(without_margin(even), even)
 

@@ -15,11 +15,14 @@ from scipy import ndimage
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import CalibrationError, UsageError
+from controller.kiosk.store.targets import on_object
 from controller.optics.calibrate.geometry.shape import FoundShape
 from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.solve.targets.files import read_large_picture, read_picture
+from controller.run.journal import Journal
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import write_geometry
+from controller.stage.artefacts.kinds import CALIBRATED
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import Registered
 from controller.stage.services.export import export
@@ -238,3 +241,23 @@ def test_a_restoration_that_a_page_asks_for_is_refused_by_the_same_name(tmp_path
     with pytest.raises(UsageError) as refused:
         make_target("restoration", tmp_path / "t.png", {}, calibrated)
     assert refused.value.code == "restoration-not-matched"
+
+
+def test_points_of_a_page_are_shares_of_both_pictures(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "20260101-000000-calibrate"
+    write_run(run)
+    with Journal(run) as journal:
+        journal.complete(CALIBRATED, {}, [], began_at_s=0)
+    Image.fromarray(np.full((30, 90, 3), 200, np.uint8)).save(tmp_path / "t.png")
+    points = "[[0, 0, 0.25, 0.2], [1, 0, 0.75, 0.2], [1, 1, 0.75, 0.9], [0, 1, 0.25, 0.9]]"
+    with Image.open(
+        io.BytesIO(on_object(tmp_path, ("left", "right"), tmp_path / "t.png", "restoration", points))
+    ) as made:
+        assert made.size == CAMERA[::-1]
+        left, top, right, bottom = made.getchannel("A").getbbox() or (0, 0, 0, 0)
+    assert (left, right) == (pytest.approx(20, abs=2), pytest.approx(60, abs=2))
+    assert (top, bottom) == (pytest.approx(12, abs=2), pytest.approx(54, abs=2))
+    for wrong in ("[[0, 0, 1]]", "{}", "[" * 9000):
+        with pytest.raises(UsageError) as refused:
+            on_object(tmp_path, ("left", "right"), tmp_path / "t.png", "restoration", wrong)
+        assert refused.value.code == "restoration-points"
