@@ -36,7 +36,7 @@ Labels = npt.NDArray[np.int8]
 MOST_PLANES: Final = 4
 LEAST_PLANE: Final = 0.08
 """Share of what the projectors light that a plane holds."""
-LEAST_FLAT: Final = 0.8
+LEAST_FLAT: Final = 0.7
 """Share of what the projectors light that all planes hold together."""
 THICK: Final = 0.005
 """Farthest from a plane, in widths of the projector's picture."""
