@@ -151,3 +151,29 @@ def test_an_object_that_the_bench_has_not_is_refused_with_all_that_it_has(tmp_pa
         with pytest.raises(PluginError, match="painting, relief, statue, corner, cylinder, sphere, two-") as refused:
             DRIVER.open({"object": name}, OpenContext(stage=tmp_path), in_seconds(5))
         assert refused.value.code == "setting-wrong"
+
+
+def test_what_the_camera_sees_of_a_painting_is_enough_to_lay_its_original_on_it(
+    seen: Callable[[str], Seen], tmp_path: Path
+) -> None:
+    from controller.optics.solve.targets.files import read_picture
+    from controller.optics.solve.targets.registration import register
+
+    hung = seen("painting")
+    truth = read_truth(hung.folder)
+    camera = dataclasses.replace(truth.camera, focus_m=1.0)
+    truth = dataclasses.replace(truth, subsamples=1, camera=camera, projectors=truth.projectors[:1])
+    samples = cast(truth, object_of(hung.folder, truth.object), lambda share: None)
+    width, height = camera.lens.size_px
+    own = np.full((height * width, 3), np.nan, np.float32)
+    own[samples.pixels] = samples.albedo * (1 + 0.01 * np.random.default_rng(1).standard_normal(samples.albedo.shape))
+    picture = read_picture(hung.folder / "original.png")[..., :3]
+    found = register(picture, own.reshape(height, width, 3))
+    x, y = samples.points[:, 0], samples.points[:, 1]
+    on_canvas = samples.on_object & (np.abs(x) < 0.148) & (np.abs(y) < 0.118)
+    at = np.stack([(x / 0.30 + 0.5) * 1125 - 0.5, (y / 0.24 + 0.5) * 900 - 0.5], axis=-1)[on_canvas]
+    off = np.linalg.norm(found.position_px.reshape(-1, 2)[samples.pixels[on_canvas]] - at, axis=1)
+    off /= np.sqrt(1125 * 900 / on_canvas.sum())  # in camera pixels
+    assert np.nanmedian(off) < 0.5
+    assert np.nanpercentile(off, 95) < 2.0
+    assert np.isfinite(off).mean() > 0.95
