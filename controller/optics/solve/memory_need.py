@@ -60,6 +60,11 @@ class StageSize:
         return WINDOW * self.windows + self.count * self.camera + 16 * self.projectors
 
     @property
+    def white(self) -> int:
+        """Bytes of what solves keep of the projectors' white light."""
+        return 12 * self.projectors + self.count * self.camera * 3 // 4
+
+    @property
     def known(self) -> int:
         """Bytes of a camera pixel of what is known of the stage's light."""
         return INDIRECT * self.has_indirect + PAINT * self.has_paint + SPREAD * self.has_spread
@@ -92,17 +97,16 @@ def planned_size(camera_px: tuple[int, int], projectors_px: Sequence[tuple[int, 
 def base_peak_bytes(size: StageSize) -> int:
     """Bytes at the peak of building the transport, solving a base image and preparing to scale it."""
     C, P, W, S = size.camera, size.projectors, size.windows, size.samples
-    own = 12 * P // max(size.count, 1)
     # even gains and one picture of samples, wherever means over metapixels are taken
     means = 4 * W + 4 * S
     built = size.transport + 3 * size.count * C + 12 * P + max(28 * C, 12 * C + means)
     # the picture and the weights stay during the solve
-    solving = size.transport + 12 * C + 4 * C
-    smoothed = solving + 12 * P + 12 * C + 12 * P + 12 * P + own + means
-    begun = solving + 24 * P + 12 * C + 12 * P + 2 * own + means
+    solving = size.transport + size.white + 12 * C + 4 * C
+    smoothed = solving + 12 * C + 12 * P + 12 * P + means
+    begun = solving + 24 * P + 12 * C + 12 * P + 12 * P + means + 4 * S
     swept = solving + 24 * P + 36 * P + 5 * 4 * S
     ended = solving + 36 * P + 24 * C
-    prepared = size.transport + 24 * C + 12 * P + 3 * C + max(12 * C + 12 * P + means, 15 * C + 36 * P)
+    prepared = size.transport + size.white + 24 * C + 12 * P + 3 * C + max(12 * C + 12 * P + means, 15 * C + 36 * P)
     return int(SPARE * max(built, smoothed, begun, swept, ended, prepared)) + PROGRAM
 
 
@@ -112,7 +116,7 @@ def appearance_peak_bytes(size: StageSize) -> int:
     own = 12 * P // max(size.count, 1)
     # Small images stay in memory: light of white, the base, what is known, and the target.
     here = C if 12 * C < MAPPED_FROM else 0
-    kept = size.transport + C + (36 * P if own < MAPPED_FROM else 0) + (36 + 36 + size.known) * here
+    kept = size.transport + size.white + C + (36 * P if own < MAPPED_FROM else 0) + (36 + 36 + size.known) * here
     aimed = kept + 12 * C + 12 * here + 7 * C
     floor = 12 * C if size.known else 0
     adapted = aimed + floor + 12 * C + 12 * C + 12 * C + 24 * C

@@ -27,7 +27,8 @@ from controller.optics.solve.appearance import (
     solve_base,
 )
 from controller.optics.solve.bounded.engine import ALONE, SolveContext
-from controller.optics.solve.bounded.equations import TOLERANCE, SolveSettings, appearance_weights
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.engines import Method
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
@@ -48,7 +49,7 @@ ADVICE_FULL_SOLVE = (
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
 LET_GO: Final = np.empty((0, 0, 3), np.float32)
-FIRST_TOLERANCE: Final = 2 * TOLERANCE
+FIRST_TOLERANCE: Final = 2 * APPEARANCE_TOLERANCE
 """Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
 
@@ -221,16 +222,20 @@ def _solved(light: StageLight, base: Base, aim: Aim, options: SolveOptions, cont
     wanted = target_radiance(aim.wanted, light.black, 1.0)
     weights = appearance_weights(wanted, aim.possible.reachable, aim.exposure)
     del wanted
-    settings = SolveSettings(options.smoothness, weights)
+    settings = SolveSettings(options.smoothness, weights, tolerance=APPEARANCE_TOLERANCE)
     solve = partial(_solved_directly, light, base, aim, options, context)
     if light.indirect is None:
         return solve(aim.direct, settings)
-    first = solve(aim.direct, replace(settings, tolerance=FIRST_TOLERANCE)).frames
+    first = solve(aim.direct, replace(settings, tolerance=FIRST_TOLERANCE))
     # what can't be reached throws back other light than was wanted of it
-    indirect = light.indirect.forward(light.transport.forward(first))
+    indirect = light.indirect.forward(light.transport.forward(first.frames))
     left = target_radiance(aim.wanted - indirect, light.black, 1.0)
     del indirect
-    return solve(left, replace(settings, start=first))
+    settings = replace(settings, start=first.frames)
+    if first.mode == "scale":
+        return solve(left, settings)
+    solution = solve_bounded(light.transport, left, light.black, settings, context)
+    return replace(first, frames=solution.frames, solution=solution)
 
 
 def _solved_directly(

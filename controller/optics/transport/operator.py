@@ -203,8 +203,8 @@ class LightTransport(LinearOperator[np.float32], ABC):
         residual -= right_hand_side.reshape(shape)
 
     def right_hand_side(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
-        """D' w picture, a buffer, from (3, rows, columns) and (rows, columns)."""
-        return np.asarray(picture * weights).reshape(-1)
+        """D' w picture, a buffer, from (3, rows, columns), which is overwritten, and (rows, columns)."""
+        return np.multiply(picture, weights, out=picture).reshape(-1)
 
     # SciPy's linear operator
 

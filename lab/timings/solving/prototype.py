@@ -30,7 +30,7 @@ from controller.optics.solve.appearance import base_image
 from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
 from controller.optics.solve.bounded.equations import EDGE_WEIGHT_STEPS, Problem, smoothness_term
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.planes import CameraBox, plane_image
+from controller.optics.transport.planes import CameraBox
 from lab.timings import Row, at_least, at_most, timed
 from lab.timings.tools.synthetic import synthetic_calibration
 from lab.timings.tools.traced import traced
@@ -133,9 +133,6 @@ class _Theirs(LightTransport):
     ) -> None:
         np.subtract(buffer, right_hand_side, out=out)
 
-    def right_hand_side(self, picture: FloatImage, weights: FloatImage) -> FloatImage:
-        return plane_image(picture).reshape(-1)
-
     def forward_planes(
         self, p: FloatImage, *, projectors: tuple[int, int] | None = None, out: FloatImage | None = None
     ) -> FloatImage:
@@ -174,7 +171,10 @@ def _to_objective(transport: _Theirs, theirs: dict[str, Any], objective: float) 
     strength_per_step = float(max(across.max(), down.max())) / EDGE_WEIGHT_STEPS
     right, below = (np.rint(part / np.float32(strength_per_step)).astype(np.uint16) for part in (across, down))
     weights = np.ones(transport.camera_shape, np.float32)
-    problem = Problem(transport, wanted, np.zeros_like(wanted), weights, right, below, strength_per_step, majoriser)
+    problem = Problem(
+        transport, wanted, np.zeros_like(wanted), weights, wanted.reshape(-1), np.zeros((3, 0, 0), np.float32), right,
+        below, strength_per_step, majoriser,
+    )  # fmt: skip
     start = _start(transport, wanted, reach)
     block_coordinate_descent(problem, start.copy(), IterationControl(0, 1))
     seen: list[tuple[int, float, float]] = []

@@ -59,10 +59,8 @@ def block_coordinate_descent(
 ) -> tuple[FloatImage, float, int]:
     """Sweep from ``x`` (3, pixels), which is overwritten; returns the last point, its KKT residual and the sweeps."""
     transport = problem.transport
-    right_hand_side = transport.right_hand_side(problem.target(), problem.weights)
     # buffers of light: of the point x, of the extrapolated point y, of y before the sweep
-    light, light_y, before = (transport.sensor_buffer() for _ in range(3))
-    residual = np.empty_like(right_hand_side)
+    light, light_y, before, residual = (transport.sensor_buffer() for _ in range(4))
     y, step = x.copy(), np.empty_like(x)
     total = _total(problem)
     inertia, kkt, least, iteration = 1.0, np.inf, np.inf, 0
@@ -75,9 +73,9 @@ def block_coordinate_descent(
             light_y[:] = light
             if iteration > 1:
                 _write_forward(transport, y, light_y)
-        before[:] = light_y
+            before[:] = light_y
         for n in range(len(transport.sizes)):
-            transport.normal_residual(light_y, problem.weights, right_hand_side, residual)
+            transport.normal_residual(light_y, problem.weights, problem.right_hand_side, residual)
             transport.adjoint_of_buffer(n, residual, step)
             a, b = _projected_step(problem, n, y, x, step)
             squared_step, uphill = squared_step + a, uphill + b
@@ -104,10 +102,9 @@ def block_coordinate_descent(
 def kkt_residual(problem: Problem, x: FloatImage) -> float:
     """The KKT residual at ``x`` (3, pixels): of one step of each projector from there, the others being as they are."""
     transport = problem.transport
-    right_hand_side = transport.right_hand_side(problem.target(), problem.weights)
-    light, residual, step = transport.sensor_buffer(), np.empty_like(right_hand_side), np.empty_like(x)
+    light, residual, step = transport.sensor_buffer(), transport.sensor_buffer(), np.empty_like(x)
     _write_forward(transport, x, light)
-    transport.normal_residual(light, problem.weights, right_hand_side, residual)
+    transport.normal_residual(light, problem.weights, problem.right_hand_side, residual)
     squared_step = 0.0
     for n in range(len(transport.sizes)):
         transport.adjoint_of_buffer(n, residual, step)

@@ -20,13 +20,16 @@ from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.jit import compiled
 from controller.optics.solve.bounded.gradient import EdgeWeights, add_smoothness_to_majoriser, inner, weighted_residual
-from controller.optics.solve.bounded.initial_estimate import initial_estimate
+from controller.optics.solve.bounded.initial_estimate import block_means, blocks_of, initial_estimate, white_light
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import planes_above
 
 TOLERANCE: Final = 3e-5
 """Default KKT residual. The objective is then within 1e-3 of its limit on a synthetic stage, and within 1e-2 on a
 calibrated one, where the last per cent is about which projector gives the light (docs/decisions/0008)."""
+APPEARANCE_TOLERANCE: Final = 1e-4
+"""KKT residual at which an appearance is done, in half of the sweeps: more of them change the median of CIEDE2000 by
+less than 0.005, its 95th percentile by less than 0.02 (docs/decisions/0008)."""
 MOST_ITERATIONS: Final = 1000
 
 
@@ -36,6 +39,7 @@ class Problem:
 
     ``picture``, ``black`` (camera rows, columns, 3): what is wanted, and the black image; not copies
     ``weights`` (camera rows, columns): 0 off the object
+    ``right_hand_side``: D' w target, a buffer; ``blocks`` (3, rows, columns): means of the target's light over blocks
     ``across``, ``down`` (3, pixels of all projectors) uint16: squared weights of the smoothness edges to the right
     and lower neighbour, in steps of 1 / EDGE_WEIGHT_STEPS
     ``strength_per_step``: factor in the objective of an edge whose stored weight is 1
@@ -46,6 +50,8 @@ class Problem:
     picture: FloatImage
     black: FloatImage
     weights: FloatImage
+    right_hand_side: FloatImage
+    blocks: FloatImage
     across: EdgeWeights
     down: EdgeWeights
     strength_per_step: float
@@ -129,27 +135,18 @@ def appearance_weights(target: FloatImage, reachable: Mask, white: float) -> Flo
 EDGE_WEIGHT_STEPS: Final = 65535
 """Squared weights, 0 to 1, are kept in so many steps: 2 bytes instead of 4, and at most 1/131070 off."""
 
-FAINTEST: Final = 1e-3
-"""Fraction of a projector's brightest observed pixel below which a pixel counts as in shadow."""
-
 
 def squared_edge_weights(transport: LightTransport, wanted: FloatImage) -> tuple[EdgeWeights, EdgeWeights]:
     """alpha squared for all projectors; alpha is 0 beside a pixel that contributes nothing (paper 2.4, eq. 3).
 
-    ``wanted`` (3, camera rows, columns): the light to be made, without the black image; overwritten. Returns two arrays
-    (3, pixels) in steps of 1 / EDGE_WEIGHT_STEPS: from each pixel to its right neighbour, and to the one below; 0 at
-    the last column and row.
+    ``wanted`` (3, camera rows, columns): the light to be made, without the black image. Returns two arrays (3, pixels)
+    in steps of 1 / EDGE_WEIGHT_STEPS: from each pixel to its right neighbour, and to the one below; 0 at the last
+    column and row.
     """
-    count = transport.pixels
-    across, down = np.zeros((3, count), np.uint16), np.zeros((3, count), np.uint16)
-    target = transport.gaussian_mean_planes(wanted)
-    light, ones = wanted, np.ones((3, count), np.float32)
-    for n, (rows, columns) in enumerate(transport.sizes):
-        span = transport.span(n)
-        transport.forward_planes(ones, projectors=(n, n + 1), out=light)
-        observed = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, span]
-        faint = float(FAINTEST * observed.max(initial=0))
-        _write_edge_weights(target, observed, faint, span.start, rows, columns, across, down)
+    across, down = (np.zeros((3, transport.pixels), np.uint16) for _ in range(2))
+    target, white = transport.gaussian_mean_planes(wanted), white_light(transport)
+    for n, size in enumerate(transport.sizes):
+        _write_edge_weights(target, white.observed, white.faint[n], transport.span(n).start, *size, across, down)
     return across, down
 
 
@@ -175,18 +172,17 @@ def _write_edge_weights(
     across: EdgeWeights,
     down: EdgeWeights,
 ) -> None:
-    """The squared weights of one projector; ``observed`` (3, its pixels), the others of all projectors."""
+    """The squared weights of one projector; all arrays (3, pixels of all projectors)."""
     for y in prange(rows):
         for c in range(3):
             for x in range(columns):
-                i = y * columns + x
-                k = start + i
-                here, seen = target[c, k], observed[c, i]
+                i = start + y * columns + x
+                here, seen = target[c, i], observed[c, i]
                 if x + 1 < columns:
-                    across[c, k] = _edge_weight(here, seen, target[c, k + 1], observed[c, i + 1], faint)
+                    across[c, i] = _edge_weight(here, seen, target[c, i + 1], observed[c, i + 1], faint)
                 if y + 1 < rows:
-                    below = k + columns, i + columns
-                    down[c, k] = _edge_weight(here, seen, target[c, below[0]], observed[c, below[1]], faint)
+                    below = i + columns
+                    down[c, i] = _edge_weight(here, seen, target[c, below], observed[c, below], faint)
 
 
 def build_problem(
@@ -196,7 +192,13 @@ def build_problem(
     counted = transport.object_mask.astype(np.float32)
     if weights is not None:
         counted *= weights
-    across, down = squared_edge_weights(transport, planes_above(target, black))
+    white_light(transport)  # while no other picture is in memory
+    light = planes_above(target, black)
+    across, down = squared_edge_weights(transport, light)
+    blocks = np.empty((3, *blocks_of(transport.camera_shape)), np.float32)
+    block_means(light, blocks)
+    right_hand_side = transport.right_hand_side(light, counted)
+    del light
     diagonal, scale = _majoriser(transport, counted)
     if transport.beside is not None:
         # A pixel without data stays dark: what little it lights of the object is not worth light on the wall.
@@ -204,7 +206,9 @@ def build_problem(
     strength_per_step = smoothness * scale / EDGE_WEIGHT_STEPS
     for n, (rows, columns) in enumerate(transport.sizes):
         add_smoothness_to_majoriser(diagonal, across, down, strength_per_step, transport.span(n).start, rows, columns)
-    return Problem(transport, target, black, counted, across, down, strength_per_step, diagonal)
+    return Problem(
+        transport, target, black, counted, right_hand_side, blocks, across, down, strength_per_step, diagonal
+    )
 
 
 def _majoriser(transport: LightTransport, counted: FloatImage) -> tuple[FloatImage, float]:
@@ -232,7 +236,7 @@ def _frame_view(transport: LightTransport, n: int, planes: npt.NDArray[Any]) -> 
 
 def initial_point(problem: Problem) -> FloatImage:
     """(3, pixels): the best frames for light that is smooth (``initial_estimate``); 0 where a pixel lights nothing."""
-    x = initial_estimate(problem.transport, problem.target())
+    x = initial_estimate(problem.transport, problem.blocks)
     x[problem.majoriser == 0] = 0
     return x
 

@@ -163,12 +163,12 @@ def extrapolate(y: FloatImage, x: FloatImage, step: FloatImage, momentum: float,
 def extrapolate_buffer(
     new: FloatImage, last: FloatImage, before: FloatImage, momentum: float, overrelaxation: float
 ) -> None:
-    """Write new + momentum (new - last) + overrelaxation (new - before) to ``new``, the old new to ``last``."""
+    """Write new + momentum (new - last) + overrelaxation (new - before) to ``new`` and ``before``, new to ``last``."""
     beta, gamma = np.float32(momentum), np.float32(overrelaxation)
     for i in prange(new.size):
         value = new[i]
-        new[i] = value + beta * (value - last[i]) + gamma * (value - before[i])
-        last[i] = value
+        ahead = value + beta * (value - last[i]) + gamma * (value - before[i])
+        new[i], before[i], last[i] = ahead, ahead, value
 
 
 @compiled(parallel=True, fastmath=True)

@@ -9,7 +9,9 @@ Sweeps find that slowly, since it changes the light by little; here it is a prob
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import prange
@@ -18,6 +20,8 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.jit import compiled
 from controller.optics.transport import LightTransport
 
+FAINTEST: Final = 1e-3
+"""Fraction of a projector's brightest observed pixel below which a pixel counts as in shadow."""
 BLOCK_PX: Final = 4
 """Places are blocks of camera pixels, about one and a half metapixels wide; of 2, a sweep less, for twice the time."""
 RIDGE: Final = 1e-4
@@ -35,31 +39,64 @@ LEAST_DETERMINANT: Final = 1e-3
 """Of the three colours at a place, relative to those of pure primaries."""
 
 
-def initial_estimate(transport: LightTransport, target_light: FloatImage) -> FloatImage:
-    """(3, pixels of all projectors) in [0, 1] for ``target_light`` (3, camera rows, columns), the light to be made.
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteLight:
+    """What solves need of a stage's projectors alone, each showing white: calculated once.
 
-    The latter is overwritten.
+    ``observed`` (3, pixels) float32: the mean over each pixel's own light
+    ``faint`` (projectors,): up to this an observed pixel counts as in shadow
+    ``blocks`` (projectors, 3, rows, columns) float32: means over blocks of camera pixels
     """
-    count = len(transport.sizes)
-    blocks = tuple(-(-side // BLOCK_PX) for side in transport.camera_shape)
-    white = np.empty((count, 3, *blocks), np.float32)
-    target = np.empty((3, *blocks), np.float32)
-    _block_means(target_light, target)
-    ones, light = np.ones((3, transport.pixels), np.float32), target_light
-    for n in range(count):
+
+    observed: FloatImage
+    faint: tuple[float, ...]
+    blocks: FloatImage
+
+
+_white: Final[WeakKeyDictionary[LightTransport, WhiteLight]] = WeakKeyDictionary()
+
+
+def white_light(transport: LightTransport) -> WhiteLight:
+    """Of a stage; kept as long as its transport is. What two threads ask for at once may be calculated twice."""
+    made = _white.get(transport)
+    if made is None:
+        made = _white[transport] = _see_white(transport)
+    return made
+
+
+def _see_white(transport: LightTransport) -> WhiteLight:
+    grid = blocks_of(transport.camera_shape)
+    blocks = np.empty((len(transport.sizes), 3, *grid), np.float32)
+    observed, ones = np.empty((3, transport.pixels), np.float32), np.ones((3, transport.pixels), np.float32)
+    light, faint = np.empty((3, *transport.camera_shape), np.float32), []
+    for n, white in enumerate(blocks):
+        own = transport.span(n)
         transport.forward_planes(ones, projectors=(n, n + 1), out=light)
-        _block_means(light, white[n])
-    del ones
-    _solve_blocks(white, transport.mixing.astype(np.float64), target)
-    found = np.zeros((3, transport.pixels), np.float32)
-    for n in range(count):
-        _upsample(white[n], light)
+        block_means(light, white)
+        observed[:, own] = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, own]
+        faint.append(float(FAINTEST * observed[:, own].max(initial=0)))
+    return WhiteLight(observed, tuple(faint), blocks)
+
+
+def blocks_of(camera_shape: tuple[int, int]) -> tuple[int, int]:
+    """How many blocks of camera pixels lie one above the other, and side by side."""
+    return -(-camera_shape[0] // BLOCK_PX), -(-camera_shape[1] // BLOCK_PX)
+
+
+def initial_estimate(transport: LightTransport, target: FloatImage) -> FloatImage:
+    """(3, pixels of all projectors) in [0, 1] for ``target`` (3, rows, columns): the wanted light by blocks."""
+    shown = white_light(transport).blocks.copy()
+    _solve_blocks(shown, transport.mixing.astype(np.float64), target)
+    found = np.empty((3, transport.pixels), np.float32)
+    light = np.empty((3, *transport.camera_shape), np.float32)
+    for n, blocks in enumerate(shown):
+        _upsample(blocks, light)
         found[:, transport.span(n)] = transport.gaussian_mean_planes(light, projectors=(n, n + 1))[:, transport.span(n)]
     return np.clip(found, 0, 1, out=found)
 
 
 @compiled(parallel=True)
-def _block_means(image: FloatImage, out: FloatImage) -> None:
+def block_means(image: FloatImage, out: FloatImage) -> None:
     """Means of (3, rows, columns) over blocks."""
     _, rows, columns = image.shape
     for y in prange(out.shape[1]):

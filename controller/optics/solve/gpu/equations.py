@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.bounded.equations import EDGE_WEIGHT_STEPS, FAINTEST, SolveInput
-from controller.optics.solve.bounded.initial_estimate import BLOCK_PX
+from controller.optics.solve.bounded.equations import EDGE_WEIGHT_STEPS, SolveInput
+from controller.optics.solve.bounded.initial_estimate import BLOCK_PX, FAINTEST
 from controller.optics.solve.gpu.device import Array, Buffer, Clear, Copy, Device, Held, Step, Work, groups_of
 from controller.optics.solve.gpu.transport import DeviceTransport, constants
 

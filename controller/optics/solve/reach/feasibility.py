@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.arrays import FloatImage, Mask, strips
 from controller.core.channels import finite, largest, smallest
 from controller.core.errors import UsageError, WorkError
 from controller.optics.solve.bounded.solver import check_target
@@ -123,15 +123,13 @@ def _exposure_and_next(
     return exposure, following
 
 
-def _most(drive: DriveLevels, target: FloatImage, black: FloatImage, rows: slice) -> Float64:
+def _most(drive: DriveLevels, target: FloatImage, black: FloatImage, rows: slice) -> FloatImage:
     """(pixels,): the largest exposure of each pixel of the object in some rows of the picture."""
-    mask = drive.mask[rows]
-    per_exposure, at_none = (drive.of(light, rows)[mask].astype(np.float64) for light in (target, -black))
-    possible = finite(per_exposure) & finite(at_none)
-    per_exposure, at_none = per_exposure[possible], at_none[possible]
+    per_exposure, at_none = (drive.of(light, rows) for light in (target, -black))
     room = np.full_like(per_exposure, np.inf)
     # less than this needs no light worth counting, and its quotient would only overflow
-    return smallest(np.divide(1 - at_none, per_exposure, out=room, where=per_exposure > 1e-12))
+    np.divide(1 - at_none, per_exposure, out=room, where=(per_exposure > 1e-12) & (per_exposure < np.inf))
+    return smallest(room)[drive.mask[rows] & finite(per_exposure) & finite(at_none)]
 
 
 def target_radiance(target: FloatImage, black: FloatImage, exposure: float) -> FloatImage:

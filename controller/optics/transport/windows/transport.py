@@ -195,7 +195,7 @@ class WindowTransport(LightTransport):
         if not self.colours.size:
             return super().right_hand_side(picture, weights)
         out = np.empty(self.camera_shape, np.float32)
-        collect(picture * weights, self.colours, out)
+        collect(np.multiply(picture, weights, out=picture), self.colours, out)
         return out.reshape(-1)
 
     def gaussian_mean_planes(self, image: FloatImage, *, projectors: tuple[int, int] | None = None) -> FloatImage:

@@ -15,7 +15,7 @@ from controller.core.arrays import Float64, FloatImage, Mask, summed
 from controller.optics.capture.brackets import merge_brackets
 from controller.optics.capture.profile import load_profile
 from controller.optics.solve.bounded.engine import SolveContext
-from controller.optics.solve.bounded.equations import SolveSettings
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings
 from controller.optics.solve.memory_need import check_memory, refine_peak_bytes, stage_size
 from controller.optics.solve.result.common_causes import Cause, CommonCauses, common_causes, equations
 from controller.optics.solve.result.refinement import (
@@ -235,7 +235,7 @@ class _Refinement:
             self.calibrated.light,
             self.solved.target - indirect,
             corrected - indirect,
-            SolveSettings(self.options.smoothness, start=self._in_order(state.frames)),
+            SolveSettings(self.options.smoothness, start=self._in_order(state.frames), tolerance=APPEARANCE_TOLERANCE),
             SolveContext(
                 self.calibrated.engine,
                 progress=lambda iteration, kkt: self.context.advance(1 - 0.6 / (1 + iteration / 60)),

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from controller.core.arrays import FloatImage
+from controller.optics.solve import request
 from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
-from controller.optics.solve.bounded.equations import SolveSettings
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings
 from controller.optics.solve.request import SolveOptions, solve_appearance
+from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
@@ -55,6 +57,25 @@ def test_fine_detail_is_solved_in_full_or_advised_to_be(
     found = solve_appearance(StageLight(transport, STAGE.black), base, picture(pitch_px), replace(OPTIONS, mode=mode))
     assert found.figures["mode"] == made
     assert (found.figures["advice"] is not None) is advised
+
+
+def test_an_appearance_ends_where_no_one_would_see_more_sweeps(
+    transport: LightTransport, base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a target with fine detail and parts out of reach; the judge is a solve to the end."""
+    options = replace(OPTIONS, share=0.7, mode="full")
+    seen = {}
+    for tolerance in (APPEARANCE_TOLERANCE, 1e-6):
+        monkeypatch.setattr(request, "APPEARANCE_TOLERANCE", tolerance)
+        found = solve_appearance(StageLight(transport, STAGE.black), base, picture(7), options)
+        light, mask = transport.forward(found.frames) + STAGE.black, transport.object_mask
+        white = float(found.figures["exposure"] or 0)
+        apart = colour_difference(light, found.target, STAGE.camera_to_xyz, white, mask)[mask]
+        seen[tolerance] = np.percentile(apart, (50, 95)), int(found.figures["iterations"] or 0)
+    (early, few), (late, many) = seen.values()
+    assert early[0] <= late[0] + 0.005
+    assert early[1] <= late[1] + 0.02
+    assert few < many / 2
 
 
 def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:

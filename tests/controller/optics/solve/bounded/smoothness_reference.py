@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.core.arrays import FloatImage
-from controller.optics.solve.bounded.equations import FAINTEST
+from controller.optics.solve.bounded.initial_estimate import FAINTEST
 
 
 @dataclass(frozen=True, slots=True)

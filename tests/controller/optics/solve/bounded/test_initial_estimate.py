@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -16,6 +18,7 @@ from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.engine import IterationControl, block_coordinate_descent
 from controller.optics.solve.bounded.equations import build_problem, initial_point
+from controller.optics.solve.bounded.initial_estimate import white_light
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.planes import plane_frames
 
@@ -37,6 +40,20 @@ def guessed(calibration: Calibration, transport: LightTransport, target: FloatIm
     return plane_frames(
         initial_point(build_problem(transport, target, calibration.black, SMOOTHNESS, None)), transport.sizes
     )
+
+
+def test_what_depends_on_the_stage_alone_is_calculated_once_and_ends_with_its_transport(stage: Stage) -> None:
+    _, transport = even_stage(stage)
+    known = white_light(transport)
+    assert white_light(transport) is known
+    for n, size in enumerate(transport.sizes):
+        white = transport.forward_part(n, np.ones((*size, 3), np.float32))
+        seen = plane_frames(known.observed[:, transport.span(n)], [size])[0]
+        np.testing.assert_array_equal(seen, transport.gaussian_mean(white, n))
+    kept = weakref.ref(known.observed)
+    del transport, known
+    gc.collect()
+    assert kept() is None
 
 
 def test_light_within_reach_is_shared_alike_whatever_spills(stage: Stage) -> None:
