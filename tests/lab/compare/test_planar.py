@@ -24,7 +24,7 @@ def lens(size: tuple[int, int], focal: float, distortion: tuple[float, float]) -
 
 
 def seen_by(camera: Pinhole, points: Float64) -> Float64:
-    px, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array([*camera.distortion, 0, 0]))
+    px, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
     return np.asarray(px, np.float64).reshape(-1, 2)
 
 
@@ -39,7 +39,7 @@ def measured(lenses: tuple[Pinhole, Pinhole], bend: float) -> tuple[Metapixels, 
     turn = cv2.Rodrigues(np.array([0.05, -0.3, 0.02]))[0]
     x, y = np.meshgrid(np.arange(PROJECTOR[0]), np.arange(PROJECTOR[1]))
     px = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float64)
-    slope = cv2.undistortPoints(px, projector.matrix, np.array([*projector.distortion, 0, 0])).reshape(-1, 2)
+    slope = cv2.undistortPoints(px, projector.matrix, projector.distortion).reshape(-1, 2)
     rays = np.concatenate([slope, np.ones((len(slope), 1))], 1) @ turn.T
     centre = np.array([0.3, 0.02, 0.1])
     normal, at = np.array([0.1, -0.05, 1.0]), np.array([0.0, 0.0, 1.0])
