@@ -33,8 +33,8 @@ RATIO: Final = 0.88
 """A feature counts where its nearest one is so much nearer than the next one."""
 NEAR_PX: Final = 2.0
 SPOT_PX: Final = 4.0
-FEWEST_SPOTS: Final = 12
-"""Places that agree on one homography. Two different pictures have at most 6, by chance."""
+FEWEST_SPOTS: Final = 8
+"""Places that agree on one homography. Two different pictures have at most 5, by chance."""
 SEARCH: Final = 0.08
 """Of the object's longer side: so far from the homography a feature is looked for."""
 NEIGHBOURS: Final = 8
