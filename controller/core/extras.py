@@ -25,7 +25,7 @@ EXTRAS: Final = {
 _MODULES: Final = {
     "": "cramjam nacl numpy pyglet xxhash zstandard",
     "controller": "OpenEXR PIL StreamDeck cv2 cycler hid imagecodecs jinja2 llvmlite lz4 matplotlib numba"
-    " pydantic pydantic_core rawpy rich scipy serial tifffile tomlkit trimesh typer usb",
+    " pydantic pydantic_core pymediainfo rawpy rich scipy serial tifffile tomlkit trimesh typer usb",
     "panel": "aiomqtt anyio argon2 multipart prometheus_client python_multipart starlette uvicorn",
     "bench": "embreex",
     "gphoto2": "gphoto2",
