@@ -35,7 +35,7 @@ def test_a_painting_is_calibrated_by_a_camera_on_usb_whose_cable_is_pulled(tmp_p
         assert done.code == 0, done.error
     assert velatura("report", done.result["run"]).code == 0
     report = json.loads((Path(done.result["run"]) / "report.json").read_text())
-    assert report["shape"]["shape"] == "unknown"
+    assert report["shape"]["shape"] == "plane"
     assert report["shape"]["code"] == "one-projector"
     errors = dict(part.split(" ")[:2] for part in done.result["error"].split(", "))
     assert sorted(errors) == sorted(projector.name for projector in read_truth(stage).projectors)
