@@ -45,6 +45,7 @@ from tests.controller.stage.blender.test_render import PAINT_SCENE
 from tests.end_to_end.conftest import FinishedDemo
 from tests.end_to_end.kiosk import copied, wait_for
 from tests.end_to_end.test_targets import CAMERA_PX, grey_png
+from tests.shared import made_once
 from tests.waiting import meanwhile
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1500)]
@@ -52,12 +53,18 @@ LONG_MS = 800_000
 HEAD = "\n[[appearances]]"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def seen_stage(finished_demo: FinishedDemo, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo's, with what a kiosk keeps of its calibration for previews: that takes as long as a whole test."""
-    stage = copied(finished_demo.stage, tmp_path_factory.mktemp("seen") / "stage")
-    view_picture(stage, finished_calibration(stage), check_stage(stage).names)
-    return stage
+    """The demo's, with what a kiosk keeps of its calibration for previews: that takes as long as a whole test.
+
+    All workers share it: copy it.
+    """
+
+    def look(folder: Path) -> None:
+        stage = copied(finished_demo.stage, folder / "stage")
+        view_picture(stage, finished_calibration(stage), check_stage(stage).names)
+
+    return made_once(tmp_path_factory, "seen", look)[0] / "stage"
 
 
 @pytest.fixture

@@ -96,7 +96,7 @@ def test_a_sensor_buffer_is_light_as_the_camera_samples_it(transport: LightTrans
     for n in range(len(transport.sizes)):
         transport.accumulate_forward(n, p, buffer)
     residual, gradient = np.empty_like(buffer), np.zeros_like(p)
-    transport.normal_residual(buffer, weights, transport.right_hand_side(wanted, weights), residual)
+    transport.normal_residual(buffer, weights, transport.right_hand_side(wanted.copy(), weights), residual)
     for n in range(len(transport.sizes)):
         transport.adjoint_of_buffer(n, residual, gradient)
     expected = transport.adjoint_planes(weights * (transport.forward_planes(p) - wanted))
