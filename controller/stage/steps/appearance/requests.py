@@ -40,7 +40,7 @@ from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
-from controller.stage.steps.appearance.restoring import Restoration, restoration_request
+from controller.stage.steps.appearance.restoring import TITLE, Restoration, restoration_request
 from controller.stage.steps.appearance.solving import AppearanceRequest
 from controller.stage.steps.mesh import carried_mesh
 
@@ -51,7 +51,7 @@ TITLES: Mapping[str, str] = {
     "gloss": "A gloss",
     "recolour": "Recoloured",
     "picture": "A picture as seen from the camera",
-    "restoration": "Restored",
+    "restoration": TITLE,
     "blender": "Rendered by Blender",
     "texture": "A picture painted on the object",
 }

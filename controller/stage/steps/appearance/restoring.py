@@ -24,6 +24,7 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import Registered
 from controller.stage.steps.appearance.solving import AppearanceRequest
 
+TITLE: Final = "Restored"
 REGISTER_S: Final = 5.0
 TURNED_DEGREES: Final = 2.0
 WHOLE: Final = 0.995
@@ -110,6 +111,4 @@ def restoration_request(
         residual = restoration.made[1].residual_px.astype(np.float16)
         return Registered(about, figures, residual).write(context.folder, name)
 
-    return AppearanceRequest(
-        name, f"{name}, restored", lambda: restoration.made[0], about, prepare, REGISTER_S, "Registering"
-    )
+    return AppearanceRequest(name, TITLE, lambda: restoration.made[0], about, prepare, REGISTER_S, "Registering")
