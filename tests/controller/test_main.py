@@ -129,7 +129,7 @@ def test_a_command_that_succeeds_shows_its_result(capsys: pytest.CaptureFixture[
 
 
 def test_help_names_every_listed_command_with_its_first_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    program = shell._built()
+    program: Any = shell._built()
     listed = [word for word in groups.words_of(program) if " " not in word and not program.commands[word].hidden]
     for arguments in ([], ["--help"]):
         assert shell.run(arguments) == 0
