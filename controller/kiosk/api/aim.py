@@ -138,6 +138,8 @@ def _shared_hints(dark: float, grazing: float) -> list[str]:
 
 
 def _of_calibration(calibrated: Calibrated) -> Aiming:
+    from controller.stage.artefacts.geometry import known_geometry
+
     transport, calibration = calibrated.transport, calibrated.calibration
     mask = calibration.object_mask
     lit = np.stack([np.asarray(part, bool) & mask for part in transport.lit])
@@ -149,7 +151,7 @@ def _of_calibration(calibrated: Calibrated) -> Aiming:
     for number, part in enumerate(calibration.projectors):
         aims.append(ProjectorAim(part.name, float(lit[number].sum() / area), focus_of(part.metapixels)))
     dark = float((on_object < DARK * usual).mean()) if on_object.size else 0.0
-    geometry = known_geometry_of(calibrated)
+    geometry = known_geometry(calibrated.folder, calibrated.projectors)
     grazing = 0.0 if geometry is None else grazing_share(geometry, lit, mask)
     return Aiming(
         tuple(aims), float((lit.sum(axis=0) >= 2).sum() / area), dark, grazing,
@@ -184,10 +186,3 @@ def grazing_share(geometry: Geometry, lit: npt.NDArray[np.bool_], mask: Mask) ->
         steepest = np.maximum(steepest, np.where(part, np.nan_to_num(cosine), 0))
     known = lit.any(axis=0) & mask & np.isfinite(geometry.normals).all(axis=2)
     return float((steepest[known] < GRAZING).mean()) if known.any() else 0.0
-
-
-def known_geometry_of(calibrated: Calibrated) -> Geometry | None:
-    """As ``artefacts.geometry.known_geometry``."""
-    from controller.stage.artefacts.geometry import known_geometry
-
-    return known_geometry(calibrated.folder, calibrated.projectors)

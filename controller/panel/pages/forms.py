@@ -78,23 +78,20 @@ class Forms:
         self._panel, self._pages = panel, pages
 
     def entries(self) -> list[Entry]:
-        return (
-            [
-                Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._operation(op)))
-                for op in self._panel.operations
-                if op.name in LEADS_TO
+        found = []
+        for op in self._panel.operations:
+            handlers: dict[str, Handler] = {}
+            if op.name in LEADS_TO:
+                handlers[f"/do/{op.name}"] = self._operation(op)
+            if op.name == "check-settings":
+                handlers[f"/do/{op.name}"] = self._check
+            if op.name == "save-settings":
+                handlers["/settings/fields"] = self._fields(op)
+            found += [
+                Entry("POST", path, "session", op.role, checked(self._panel, handler))
+                for path, handler in handlers.items()
             ]
-            + [
-                Entry("POST", f"/do/{op.name}", "session", op.role, checked(self._panel, self._check))
-                for op in self._panel.operations
-                if op.name == "check-settings"
-            ]
-            + [
-                Entry("POST", "/settings/fields", "session", op.role, checked(self._panel, self._fields(op)))
-                for op in self._panel.operations
-                if op.name == "save-settings"
-            ]
-        )
+        return found
 
     def _fields(self, save: Operation) -> Handler:
         """The fields of the settings that museums change; all else in stage.toml stays."""

@@ -109,6 +109,12 @@ def read_geometry(run: Path, projectors: Sequence[str] | None = None) -> Geometr
     return replace(geometry, projectors=tuple(by_name[name] for name in projectors))
 
 
+def read_camera(run: Path) -> Pinhole:
+    """The camera of a finished run, without the arrays of its points. Raises UsageError("shape-unknown")."""
+    require_shape(run, "This")
+    return _read_pinhole(read_geometry_figures(run)["camera"])
+
+
 def known_points_m(run: Path) -> FloatImage | None:
     """(camera rows, columns, 3) float32: the object's points in the camera's frame, metres, NaN where unknown.
 

@@ -33,7 +33,7 @@ from controller.optics.calibrate.mesh_alignment import (
     refined,
 )
 from controller.optics.calibrate.values import Pinhole
-from controller.stage.artefacts.geometry import known_points_m, read_geometry, require_shape
+from controller.stage.artefacts.geometry import known_points_m, read_camera, read_geometry_figures, require_shape
 from controller.stage.artefacts.mesh import RegisteredMesh, last_mesh
 
 MOST_COST: Final = 0.25
@@ -66,9 +66,10 @@ class Surface:
     def read(cls, run: Path) -> Surface:
         """Raises UsageError("shape-unknown")."""
         require_shape(run, "A mesh")
-        geometry, points_m = read_geometry(run), known_points_m(run)
+        points_m = known_points_m(run)
         assert points_m is not None
-        return cls(geometry.camera, points_m, ~room_pixels(points_m), geometry.scale_known)
+        scale_known = bool(read_geometry_figures(run)["scale_known"])
+        return cls(read_camera(run), points_m, ~room_pixels(points_m), scale_known)
 
     def parts(self) -> list[Mask]:
         """The whole, and the largest of what stands apart in the picture or in depth, if there are several."""

@@ -27,7 +27,7 @@ from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.transport import build_transport
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.depth_edges import edged
-from controller.stage.artefacts.geometry import read_geometry_figures
+from controller.stage.artefacts.geometry import read_shape
 from controller.stage.sessions.check import check_stage
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.calibrate.gate import grade_figures
@@ -71,7 +71,7 @@ def _rows(folder: Path, size: str, thing: str, seeds: Sequence[int]) -> list[Row
         except CodedError as error:
             said.append(f"{error.code}: {error.what}")
             continue
-        shape = read_geometry_figures(run).get("shape", "surface")
+        shape = read_shape(run).shape
         said.append(f"grade {grade_figures(run)['grade']} and {shape} with {len(check_stage(stage).names)} projectors")
         figures.append(judged(stage, run, (PICTURE,), tuple(REFINED)))
     rows = [at_least(f"{thing}, calibrated", len(figures), len(seeds), unit="stages", how="; ".join(said))]

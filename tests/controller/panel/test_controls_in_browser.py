@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from controller.panel.app import STATIC
 from tests.controller.panel.browser import SHELL, chromium, enter, tab
@@ -32,6 +32,13 @@ def browser() -> Iterator[Browser]:
 def kiosk_of(served: Served) -> MemoryKiosk:
     assert isinstance(served.kiosk, MemoryKiosk)
     return served.kiosk
+
+
+def choose(page: Page, picture: Image.Image) -> None:
+    """As a file of the form that is shown."""
+    out = io.BytesIO()
+    picture.save(out, "PNG")
+    page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
 
 
 def test_the_picture_is_made_darker_black_and_followed_by_the_next(fresh: Served, browser: Browser) -> None:
@@ -82,12 +89,10 @@ def test_what_is_chosen_is_not_said_to_play_while_the_lamps_are_dark(fresh: Serv
 
 
 def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served, browser: Browser) -> None:
-    out = io.BytesIO()
-    Image.new("RGB", (240, 160), "white").save(out, "PNG")
     with tab(browser, fresh.address) as page:
         enter(page, "otto")
         page.goto("/appearances/new")
-        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        choose(page, Image.new("RGB", (240, 160), "white"))
         page.get_by_role("button", name="Upload").click()
         expect(page.get_by_text("45 %").first).to_be_visible()
         page.get_by_label("Target over the object").fill("20")
@@ -116,12 +121,10 @@ def test_an_outline_restricts_the_target_and_the_result_is_played(fresh: Served,
 
 
 def test_points_in_the_picture_and_on_the_object_lay_it(fresh: Served, browser: Browser) -> None:
-    out = io.BytesIO()
-    Image.new("RGB", (240, 160), "white").save(out, "PNG")
     with tab(browser, fresh.address) as page:
         enter(page, "otto")
         page.goto("/appearances/new")
-        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        choose(page, Image.new("RGB", (240, 160), "white"))
         page.get_by_role("button", name="Upload").click()
         lay = page.get_by_role("button", name="Lay it by these points")
         for name in ("The uploaded target", "The object in white light"):
@@ -154,16 +157,14 @@ COLOUR_AT = """([way, x, y]) => {
 
 def test_a_chosen_picture_is_shown_in_each_way_to_fit_it(panel: Served, browser: Browser) -> None:
     """The view is 240 x 160, drawn as 80 x 53.3 around (48, 40); the picture is 120 x 20, red with a blue left edge."""
-    out = io.BytesIO()
     chosen = Image.new("RGB", (120, 20), (255, 0, 0))
     chosen.paste((0, 0, 255), (0, 0, 30, 20))
-    chosen.save(out, "PNG")
     red, blue, nothing = [255, 0, 0, 255], [0, 0, 255, 255], [0, 0, 0, 0]
     with tab(browser, panel.address) as page:
         enter(page, "otto")
         page.goto("/appearances/new")
         expect(page.locator(".way canvas").first).to_be_hidden()
-        page.set_input_files("#file", {"name": "t.png", "mimeType": "image/png", "buffer": out.getvalue()})
+        choose(page, chosen)
         expect(page.locator(".way canvas").first).to_be_visible()
         for way, at, colour in [
             ("fit", (48, 40), red), ("fit", (12, 40), blue), ("fit", (48, 20), nothing),

@@ -101,8 +101,7 @@ def restored(
     if look.outside == "dark":
         as_is &= registration.inside
     # its own reflectance is that in the camera's white, and only the light's colour changes it
-    white = reflectance_to_camera(LIGHTS[look.light], camera_to_xyz).sum(axis=1).astype(np.float32)
-    image[as_is] = np.maximum(own[as_is], 0) * white
+    image[as_is] = np.maximum(own[as_is], 0) * to_camera.sum(axis=1).astype(np.float32)
     return replace(asked, image=image, mask=matched | as_is)
 
 

@@ -35,7 +35,7 @@ from controller.optics.solve.targets.values import Target, in_box, on_each, thro
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import read_geometry, require_shape
+from controller.stage.artefacts.geometry import read_camera, read_geometry, require_shape
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
@@ -228,7 +228,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         if sheet.shape[2] == 3:
             sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
         mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
-        places = None if mesh is None else mesh.places(read_geometry(calibrated.folder).camera)
+        places = None if mesh is None else mesh.places(read_camera(calibrated.folder))
         return texture(sheet, places, as_it_is(calibrated.transport), mask)
     geometry = read_geometry(calibrated.folder, calibrated.projectors)
     if kind == "photograph":
