@@ -15,14 +15,14 @@ from controller.cli import groups
 from tests import house
 
 LIMITS: Final[Mapping[str, int]] = {
-    "lines": 106_000,
-    "files": 640,
+    "lines": 111_000,
+    "files": 655,
     "folders at the root of controller": 11,
     "files with one importer": 145,
     "small files with one importer": 5,
     "functions with 8 or more parameters": 11,
     "modules named by a participle": 10,
-    "decision records": 35,
+    "decision records": 38,
 }
 MOST_COMMANDS: Final = 17
 """In the first help, without those of other distributions."""
