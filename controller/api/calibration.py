@@ -237,7 +237,7 @@ class CalibratedRun:
 
     @property
     def transport(self) -> LightTransport:
-        """The light transport, with the corrections at depth edges if the run has measured them."""
+        """The light transport."""
         return self._calibrated.transport
 
     @property

@@ -34,8 +34,8 @@ class PatternChoice:
     """Which patterns a calibration photographs."""
 
     mode: Annotated[
-        Literal["fast", "paper", "auto"],
-        typer.Option(help="fast: sinusoids; paper: dots everywhere; auto: dots at depth edges."),
+        Literal["fast", "paper"],
+        typer.Option(help="fast: sinusoids; paper: dots."),
     ] = "fast"
     dot_spacing: Annotated[
         str | None, typer.Option(help='Projector pixels between dots, or "auto" (from the blur).')

@@ -15,7 +15,6 @@ from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.stage.artefacts.calibration import read_calibration
-from controller.stage.artefacts.depth_edges import edged
 from controller.stage.artefacts.geometry import camera_px, known_geometry
 from controller.stage.artefacts.solved import SolvedBase
 
@@ -57,7 +56,7 @@ class Calibrated:
     @property
     def transport(self) -> LightTransport:
         if self._transport is None:
-            self._transport = edged(build_transport(self.calibration), self.folder, self.projectors)
+            self._transport = build_transport(self.calibration)
         return self._transport
 
     @property

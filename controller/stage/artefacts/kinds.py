@@ -28,9 +28,6 @@ class StepKind(enum.StrEnum):
     METAPIXELS = "metapixels"
     STUDY_DOTS = "study-dots"
     STUDY_SHARES = "study-shares"
-    EDGE_DOTS = "edge-dots"
-    EDGES = "edges"
-    EDGE_TERMS = "edge-terms"
     MODE = "mode"
     DRIFT_PHOTOGRAPHS = "drift-photographs"
     DRIFT = "drift"
@@ -55,7 +52,7 @@ class StepKind(enum.StrEnum):
 
 OF_PROJECTORS: Final = (
     StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT, StepKind.DOTS,
-    StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.STUDY_SHARES, StepKind.EDGE_DOTS, StepKind.EDGES,
+    StepKind.METAPIXELS, StepKind.STUDY_DOTS, StepKind.STUDY_SHARES,
 )  # fmt: skip
 """Kinds of the steps that each projector has of its own."""
 

@@ -26,7 +26,7 @@ from controller.stage.exchange.content import Content
 SUMS, INDEX = "SHA256SUMS", "index.json"
 MEASURED: Final = (
     StepKind.GEOMETRY, StepKind.RADIOMETRY, StepKind.PIXELS, StepKind.INDIRECT, StepKind.DOTS, StepKind.METAPIXELS,
-    StepKind.EDGES, StepKind.EDGE_TERMS, StepKind.CAMERA, StepKind.EXPOSURE, StepKind.DELAY, "verification",
+    StepKind.CAMERA, StepKind.EXPOSURE, StepKind.DELAY, "verification",
 )  # fmt: skip
 """Kinds of files that are copied to calibration/."""
 
@@ -180,7 +180,7 @@ A projector's name stands for NAME.
 | `radiometry-NAME.npz` | `white` of this projector alone, `black`; `response` (3, 256); `mixing` |
 | `pixels-NAME.npz` | `projector_px` of camera pixels where `seen`; of projector pixels `centre_px`, `covariance_px2` |
 | | `colours_px` (3, 2): how far red, green and blue lie to the right and below, where they do not lie on each other |
-| `dots-NAME.npz`, `edges-NAME.npz` | the same spots, measured by dots, where the run has them |
+| `dots-NAME.npz` | the same spots, measured by dots, where the run has them |
 | `camera.npz` | measurements of the camera |
 | `indirect-NAME.npz` | light that came by way of other surfaces, where it was measured |
 | `exposure.json`, `delay.json` | seconds: exposures of the photographs, delay of the projectors' pictures |

@@ -14,7 +14,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import write_mode
 
-CalibrationMode = Literal["fast", "paper", "auto"]
+CalibrationMode = Literal["fast", "paper"]
 MODES: Final[tuple[CalibrationMode, ...]] = get_args(CalibrationMode)
 AUTO: Final = "auto"
 
@@ -47,7 +47,7 @@ def dot_options(mode: str, spacing: str | None) -> DotOptions:
         raise UsageError(
             "dot-spacing-unused",
             what="The mode fast shows no dots, so --dot-spacing has no effect.",
-            remedy="Remove it, or add --mode auto or --mode paper.",
+            remedy="Remove it, or add --mode paper.",
         )
     if spacing is None:
         return DotOptions(known, PAPER_SPACING_PX if known == "paper" else None)

@@ -1,4 +1,4 @@
-"""Ways to measure metapixels against the truth of one stage: sinusoids, dots at two spacings, dots at depth edges only.
+"""Ways to measure metapixels against the truth of one stage: sinusoids, and dots at two spacings.
 
 And how fast dots are fitted at the paper's size, on pictures that are made here.
 """
@@ -21,7 +21,6 @@ from controller.optics.capture.pattern_frames import device_frame
 from controller.optics.transport import LightTransport, build_transport
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibration import read_calibration
-from controller.stage.artefacts.depth_edges import edged
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import PhotographSet, captured
 from controller.stage.services.calibrate import calibrate
@@ -34,11 +33,10 @@ from lab.timings.tools.judge import metapixel_errors, relative, rms
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
 from lab.timings.tools.truth import Truth, developed
 
-RUNS: Final = (("auto", None), ("paper", "6"), ("paper", "16"))
+RUNS: Final = (("fast", None), ("paper", "6"), ("paper", "16"))
 EDGE_PX: Final = 3
 """Camera pixels around an edge or a fold that count as near it."""
 GRID_PX: Final = 12
-DOTS: Final = (StepKind.DOTS, StepKind.EDGE_DOTS)
 PAPER_PX: Final = (1400, 1050)
 CAMERA_PX: Final = (3888, 2592)
 BLURS_PX: Final = {"in focus": 0.47, "blurred 1.2 px": 1.22}
@@ -55,17 +53,15 @@ def measure(size: str) -> list[Row]:
             run = _calibrated(stage, mode, spacing)
             wall_s = time.perf_counter() - began
             calibration = read_calibration(run, names)
-            dots = sum(captured(run, PhotographSet(kind, name)) for kind in DOTS for name in names) / len(names)
-            if mode == "auto":
-                model = build_transport(calibration)
-                rows += _judged("fast", truth, calibration, model)
-                rows += _judged("auto", truth, calibration, edged(model, run, names))
+            dots = sum(captured(run, PhotographSet(StepKind.DOTS, name)) for name in names) / len(names)
+            if mode == "fast":
+                rows += _judged("fast", truth, calibration, build_transport(calibration))
                 plain = tuple(dataclasses.replace(part, phase_map=None) for part in calibration.projectors)
                 gaussians = dataclasses.replace(calibration, projectors=plain)
                 rows += _judged("fast, Gaussians", truth, gaussians, build_transport(gaussians))
             else:
                 rows += _judged(f"dots r = {spacing}", truth, calibration, build_transport(calibration))
-            label = "auto" if mode == "auto" else f"dots r = {spacing}"
+            label = mode if mode == "fast" else f"dots r = {spacing}"
             rows.append(at_most(f"{label}: photographs of dots, a projector", dots, None, unit="", how=""))
             rows.append(at_most(f"{label}: calibration", wall_s, None, unit="s", how="all projectors, lamps included"))
     return rows + fit_rows()

@@ -26,7 +26,6 @@ from controller.optics.solve.reach.feasibility import expose_target, target_radi
 from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.transport import build_transport
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.depth_edges import edged
 from controller.stage.artefacts.geometry import read_shape
 from controller.stage.sessions.check import check_stage
 from controller.stage.steps.appearance.solving import device_frames
@@ -119,7 +118,7 @@ def _alone(stage: Path, run: Path) -> tuple[float, float]:
     calibrated = Calibrated(run, names)
     whole = calibrated.calibration
     one = dataclasses.replace(whole, projectors=whole.projectors[:1])
-    transport = edged(build_transport(one), run, names[:1])
+    transport = build_transport(one)
     asked = expose_target(transport, _smooth(whole.black.shape), whole.black, share=SHARE)
     radiance, direct = (target_radiance(image, whole.black, 1.0) for image in (asked.wanted, asked.needed))
     mask = asked.possible.reachable & transport.object_mask

@@ -30,7 +30,7 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
     ),
     ErrorCause.EDGE: (
         "edge of two surfaces", "camera pixels see two surfaces at once at a depth edge",
-        "`velatura calibrate --mode auto` measures such edges with dots",
+        "usually no action is needed; move the projector or the camera if such lines disturb",
     ),
     ErrorCause.MOVED: ("moved", "the pattern lies elsewhere than predicted", "something moved: run `velatura drift`"),
     ErrorCause.DIMMED: ("brightness", "it is evenly brighter or darker than predicted",

@@ -218,7 +218,7 @@ class DeviceEquations:
         steps.append(Clear(self._reach))
         for n, one in enumerate(self.projectors):
             steps += [Clear(self.light), self._over_pixels(one, "fill_white", bound=[transport.shown], white=True)]
-            steps += transport.forward(n, self.light, absolute=True)
+            steps += transport.forward(n, self.light)
             kernel = self.device.kernel("add")
             steps.append(self.device.work(kernel, [self._reach, self.light], transport.sensor_count))
             steps += transport.counted_of(self.light, self.weights)

@@ -1,25 +1,22 @@
 """The light transport on a graphics processor: T p, T' r and means over projector pixels, on buffers that stay there.
 
-The sensor's buffer holds a number for each camera site, and after them three for each camera pixel with a term at a
-depth edge. Products have the windows and tables of ``transport.windows``; nothing is approximated further.
+The sensor's buffer holds a number for each camera site. Products have the windows and tables of ``transport.windows``;
+nothing is approximated further.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 from controller.core.arrays import FloatImage
 from controller.optics.solve.bounded.initial_estimate import BLOCK_PX
 from controller.optics.solve.gpu.device import GROUP, Buffer, Device, DeviceRefused, Held, Work
 from controller.optics.solve.gpu.records import BLOCK, RECORD_BYTES, bands_of, place_columns, reach_of
 from controller.optics.transport import LightTransport
-from controller.optics.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.optics.transport.planes import CameraBox
 from controller.optics.transport.windows.transport import WindowTransport
 
@@ -44,7 +41,7 @@ class _Windows:
 
 
 class DeviceTransport:
-    """T on a device. ``sites``, ``edges``: what the sensor's buffer holds; ``sensor_count`` numbers in all.
+    """T on a device. The sensor's buffer holds ``sensor_count`` numbers.
 
     ``shown`` has room for one projector's mixed frame (3, its pixels), ``residual`` for a picture (3, rows, columns)
     """
@@ -55,11 +52,12 @@ class DeviceTransport:
         ``band_bytes``: most of the windows in one piece; None: as much as the device can use.
         Raises DeviceRefused where the device has no room, or the transport no windows.
         """
-        windowed, terms = parts_of(transport)
+        if not isinstance(transport, WindowTransport):
+            raise DeviceRefused("this calibration has no phase maps, and the graphics processor needs them")
         self._held = Held(device)
         self._band_bytes = band_bytes or device.most_bytes
         try:
-            self._copy(device, transport, windowed, terms)
+            self._copy(device, transport)
         except BaseException:
             self.free()
             raise
@@ -68,21 +66,15 @@ class DeviceTransport:
         """Give the memory back."""
         self._held.free()
 
-    def _copy(
-        self, device: Device, transport: LightTransport, windowed: WindowTransport, terms: tuple[EdgeTerm, ...]
-    ) -> None:
+    def _copy(self, device: Device, windowed: WindowTransport) -> None:
         held = self._held
-        self.device, self.source = device, transport
-        self.sizes, self.mixing = transport.sizes, transport.mixing
-        self.box = box = _box_of(transport, windowed)
+        self.device, self.source = device, windowed
+        self.sizes, self.mixing = windowed.sizes, windowed.mixing
+        self.box = box = _box_of(windowed)
         self.rows, self.columns = box.bottom - box.top, box.right - box.left
         self.mosaic = windowed.colours.size > 0
         pixels = self.rows * self.columns
-        self.sites = pixels if self.mosaic else 3 * pixels
-        terms = tuple(dataclasses.replace(term, camera=self._inside(term.camera)) for term in terms)
-        on_edges = np.unique(np.concatenate([np.zeros(0, np.int64), *(term.camera for term in terms)]))
-        self.edges = len(on_edges)
-        self.sensor_count = self.sites + 3 * self.edges
+        self.sensor_count = pixels if self.mosaic else 3 * pixels
         table, small = windowed.table, windowed.small
         kinds = np.stack([table.first, table.size], 1).astype(np.uint32)
         self._tables = {
@@ -99,11 +91,6 @@ class DeviceTransport:
         self._sites = held.room(4 * pixels, "camera samples") if self.mosaic else self.residual
         self._per_sum = windowed.per_sum
         self._camera = device.uniform(self._camera_values(windowed.colours))
-        self._on_edges = held.put(on_edges.astype(np.uint32), "edges")
-        self._terms = {
-            absolute: [self._term(n, term, on_edges, absolute) for n, term in enumerate(terms)]
-            for absolute in (False, True)
-        }
 
     def _copied(self, windowed: WindowTransport, n: int) -> list[_Windows]:
         tables = windowed.table, windowed.small
@@ -136,8 +123,8 @@ class DeviceTransport:
 
     # work
 
-    def forward(self, n: int, sensor: Buffer, *, absolute: bool = False) -> list[Work]:
-        """Adds T_n p_n to ``sensor``; ``shown`` holds the mixed frame M p_n. ``absolute``: with magnitudes in T."""
+    def forward(self, n: int, sensor: Buffer) -> list[Work]:
+        """Adds T_n p_n to ``sensor``; ``shown`` holds the mixed frame M p_n."""
         work = []
         for part in self._windows[n]:
             begin, end = part.own
@@ -147,13 +134,6 @@ class DeviceTransport:
             kernel = self.device.kernel("band", "records", f"{kind}_shares", f"forward_{kind}")
             bound = [self._band(n, part, _IDENTITY), part.records, part.first, *self._tables[part.small]]
             work.append(self.device.work(kernel, [*bound, self.shown, sensor], (-(-part.most // GROUP), end - begin)))
-        terms = self._terms[absolute]
-        if terms and terms[n].rows:
-            term = terms[n]
-            kernel = self.device.kernel("term", "edge_forward")
-            work.append(
-                self.device.work(kernel, [term.values, *term.by_row, term.slots, self.shown, sensor], term.rows)
-            )
         return work
 
     def adjoint(self, n: int, out: Buffer, *, absolute: bool = False) -> list[Work]:
@@ -161,14 +141,8 @@ class DeviceTransport:
 
         ``absolute``: with magnitudes in T.
         """
-        mixing, terms = self.mixing[n], self._terms[absolute]
-        work = self._gather(n, abs(mixing) if absolute else mixing, out, even=False)
-        if terms and terms[n].columns:
-            term = terms[n]
-            kernel = self.device.kernel("term", "edge_adjoint")
-            bound = [term.values, *term.by_column, term.own, term.camera, self.residual, out]
-            work.append(self.device.work(kernel, bound, term.columns))
-        return work
+        mixing = self.mixing[n]
+        return self._gather(n, abs(mixing) if absolute else mixing, out, even=False)
 
     def sums(self, n: int, out: Buffer) -> list[Work]:
         """Writes the sums under the metapixels of the picture in ``residual``, gains left out, to ``out``.
@@ -217,11 +191,7 @@ class DeviceTransport:
         times = "times_weight" if weights is not None else "times_one"
         given = {1: sensor, 2: wanted, 3: weights, 4: self.residual}
         bound = {0: self._camera, **{number: buffer for number, buffer in given.items() if buffer is not None}}
-        work = [self.device.work(self.device.kernel("camera", less, times, name), bound, self.rows * self.columns)]
-        if self.edges:
-            bound = {**bound, 2: self._on_edges}
-            work.append(self.device.work(self.device.kernel("camera", times, "edge_residual"), bound, self.edges))
-        return work
+        return [self.device.work(self.device.kernel("camera", less, times, name), bound, self.rows * self.columns)]
 
     def collect(self) -> list[Work]:
         """Brings the picture in ``residual`` to the sites: D'."""
@@ -249,39 +219,18 @@ class DeviceTransport:
 
     def _camera_values(self, colours: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
         four = colours.ravel() if colours.size else np.zeros(4, np.int64)
-        numbers = [self.rows, self.columns, self.rows * self.columns, self.sites, *four, self.edges, 0, 0, 0]
+        numbers = [self.rows, self.columns, self.rows * self.columns, 0, *four]
         return np.array(numbers, np.uint32)
 
-    def _term(self, n: int, term: EdgeTerm, on_edges: npt.NDArray[np.int64], absolute: bool) -> _Term:
-        rows = sp.csr_matrix(abs(term.differences) if absolute else term.differences)
-        mixing = abs(self.mixing[n]) if absolute else self.mixing[n]
-        columns = sp.csc_matrix(rows)
-        own = np.flatnonzero(np.diff(columns.indptr))
-        first = np.append(columns.indptr[own], columns.indptr[-1])
-        pixels = self.sizes[n][0] * self.sizes[n][1]
-        count, camera = rows.shape[0], self.rows * self.columns
-        values = constants([count, len(own), pixels, camera, self.sites, self.edges], mixing)
 
-        def put(array: npt.NDArray[Any], kind: type[np.generic]) -> Buffer:
-            return self._held.put(array.astype(kind), "edges")
-
-        white = put(term.white, np.float32)
-        return _Term(
-            count, len(own), self.device.uniform(values),
-            [put(rows.indptr, np.uint32), put(rows.indices, np.uint32), put(rows.data, np.float32), white],
-            [put(first, np.uint32), put(columns.indices, np.uint32), put(columns.data, np.float32), white],
-            put(np.searchsorted(on_edges, term.camera), np.uint32), put(own, np.uint32), put(term.camera, np.uint32),
-        )  # fmt: skip
-
-
-def _box_of(transport: LightTransport, windowed: WindowTransport) -> CameraBox:
+def _box_of(transport: WindowTransport) -> CameraBox:
     """The camera pixels that solves are about: the object and all that is lit, with dark pixels around.
 
     It begins at a block of the initial estimate, and so at the same colour of the mosaic as the picture does.
     """
     rows, columns = transport.camera_shape
     seen = transport.object_mask.copy()
-    seen.reshape(-1)[windowed.windows.site % (rows * columns)] = True
+    seen.reshape(-1)[transport.windows.site % (rows * columns)] = True
     ends = []
     for axis, most in ((1, rows), (0, columns)):
         found = np.flatnonzero(seen.any(axis=axis))
@@ -291,29 +240,9 @@ def _box_of(transport: LightTransport, windowed: WindowTransport) -> CameraBox:
     return CameraBox(top, left, bottom, right)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Term:
-    rows: int
-    columns: int
-    values: Buffer
-    by_row: list[Buffer]
-    by_column: list[Buffer]
-    slots: Buffer
-    own: Buffer
-    camera: Buffer
-
-
 def constants(numbers: list[int], matrix: FloatImage) -> npt.NDArray[np.uint32]:
     """A kernel's structure: whole numbers, then a matrix (3, 3) in rows of four, from a multiple of 16 bytes on."""
     rows = np.zeros((3, 4), np.float32)
     rows[:, :3] = matrix
     head = np.array(numbers, np.int64).astype(np.uint32)
     return np.concatenate([head, np.zeros(-len(head) % 4, np.uint32), rows.ravel().view(np.uint32)])
-
-
-def parts_of(transport: LightTransport) -> tuple[WindowTransport, tuple[EdgeTerm, ...]]:
-    """The windows and the terms at depth edges. Raises DeviceRefused for a transport of another model."""
-    model, terms = (transport.model, transport.terms) if isinstance(transport, EdgedTransport) else (transport, ())
-    if not isinstance(model, WindowTransport):
-        raise DeviceRefused("this calibration has no phase maps, and the graphics processor needs them")
-    return model, terms

@@ -211,7 +211,7 @@ def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
     return {name: image}
 
 
-REPEATED = (StepKind.BLACK, StepKind.GEOMETRY, StepKind.EDGE_TERMS)
+REPEATED = (StepKind.BLACK, StepKind.GEOMETRY)
 """Kinds of steps that concern every projector and depend on the new measurements."""
 EXPOSURE = StepId(StepKind.EXPOSURE)
 

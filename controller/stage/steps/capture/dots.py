@@ -1,4 +1,4 @@
-"""Photographs of dots for the paper's mode and the automatic mode: exposure, batches, disk space."""
+"""Photographs of dots for the paper's mode: exposure, batches, disk space."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def of_sinusoids(folder: Path, projector: str) -> Metapixels:
     return Pixels.read(folder, projector).metapixels
 
 
-def spacing_of(options: DotOptions, known: Metapixels, *, share: float = 0.95) -> int:
-    """The dots' spacing: as given, or r >= 6.5 sigma for the blur of a ``share`` of pixels, at most 16."""
-    return options.spacing_px or min(dot_spacing(largest_sigma_px(known, share)), PAPER_SPACING_PX)
+def spacing_of(options: DotOptions, known: Metapixels) -> int:
+    """The dots' spacing: as given, or r >= 6.5 sigma for the blur of 95 % of the pixels, at most 16."""
+    return options.spacing_px or min(dot_spacing(largest_sigma_px(known)), PAPER_SPACING_PX)
 
 
 def dot_exposure_s(rig: Rig, folder: Path, projector: str, known: Metapixels, longest_s: float) -> float:

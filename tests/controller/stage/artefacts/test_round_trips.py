@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from scipy.sparse import csr_matrix
 
 from controller.core.arrays import load_arrays, save_arrays
 from controller.core.errors import CalibrationError, UsageError
@@ -19,9 +17,7 @@ from controller.optics.calibrate.geometry.shape import FoundShape
 from controller.optics.calibrate.geometry.values import Reconstruction
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.bounded.equations import Solution
-from controller.optics.transport.edge_terms import EdgedTransport, EdgeTerm
 from controller.stage.artefacts.camera import Exposures
-from controller.stage.artefacts.depth_edges import edged, write_terms
 from controller.stage.artefacts.geometry import (
     ShapeRecord,
     camera_px,
@@ -38,12 +34,10 @@ from controller.stage.artefacts.grade import ErrorMaps, graded, read_error_maps,
 from controller.stage.artefacts.photographs import DRIFT, PATTERN, VERIFICATION, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels
 from controller.stage.artefacts.solved import Solved, SolvedBase, is_solved, read_solved, remove_solved
-from controller.stage.steps.modes import DotOptions, mode_step
 from tests.controller.stage.artefacts.names import projectors
 
 if TYPE_CHECKING:
-    from controller.optics.transport import LightTransport
-    from controller.run.runner import Context
+    pass
 
 FEW = settings(max_examples=8, deadline=None)
 
@@ -154,28 +148,6 @@ def test_poses_are_found_by_projector_in_any_order(names: list[str]) -> None:
         assert projectors_of(run) == names
         found = read_geometry(run, names[::-1])
         assert [one.translation_m[0] for one in found.projectors] == [float(n) for n in range(len(names))][::-1]
-
-
-@FEW
-@given(projectors)
-def test_terms_at_depth_edges_are_those_of_the_projectors_asked_for(names: list[str]) -> None:
-    """Also of some of them, in another order: frames for the loss of a projector are solved with the others."""
-    with tempfile.TemporaryDirectory() as place:
-        run = Path(place)
-        mode_step(DotOptions("auto", None), ()).run(cast("Context", SimpleNamespace(folder=run)))
-        sizes = {name: (2, n + 1) for n, name in enumerate(names)}
-        write_terms(run, names, [
-            EdgeTerm(csr_matrix(np.full((3, 2 * (n + 1)), n + 1.0, np.float32)), np.arange(3), image(n))
-            for n in range(len(names))
-        ])  # fmt: skip
-        for some in (names, names[::-1], names[1:] or names):
-            model = cast("LightTransport", SimpleNamespace(
-                sizes=tuple(sizes[name] for name in some), pixels=sum(2 * sizes[name][1] for name in some),
-                mixing=None, lit=np.zeros((len(some), 1, 3), np.bool_), per_weight=None, segments=(), beside=None
-            ))  # fmt: skip
-            found = cast("EdgedTransport", edged(model, run, some)).terms
-            assert [term.differences.shape for term in found] == [(3, 2 * sizes[name][1]) for name in some]
-            assert [term.differences[0, 0] for term in found] == [float(sizes[name][1]) for name in some]
 
 
 def test_colours_that_lie_apart_are_kept_with_the_phase_map(tmp_path: Path) -> None:

@@ -3,11 +3,9 @@ struct Camera {
   rows: i32,
   columns: i32,
   pixels: u32,
-  sites: u32,
+  unused: u32,
   // of sites at even and odd rows and columns, row by row
   colours: vec4<u32>,
-  // camera pixels with terms at depth edges
-  edges: u32,
 }
 
 @group(0) @binding(0) var<uniform> camera: Camera;

@@ -27,7 +27,6 @@ from controller.optics.solve.bounded.regions import (
 )
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.edge_terms import EdgeTerm, with_terms
 from controller.optics.transport.planes import CameraBox
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
 
@@ -55,15 +54,6 @@ def windowed(*, mosaic: bool) -> LightTransport:
     return build_transport(calibration if mosaic else dataclasses.replace(calibration, mosaic=None))
 
 
-def edge_term_of(transport: LightTransport, n: int) -> EdgeTerm:
-    """Random differences at some camera pixels."""
-    rows, columns = transport.sizes[n]
-    camera = np.sort(np.random.default_rng(n).choice(transport.lit[0].size, 900, replace=False)).astype(np.int64)
-    random = np.random.default_rng(7 + n)
-    differences = sp.random_array((camera.size, rows * columns), density=0.02, rng=random, dtype=np.float32)
-    return EdgeTerm(sp.csr_matrix(differences), camera, random.random((3, camera.size)).astype(np.float32))
-
-
 def picture(transport: LightTransport) -> FloatImage:
     """Waves and squares, mostly reachable."""
     y, x = np.mgrid[0 : transport.camera_shape[0], 0 : transport.camera_shape[1]].astype(np.float32)
@@ -87,11 +77,8 @@ def test_the_equations_of_a_region_are_those_of_the_transport(stage: Stage, blur
 
 
 @pytest.mark.parametrize("mosaic", [True, False], ids=["bayer camera", "three colours a pixel"])
-@pytest.mark.parametrize("edged", [False, True], ids=["model alone", "with measured edges"])
-def test_the_equations_of_a_region_are_those_of_a_transport_by_camera_samples(mosaic: bool, edged: bool) -> None:
+def test_the_equations_of_a_region_are_those_of_a_transport_by_camera_samples(mosaic: bool) -> None:
     transport = windowed(mosaic=mosaic)
-    if edged:
-        transport = with_terms(transport, tuple(edge_term_of(transport, n) for n in range(len(transport.sizes))))
     box = CameraBox(20, 28, 40, 49)
     random = np.random.default_rng(2)
     unknown = np.sort(random.choice(transport.pixels, 300, replace=False))

@@ -8,22 +8,19 @@ from collections.abc import Iterator
 import numba
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import PhaseMap
 from controller.optics.solve.gpu.device import Device, adapters
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.edge_terms import EdgeTerm, with_terms
 from tests.controller.optics.transport.conftest import random_calibration
 from tests.controller.optics.transport.windows.test_transport import RGGB, mapped
 
 few = settings(
     max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
 )
-stages = given(seed=st.integers(0, 2**20), mosaic=st.booleans(), edges=st.booleans())
+stages = given(seed=st.integers(0, 2**20), mosaic=st.booleans())
 
 
 def opened() -> Device:
@@ -50,7 +47,7 @@ def one_thread() -> Iterator[None]:
     numba.set_num_threads(before)
 
 
-def any_windows(seed: int, *, mosaic: bool, edges: bool = False, segment: float = 0.0) -> LightTransport:
+def any_windows(seed: int, *, mosaic: bool, segment: float = 0.0) -> LightTransport:
     """Windows of all sorts and sizes in any order, many of them partly beyond the frame; those of one are small."""
     calibration = random_calibration(seed, camera=(22, 36), sizes=((11, 14), (70, 21)))
     one, other = mapped(calibration, seed, mosaic=RGGB if mosaic else None).projectors
@@ -59,19 +56,4 @@ def any_windows(seed: int, *, mosaic: bool, edges: bool = False, segment: float 
     parts = one, dataclasses.replace(other, phase_map=sharp)
     made = dataclasses.replace(calibration, projectors=parts, mosaic=RGGB if mosaic else None)
     transport = build_transport(made)
-    if edges:
-        transport = with_terms(transport, tuple(term(transport, n, seed) for n in range(2)))
     return dataclasses.replace(transport, segments=(segment, 0.0)) if segment else transport
-
-
-def term(model: LightTransport, n: int, seed: int) -> EdgeTerm:
-    """Differences of shares at a few camera pixels, of both signs; rows sum to 0."""
-    rng = np.random.default_rng(seed + n)
-    pixels = model.sizes[n][0] * model.sizes[n][1]
-    camera = np.flatnonzero(model.lit[n].ravel())[:: 17 + n]
-    dense = np.zeros((camera.size, pixels), np.float32)
-    for row in dense:
-        at = rng.choice(pixels, 3, replace=False)
-        row[at] = np.array([0.2, -0.15, -0.05])
-    white: FloatImage = rng.uniform(0.1, 1, (3, camera.size)).astype(np.float32)
-    return EdgeTerm(sp.csr_matrix(dense), camera.astype(np.int64), white)

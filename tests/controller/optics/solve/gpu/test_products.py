@@ -76,10 +76,8 @@ def test_a_pixel_beside_very_sharp_windows_has_no_infinite_mean() -> None:
 
 @few
 @stages
-def test_light_and_its_transpose_are_those_of_the_processor(
-    device: Device, seed: int, mosaic: bool, edges: bool
-) -> None:
-    transport = any_windows(seed, mosaic=mosaic, edges=edges)
+def test_light_and_its_transpose_are_those_of_the_processor(device: Device, seed: int, mosaic: bool) -> None:
+    transport = any_windows(seed, mosaic=mosaic)
     there = DeviceTransport(device, transport)
     p, r = numbers(transport, seed)
     light, back = forward(there, p), backward(there, r)
@@ -139,7 +137,7 @@ def test_a_buffer_beyond_the_device_s_limit_is_refused_in_words(device: Device) 
 
 def test_memory_that_was_given_back_is_no_longer_counted(device: Device) -> None:
     before = device.held_bytes
-    there = DeviceTransport(device, any_windows(2, mosaic=True, edges=True))
+    there = DeviceTransport(device, any_windows(2, mosaic=True))
     assert device.held_bytes > before
     there.free()
     assert device.held_bytes == before

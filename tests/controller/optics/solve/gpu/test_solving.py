@@ -65,11 +65,11 @@ def test_the_objective_is_the_least_on_a_folded_object(engine: GpuEngine) -> Non
 
 
 @pytest.mark.parametrize(
-    ("mosaic", "edges", "segment"),
-    [(True, False, 0.0), (False, False, 0.0), (True, True, 0.0), (False, True, 0.3), (True, False, 0.4)],
+    ("mosaic", "segment"),
+    [(True, 0.0), (False, 0.0), (False, 0.3), (True, 0.4)],
 )
-def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, edges: bool, segment: float) -> None:
-    transport = any_windows(3, mosaic=mosaic, edges=edges, segment=segment)
+def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, segment: float) -> None:
+    transport = any_windows(3, mosaic=mosaic, segment=segment)
     rng = np.random.default_rng(3)
     black = np.zeros((*transport.camera_shape, 3), np.float32)
     target = transport.reach() * rng.uniform(0, 1.2, black.shape).astype(np.float32)
@@ -92,9 +92,9 @@ def test_objectives_agree_with_the_processor(engine: GpuEngine, mosaic: bool, ed
 
 @few
 @stages
-def test_a_solve_starts_where_the_processor_s_does(device: Device, seed: int, mosaic: bool, edges: bool) -> None:
+def test_a_solve_starts_where_the_processor_s_does(device: Device, seed: int, mosaic: bool) -> None:
     """Within reach and beyond, dark pixels too."""
-    transport = any_windows(seed, mosaic=mosaic, edges=edges, segment=0.0)
+    transport = any_windows(seed, mosaic=mosaic, segment=0.0)
     rng = np.random.default_rng(seed)
     black = np.full((*transport.camera_shape, 3), 0.001, np.float32)
     target = black + transport.reach() * rng.uniform(0, 1.6, 3).astype(np.float32)

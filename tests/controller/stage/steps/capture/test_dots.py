@@ -124,7 +124,6 @@ def test_a_full_disk_is_told_before_the_first_photograph(
         ("paper", None, DotOptions("paper", 16)),
         ("paper", "6", DotOptions("paper", 6)),
         ("paper", "auto", DotOptions("paper", None)),
-        ("auto", None, DotOptions("auto", None)),
     ],
 )
 def test_a_mode_has_its_own_spacing_unless_one_is_given(mode: str, spacing: str | None, wanted: DotOptions) -> None:
@@ -135,6 +134,7 @@ def test_a_mode_has_its_own_spacing_unless_one_is_given(mode: str, spacing: str 
     ("mode", "spacing", "code"),
     [
         ("slow", None, "calibration-mode-unknown"),
+        ("auto", None, "calibration-mode-unknown"),
         ("fast", "6", "dot-spacing-unused"),
         ("fast", "auto", "dot-spacing-unused"),
         ("paper", "3", "dot-spacing-wrong"),
@@ -162,7 +162,7 @@ def test_the_mode_of_a_run_says_which_metapixels_count(context: Context) -> None
     write_metapixels(context.folder / "pixels-left.npz", 3.0, 1.0)
     write_metapixels(context.folder / "dots-left.npz", 3.0, 2.0)
     assert mode_of(context.folder) == "fast"
-    for mode, sigma in (("fast", 1.0), ("paper", 2.0), ("auto", 1.0)):
+    for mode, sigma in (("fast", 1.0), ("paper", 2.0)):
         mode_step(dot_options(mode, None), ()).run(context)
         assert mode_of(context.folder) == mode
         assert read_metapixels(context.folder, "left").covariance_px2[3, 3, 0] == sigma**2
