@@ -1,0 +1,51 @@
+"""Which views a run has, and where their files are."""
+
+from pathlib import Path
+
+from controller.stage.artefacts.views import (
+    first_view,
+    is_whole,
+    reopen_view,
+    view_folder,
+    view_folders,
+    write_view,
+)
+
+
+def test_a_run_of_one_camera_is_its_only_view(tmp_path: Path) -> None:
+    assert view_folders(tmp_path) == {"camera": tmp_path}
+
+
+def test_views_stand_in_the_stages_order_and_the_first_is_the_run_itself(tmp_path: Path) -> None:
+    write_view(tmp_path, "front", 0)
+    for number, name in ((2, "a"), (1, "z")):
+        view_folder(tmp_path, name).mkdir(parents=True)
+        write_view(view_folder(tmp_path, name), name, number)
+    assert list(view_folders(tmp_path).items()) == [
+        ("front", tmp_path),
+        ("z", tmp_path / "views" / "z"),
+        ("a", tmp_path / "views" / "a"),
+    ]
+
+
+def test_a_view_that_is_not_whole_is_not_listed(tmp_path: Path) -> None:
+    folder = view_folder(tmp_path, "back")
+    folder.mkdir(parents=True)
+    (folder / "exposure.json").write_text("{}")
+    assert not is_whole(folder)
+    assert list(view_folders(tmp_path)) == ["camera"]
+    write_view(folder, "back", 1)
+    assert list(view_folders(tmp_path)) == ["camera", "back"]
+    reopen_view(folder)
+    assert list(view_folders(tmp_path)) == ["camera"]
+
+
+def test_any_name_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    names = ["..", ".", "links", "Rückseite", "50 %", "x" * 300]
+    for number, name in enumerate(names, start=1):
+        folder = view_folder(tmp_path, name)
+        assert folder.parent == tmp_path / "views"
+        folder.mkdir(parents=True)
+        write_view(folder, name, number)
+    assert list(view_folders(tmp_path)) == ["camera", *names]
+    assert first_view(tmp_path) == "camera"
