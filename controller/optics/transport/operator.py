@@ -6,8 +6,8 @@ mixing, and G_n holds, for each camera pixel, the shares of its light that come 
 object's colour stay as sharp as the camera sees them.
 
 One operator is what one camera sees of all projectors: T = [T_1 ... T_N], in columns. Solvers read the camera only
-through sensor buffers (flat float32 vectors), so that several cameras can become one operator whose buffer is theirs
-joined end to end (docs/decisions/0005).
+through sensor buffers (flat float32 vectors), so that several cameras become one operator (``views``), whose buffer is
+theirs joined end to end (docs/decisions/0005).
 """
 
 from __future__ import annotations
@@ -75,6 +75,14 @@ class LightTransport(LinearOperator[np.float32], ABC):
     def object_mask(self) -> Mask:
         """(rows, columns): camera pixels that at least one projector lights."""
         return np.asarray(self.lit.any(axis=0))
+
+    def counts(self) -> FloatImage:
+        """(rows, columns) float32: how much each camera pixel counts in a solve; 0 off the object. A new array."""
+        return self.object_mask.astype(np.float32)
+
+    def mixing_of(self, n: int) -> FloatImage:
+        """(3, 3, 1 or rows, 1): the mixing of projector ``n`` at the rows of the camera image, or at all alike."""
+        return np.asarray(self.mixing[n][:, :, None, None])
 
     @property
     def pixels(self) -> int:
@@ -180,7 +188,12 @@ class LightTransport(LinearOperator[np.float32], ABC):
         A solver that changes one projector at a time adds light to buffers, and needs a picture only at its end. Here a
         buffer is a picture (3, rows, columns), flat.
         """
-        return np.zeros(self.shape[0], np.float32)
+        return np.zeros(self.sensor_size, np.float32)
+
+    @property
+    def sensor_size(self) -> int:
+        """How many samples a sensor buffer has."""
+        return self.shape[0]
 
     def accumulate_forward(self, n: int, p: FloatImage, buffer: FloatImage) -> None:
         """Add T_n p_n to a buffer; ``p`` (3, pixels of all projectors), of which those of ``n`` are read."""

@@ -189,7 +189,7 @@ def build_problem(
     transport: LightTransport, target: FloatImage, black: FloatImage, smoothness: float, weights: FloatImage | None
 ) -> Problem:
     """The equations of a solve; the parameters are those of ``solve_bounded``, which has checked them."""
-    counted = transport.object_mask.astype(np.float32)
+    counted = transport.counts()
     if weights is not None:
         counted *= weights
     white_light(transport)  # while no other picture is in memory

@@ -38,7 +38,8 @@ class DriveLevels:
         self.matrices = array_in_file(folder, shape)
         self.matrices[:] = 0
         segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
-        for n, mixing in enumerate(transport.mixing):
+        for n in range(len(transport.sizes)):
+            mixing = transport.mixing_of(n)
             white = transport.forward_planes(ones, projectors=(n, n + 1))
             for channel in range(3):
                 for colour in range(3):

@@ -172,9 +172,10 @@ class WindowTransport(LightTransport):
         self._transposed(r, self.mixing, self.windows, projectors or (0, len(self.sizes)), out)
         return out
 
-    def sensor_buffer(self) -> FloatImage:
-        """One number a camera sample; see ``LightTransport.sensor_buffer``."""
-        return np.zeros(self._sites, np.float32)
+    @property
+    def sensor_size(self) -> int:
+        """How many samples the camera has: one a pixel with a mosaic, else three."""
+        return int(self.lit[0].size) * (1 if self.colours.size else 3)
 
     def accumulate_forward(self, n: int, p: FloatImage, buffer: FloatImage) -> None:
         forward_sites(self.windows, self.table, self.small, self.mixing, p, (n, n + 1), buffer)
@@ -213,12 +214,7 @@ class WindowTransport(LightTransport):
 
     @cached_property
     def _rows(self) -> SampleRows:
-        return SampleRows(self.windows, self.table, self.small, windows_of_sites(self.windows, self._sites))
-
-    @property
-    def _sites(self) -> int:
-        """How many samples the camera has: one a pixel with a mosaic, else three."""
-        return int(self.lit[0].size) * (1 if self.colours.size else 3)
+        return SampleRows(self.windows, self.table, self.small, windows_of_sites(self.windows, self.sensor_size))
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         own = ("mixing", "lit", "per_weight", "colours", "per_sum")
