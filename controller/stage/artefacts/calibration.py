@@ -12,7 +12,7 @@ from controller.core.arrays import FloatImage, Mask, array_in_file, strips
 from controller.core.channels import smallest
 from controller.optics.calibrate.geometry.background import room_pixels
 from controller.optics.calibrate.values import Calibration, Correspondence, PhaseMap, ProjectorCalibration
-from controller.optics.capture.brackets import merge_brackets
+from controller.optics.capture.brackets import MergedBracket, merge_brackets
 from controller.optics.capture.raw import CAMERA_BLUR_PX
 from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures
 from controller.stage.artefacts.photographs import BLACK, TakenPhotograph, codes_of, light_of
@@ -29,10 +29,15 @@ LIT_SHARE = 0.004
 """A camera pixel counts as lit if a projector's white is above this share of the brightest white."""
 
 
-def merge_photographs(taken: Sequence[TakenPhotograph]) -> FloatImage:
-    """HDR radiance in full scales per second from photographs of one picture."""
+def merged(taken: Sequence[TakenPhotograph]) -> MergedBracket:
+    """Radiance in full scales per second, and its noise, from photographs of one picture."""
     noise = taken[0].profile.noise if taken and taken[0].profile is not None else None
-    return merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken], noise=noise).radiance
+    return merge_brackets([t.measured() for t in taken], [t.exposure_s for t in taken], noise=noise)
+
+
+def merge_photographs(taken: Sequence[TakenPhotograph]) -> FloatImage:
+    """The radiance of ``merged``."""
+    return merged(taken).radiance
 
 
 def read_black(folder: Path) -> FloatImage:

@@ -39,6 +39,12 @@ CAMERA_PIXELS = 1_200_000
 """Larger camera images are shrunk before they are registered."""
 LEAST_LIGHT = 0.25
 """Below this share of its light a projector counts as dark, and the position of its picture is not reported."""
+PART_PX: Final = 8
+"""Side of a part of a projector's picture: its mean is the same in a softer picture."""
+CHANGE_PX: Final = 6.0
+"""Camera pixels over which a change of light is even: a Gaussian's standard deviation."""
+NOISE_AROUND: Final = (7, 7)
+"""Camera pixels over which a difference is compared with noise."""
 AMBIENT_SHARE = 0.003
 """Of white: a larger change of the black image is reported."""
 
@@ -252,14 +258,20 @@ def _projector(
 def _gains(channels: Sequence[FloatImage], seen: FloatImage, weight: FloatImage) -> tuple[Float64, Float64]:
     """Least squares for the strength of each of the projector's channels, and its uncertainty from parts that differ.
 
-    ``channels``: what each looks like alone; an outer frame of NaN is left out.
+    Means of small parts are compared: pixel by pixel, a picture that is a little softer than predicted would count as
+    less light. ``channels``: what each looks like alone; an outer frame of NaN is left out.
     """
     rows, columns = weight.shape
     known = (weight > 0) & np.isfinite(np.stack(channels)).all(axis=(0, 3)) & finite(seen)
     y, x = np.nonzero(known)
-    a = np.stack([channel[known] for channel in channels]).astype(np.float64)
-    b, w = seen[known].astype(np.float64), weight[known].astype(np.float64)
-    block = (y * 6 // rows) * 6 + x * 6 // columns
+    part, of = np.unique(y // PART_PX * columns + x // PART_PX, return_inverse=True)
+    w = np.bincount(of, weight[known])
+
+    def means(image: FloatImage) -> Float64:
+        return np.stack([np.bincount(of, weight[known] * image[known][:, c]) / w for c in range(3)], axis=1)
+
+    a, b = np.stack([means(channel) for channel in channels]), means(seen)
+    block = part // columns * PART_PX * 6 // rows * 6 + part % columns * PART_PX * 6 // columns
     gain, inverse = np.ones(3), np.eye(3)
     for _ in range(4):
         error = b - np.einsum("knc,k->nc", a, gain)
@@ -431,3 +443,20 @@ def update_radiometry(radiometry: Radiometry, gain: tuple[float, float, float]) 
         # White has changed, too, and paint is determined by it.
         paint = paint @ np.linalg.inv(paint.sum(axis=1))
     return replace(radiometry, mixing=mixing / mixing.sum(axis=1, keepdims=True), paint=paint)
+
+
+def update_white(white: FloatImage, again: FloatImage, sigma: FloatImage) -> FloatImage:
+    """A projector's white image after its light has changed, (rows, columns, 3), NaN where saturated.
+
+    ``white`` is a mean of many photographs, ``again`` one photograph of the changed light; ``sigma``: the standard
+    deviation of its noise. Where noise explains the difference from ``white`` with the change around, that is the
+    better picture. What has moved, such as shadows and gaps between pixels, is that of ``again``.
+    """
+    known = (finite(white) & finite(again) & finite(sigma))[:, :, None]
+    images = [np.where(known, image, 0).astype(np.float32) for image in (white, again, sigma)]
+    around = [cv2.GaussianBlur(image, (0, 0), CHANGE_PX) for image in images[:2]]
+    changed = images[0] * np.divide(around[1], around[0], out=np.ones_like(around[0]), where=around[0] > 0)
+    apart = images[1] - changed
+    off, noise = (cv2.boxFilter(total(one * one), -1, NOISE_AROUND) for one in (apart, images[2]))
+    share = 1 - np.divide(noise, off, out=np.ones_like(off), where=off > noise)
+    return np.where(known, changed + share[:, :, None] * apart, again).astype(np.float32)

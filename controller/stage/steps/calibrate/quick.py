@@ -23,18 +23,24 @@ import numpy as np
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import CalibrationError
-from controller.optics.calibrate.verify.drift import Drift, ProjectorDrift, update_positions, update_radiometry
+from controller.optics.calibrate.verify.drift import (
+    Drift,
+    ProjectorDrift,
+    update_positions,
+    update_radiometry,
+    update_white,
+)
 from controller.optics.calibrate.verify.drift_report import advice, sentences
 from controller.run.journal import Journal
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.calibration import merge_photographs, read_black
+from controller.stage.artefacts.calibration import merged, read_black
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.drift import read_drift
 from controller.stage.artefacts.kinds import StepKind, white_of
 from controller.stage.artefacts.photographs import DRIFT, white_again_of
-from controller.stage.artefacts.projectors import Indirect, Light, Pixels, mode_of
+from controller.stage.artefacts.projectors import Indirect, Light, Pixels, mode_of, read_white_gain
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.calibrate.drift import drift_steps
@@ -177,7 +183,7 @@ def _correct(rig: Rig, last: Calibrated, step: StepId, kept: list[Path], context
         # its stripes lay elsewhere or were brighter; those of the others are enough. Its white is photographed again.
         dataclasses.replace(found, mixing=mixing, stripes=None, white_gain=None).write(context.folder, name)
     else:
-        _correct_light(context.folder, name, one)
+        _correct_light(last.folder, context.folder, one)
     return kept
 
 
@@ -186,12 +192,15 @@ def _shift_pixels(folder: Path, name: str, one: ProjectorDrift) -> None:
     dataclasses.replace(pixels, **update_positions(pixels.arrays(), one.motion.matrix)).write(folder, name)
 
 
-def _correct_light(folder: Path, name: str, one: ProjectorDrift) -> None:
+def _correct_light(last: Path, folder: Path, one: ProjectorDrift) -> None:
+    name = one.name
     light = Light.read(folder, name)
     light = dataclasses.replace(light, black=read_black(folder))
     if one.moved or one.dimmed:
-        white = merge_photographs(white_again_of(name).read(folder))
-        light = dataclasses.replace(light, white=np.maximum(white - light.black, 0).astype(np.float32))
+        gain, again = read_white_gain(last, name), merged(white_again_of(name).read(folder))
+        before = light.white if gain is None else light.white * gain
+        seen = np.maximum(again.radiance - light.black, 0).astype(np.float32)
+        light = dataclasses.replace(light, white=update_white(before, seen, again.sigma))
     if one.dimmed:
         light = dataclasses.replace(light, mixing=update_radiometry(light.radiometry, one.gain).mixing)
     light.write(folder, name)
