@@ -7,6 +7,7 @@
 # make figures   measured figures into the documents that name them, and the pages of the study from their data
 # make blender   Blender, for targets that it renders
 # make campaign NAME=camera_faults COUNT=10000   a test of hours that has a short version in `make test` (tests/campaigns/)
+# make campaign NAME=mutants COUNT=100 SEED=7   changed lines that no test notices; continues where it stopped
 # make deb DEBIAN=bookworm   the Debian package of a kiosk in build/; trixie too, with DEBIAN_ROOT=the root folder of a Debian 13
 # make nightly COUNT=3   every experiment of the study at size small, for so many seeds; about an hour for each
 # All do their own set-up.
@@ -115,7 +116,7 @@ nightly:
 campaign:
 	@.ci/setup test
 	@.ci/system-packages
-	.venv/bin/python -m tests.campaigns.$(NAME) $(COUNT)
+	.venv/bin/python -m tests.campaigns.$(NAME) $(COUNT) $(if $(filter-out file,$(origin SEED)),$(SEED))
 
 deb:
 	@.ci/setup demo
