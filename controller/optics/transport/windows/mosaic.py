@@ -14,6 +14,7 @@ from numba import prange
 
 from controller.core.arrays import FloatImage
 from controller.core.jit import compiled
+from controller.optics.transport.windows.profiles import LINE
 
 BORDER: Final = 2
 """Rows and columns whose neighbours, or neighbours' neighbours, may be outside."""
@@ -97,12 +98,13 @@ def _interpolate_row(
         below[BORDER + 1 :],
     )
     own, green, far = own[BORDER:], green[BORDER:], far[BORDER:]
+    # one loop each: with three rows to write, more may overlap than the compiler is willing to check
     for i in range(n):
-        across, down, corners = left[i] + right[i], a[i] + b[i], la[i] + ra[i] + lb[i] + rb[i]
-        other = (i & 1) == at
-        own[i] = h[i] if other else half * across
-        green[i] = quarter * (across + down) if other else h[i]
-        far[i] = quarter * corners if other else half * down
+        own[i] = h[i] if (i & 1) == at else half * (left[i] + right[i])
+    for i in range(n):
+        green[i] = quarter * (left[i] + right[i] + a[i] + b[i]) if (i & 1) == at else h[i]
+    for i in range(n):
+        far[i] = quarter * (la[i] + ra[i] + lb[i] + rb[i]) if (i & 1) == at else half * (a[i] + b[i])
 
 
 @compiled(fastmath=True)
@@ -132,21 +134,22 @@ def _collect_row(own: FloatImage, green: FloatImage, y: int, at: int, out: Float
 
 @compiled()
 def _picture_row(
-    sites: FloatImage, colours: Colours, y: int, red: FloatImage, green: FloatImage, blue: FloatImage
+    sites: FloatImage, colours: Colours, y: int, left: int, red: FloatImage, green: FloatImage, blue: FloatImage
 ) -> None:
-    """Row ``y`` of the picture."""
-    rows, columns = sites.shape
+    """Row ``y`` of the picture, as many columns of it from ``left``, which is even, as ``red`` has."""
+    rows, columns, right = sites.shape[0], red.size, left + red.size
     inner = BORDER <= y < rows - BORDER
     if inner:
         at = 1 if colours[y & 1, 0] == GREEN else 0
+        above, here, below = sites[y - 1, left:right], sites[y, left:right], sites[y + 1, left:right]
         if colours[y & 1, at] == 0:
-            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, red, green, blue)
+            _interpolate_row(above, here, below, at, red, green, blue)
         else:
-            _interpolate_row(sites[y - 1], sites[y], sites[y + 1], at, blue, green, red)
+            _interpolate_row(above, here, below, at, blue, green, red)
     for x in range(min(BORDER, columns) if inner else columns):
-        red[x], green[x], blue[x] = _picture_one(sites, colours, y, x)
+        red[x], green[x], blue[x] = _picture_one(sites, colours, y, left + x)
     for x in range(max(columns - BORDER, BORDER) if inner else columns, columns):
-        red[x], green[x], blue[x] = _picture_one(sites, colours, y, x)
+        red[x], green[x], blue[x] = _picture_one(sites, colours, y, left + x)
 
 
 @compiled()
@@ -167,7 +170,7 @@ def _sites_row(planes: FloatImage, above: int, rows: int, colours: Colours, y: i
 def interpolate(sites: FloatImage, colours: Colours, out: FloatImage) -> None:
     """Write the picture (3, rows, columns) that a camera makes of its ``sites`` (rows, columns)."""
     for y in prange(sites.shape[0]):
-        _picture_row(sites, colours, y, out[0, y], out[1, y], out[2, y])
+        _picture_row(sites, colours, y, 0, out[0, y], out[1, y], out[2, y])
 
 
 @compiled(parallel=True)
@@ -184,20 +187,57 @@ def normal_residual(
 ) -> None:
     """Write D' w D sites - right_hand_side, with D the interpolation; all (rows, columns).
 
-    In strips of rows whose pictures stay in a near cache, so that a picture of three planes is never written.
+    In strips of rows whose pictures stay in a near cache, so that a picture of three planes is never written; between
+    the columns that have weights.
     """
     rows, columns = sites.shape
     for i in prange((rows + STRIP - 1) // STRIP):
         first, last = STRIP * i, min(STRIP * (i + 1), rows)
         above = max(first - 1, 0)
         end = min(last + 1, rows)
-        planes = np.empty((3, end - above, columns), np.float32)
+        left, right = columns, 0
         for y in range(above, end):
-            _picture_row(sites, colours, y, planes[0, y - above], planes[1, y - above], planes[2, y - above])
-            for c in range(3):
-                for x in range(columns):
-                    planes[c, y - above, x] *= weights[y, x]
+            x = 0
+            while x < left and _total(weights[y, x : x + LINE]) == 0:
+                x += LINE
+            left, x = min(left, x), columns
+            while x > right and _total(weights[y, max(x - LINE, 0) : x]) == 0:
+                x -= LINE
+            right = max(right, x)
+        # even, and beyond what a weight reaches
+        left, right = max(left - left % 2 - 2 * BORDER, 0), min(right + 2 * BORDER, columns)
+        if left >= right:
+            left = right = 0
+        planes = np.empty((3, end - above, right - left), np.float32)
+        for y in range(above, end):
+            k = y - above
+            _picture_row(sites, colours, y, left, planes[0, k], planes[1, k], planes[2, k])
+            _weigh(planes[0, k], planes[1, k], planes[2, k], weights[y, left:right])
         for y in range(first, last):
-            _sites_row(planes, above, rows, colours, y, out[y])
-            for x in range(columns):
-                out[y, x] -= right_hand_side[y, x]
+            if left < right:
+                _sites_row(planes, above, rows, colours, y, out[y, left:right])
+            out[y, :left] = out[y, right:] = 0
+            _subtract(out[y], right_hand_side[y])
+
+
+# not in the loops above: numba does not know there that the rows lie apart
+
+
+@compiled(fastmath=True)
+def _weigh(red: FloatImage, green: FloatImage, blue: FloatImage, weights: FloatImage) -> None:
+    for x in range(weights.size):
+        red[x], green[x], blue[x] = red[x] * weights[x], green[x] * weights[x], blue[x] * weights[x]
+
+
+@compiled(fastmath=True)
+def _subtract(row: FloatImage, other: FloatImage) -> None:
+    for x in range(other.size):
+        row[x] -= other[x]
+
+
+@compiled(fastmath=True)
+def _total(row: FloatImage) -> float:
+    total = np.float32(0)
+    for x in range(row.size):
+        total += row[x]
+    return float(total)
