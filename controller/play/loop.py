@@ -5,12 +5,13 @@ other.
 from __future__ import annotations
 
 import os
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import islice
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
-from controller.bundle.format import PlaylistEntry
 from controller.bundle.live_maps import LiveMaps
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, unsigned_warning
@@ -20,83 +21,18 @@ from controller.play.control.notify import Notifier, log
 from controller.play.display.outputs import Output, dimmed
 from controller.play.frames import FrameSet, OutputSize
 from controller.play.live_stream import LiveStream, open_live
-from controller.play.presenting import Grid, PendingPresentation, Presenter, ResultCallback
+from controller.play.playlist import Playlist, Timetable
+from controller.play.presenting import Agreed, Grid, PendingPresentation, Presenter, ResultCallback, superseded
 from hal.codecs import player as player_codec
-
-
-class Playlist:
-    """Steps through (appearance, seconds, fade_s) items, ``repeat`` times, or without end if 0.
-
-    ``first_fade_s``: how long the first item comes in at the very beginning, None: as it says.
-    """
-
-    def __init__(
-        self, items: Sequence[tuple[str, float, float]], repeat: int, first_fade_s: float | None = None
-    ) -> None:
-        self._items = tuple(items)
-        self._first_fade_s = first_fade_s
-        self._rounds_left = repeat if repeat else None
-        self._at = 0
-        self.look_ahead = 2
-
-    @classmethod
-    def suggested(cls, hints: Sequence[PlaylistEntry], repeat: int) -> Self:
-        """What a bundle suggests. Raises BundleError("bundle-no-schedule") if that is nothing."""
-        if not hints:
-            raise BundleError(
-                "bundle-no-schedule",
-                what="The bundle contains no playlist.",
-                remedy="Name the appearances to play, or publish the bundle again with a playlist.",
-            )
-        return cls([(hint.appearance, hint.duration_ms / 1000, hint.fade_ms / 1000) for hint in hints], repeat)
-
-    @property
-    def names(self) -> frozenset[str]:
-        return frozenset(name for name, _, _ in self._items)
-
-    @property
-    def appearance(self) -> str:
-        """The item that is to be presented, or is."""
-        return self._items[self._at][0]
-
-    @property
-    def seconds(self) -> float:
-        """How long it stays, its cross-fade included."""
-        return self._items[self._at][1]
-
-    @property
-    def fade_s(self) -> float:
-        """Seconds for which it fades in over the previous one; 0: at once."""
-        return self._items[self._at][2] if self._first_fade_s is None else self._first_fade_s
-
-    @property
-    def upcoming(self) -> list[str]:
-        """This item's appearance and the different ones that follow it, at most ``look_ahead`` in all."""
-        ordered = (self._items[(self._at + step) % len(self._items)][0] for step in range(len(self._items)))
-        return list(islice(dict.fromkeys(ordered), self.look_ahead))
-
-    def has_others(self, appearance: str | None) -> bool:
-        return bool(self.names - {appearance})
-
-    def advance(self) -> bool:
-        """Go to the next item; False when there is none."""
-        self._first_fade_s = None
-        if self._at + 1 < len(self._items):
-            self._at += 1
-            return True
-        if self._rounds_left is not None:
-            self._rounds_left -= 1
-            if self._rounds_left <= 0:
-                return False
-        self._at = 0
-        return True
-
 
 _IDLE_S: Final = 0.1
 _STATM: Final = Path("/proc/self/statm")
 """Created once: each Path interns its parts, and the table of interned strings grows after ten thousand of them."""
 _DECODE_WAIT_S: Final = 0.02
 _LIVE_WAIT_S: Final = 0.004
+_REPORTS: Final = 4096
+"""So many presentations of schedules are remembered for those who compare them with other players'."""
+_REPORTS_AT_ONCE: Final = 1000
 
 
 class Player:
@@ -129,6 +65,12 @@ class Player:
         self._decoded: DecodedAhead | None = None
         self._coming: PendingPresentation | None = None
         self._playlist: Playlist | None = None
+        self._timetable: Timetable | None = None
+        self._agreed: Agreed | None = None
+        self._ahead_s: float | None = None
+        self._alone_at_s: float | None = None
+        self._alone, self._alone_then = False, "on"
+        self._reports: deque[list[Any]] = deque(maxlen=_REPORTS)
         self._live: LiveStream | None = None
         self._warning: BundleError | None = None
         self._skipped = 0
@@ -154,6 +96,7 @@ class Player:
             serve(self._patience_s())
             self._output.pump()
             self._take_live()
+            self._keep_times()
             self._present_if_due()
             self._notifier.alive()
         self._notifier.stopping()
@@ -171,34 +114,121 @@ class Player:
         """End soon, with black, or ``leaving`` the picture to the next player; a signal handler may call it."""
         self._ending, self._leaving = True, leaving
 
-    def stop(self, on_result: ResultCallback | None, *, fade_s: float = 0.0) -> None:
+    def clock(self, ahead_s: float, keep_s: float | None, then: str) -> None:
+        """The common clock is ``ahead_s`` ahead of the monotonic one. Without another call within ``keep_s`` this
+        player is alone: ``then`` it continues ("on"), shows "black", or stays "still". None: it is never alone.
+        """
+        self._ahead_s = ahead_s
+        self._alone_at_s = None if keep_s is None else time.monotonic() + keep_s
+        self._alone, self._alone_then = False, then
+        if self._timetable is not None:
+            self._presenter.grid = Grid(self._presenter.grid.rate_hz, ahead_s)
+
+    @property
+    def ahead_s(self) -> float:
+        """How far the common clock is ahead of the monotonic one. Raises UsageError("clock-unknown")."""
+        if self._ahead_s is None:
+            raise UsageError(
+                "clock-unknown",
+                what="A moment was given, but this player has not been given the common clock.",
+                remedy="Send it with 'clock' first, as the agent of this computer does.",
+            )
+        return self._ahead_s
+
+    def stop(self, on_result: ResultCallback | None, *, fade_s: float = 0.0, at_s: float | None = None) -> None:
         """Show black."""
-        self.show(self._black, on_result, showing="black", fade_s=fade_s)
+        self.show(self._black, on_result, showing="black", fade_s=fade_s, at_s=at_s)
 
     def show(
-        self, frames: FrameSet, on_result: ResultCallback | None, *, showing: str = "pattern", fade_s: float = 0.0
+        self,
+        frames: FrameSet,
+        on_result: ResultCallback | None,
+        *,
+        showing: str = "pattern",
+        fade_s: float = 0.0,
+        at_s: float | None = None,
     ) -> None:
-        """Show these frames; they must not change while they are the ``shown`` ones, or will be."""
+        """Show these frames; they must not change while they are the ``shown`` ones, or will be. ``at_s``: when, on
+        the common clock.
+        """
+        if at_s is not None:
+            begin = partial(self._show, frames, on_result, showing, fade_s, at_s)
+            self._agree(Agreed(at_s, begin, on_result))
+            return
+        self._show(frames, on_result, showing, fade_s)
+
+    def _show(
+        self,
+        frames: FrameSet,
+        on_result: ResultCallback | None,
+        showing: str,
+        fade_s: float,
+        at_s: float | None = None,
+    ) -> None:
         self.withdraw()
         self._coming = PendingPresentation(showing, None, frames, self._presenter.soon(), on_result, fade_s)
+        if at_s is not None:
+            grid = self._presenter.grid = Grid(self.rate_hz, self.ahead_s)
+            self._coming.due_tick = grid.after(at_s - self.ahead_s)
+            self._coming.tick = max(self._coming.due_tick, self._presenter.soon())
 
     def play(
-        self, playlist: Playlist, on_result: ResultCallback, *, rate_hz: float | None = None, brightness: float = 1.0
+        self,
+        playlist: Playlist,
+        on_result: ResultCallback,
+        *,
+        rate_hz: float | None = None,
+        brightness: float = 1.0,
+        at_s: float | None = None,
+        bundle: Path | None = None,
     ) -> None:
         """Play appearances in turn; ``on_result`` is called for the first. ``rate_hz``: the grid meanwhile;
-        ``brightness``: the share of their light, 0..1.
+        ``brightness``: the share of their light, 0..1; ``at_s``: when the first is due on the common clock, all others
+        follow by the same clock, and a player that comes later joins in; ``bundle``: which they are of, then.
 
         Raises BundleError if the bundle is missing or it has not all of them; then nothing changes.
         """
         self._on_asked()
-        decoded = self._loaded()
+        decoded = self._loaded() if bundle is None else self._opened(bundle)
         for name in playlist.names:
             decoded.bundle.index.appearance(name)
-        self.withdraw()
-        self._presenter.begin_sequence(rate_hz or self.rate_hz)
-        self._playlist, self._brightness = playlist, brightness
         playlist.look_ahead = decoded.look_ahead
-        self._make_coming(self._presenter.soon(), on_result)
+
+        def begin() -> None:
+            self.withdraw()
+            if decoded is not self._decoded:
+                self._use(decoded)
+            self._presenter.begin_sequence(rate_hz or self.rate_hz, 0.0 if at_s is None else self.ahead_s)
+            self._playlist, self._brightness = playlist, brightness
+            if at_s is None:
+                self._make_coming(self._presenter.soon(), on_result)
+                return
+            grid = self._presenter.grid
+            self._timetable = playlist.starts(grid.after(at_s - self.ahead_s), grid.ticks)
+            self._make_scheduled(self._timetable.number_at(self._now_tick), on_result)
+
+        if at_s is None:
+            begin()
+            return
+        if decoded is not self._decoded:
+            decoded.want([playlist.appearance])
+        self._agree(Agreed(at_s, begin, on_result, decoded, (playlist.appearance,)))
+
+    def _agree(self, agreed: Agreed) -> None:
+        _ = self.ahead_s
+        self._drop_agreed()
+        self._agreed = agreed
+        if self._playlist is not None and self._decoded is not None:
+            self._decoded.want(self._wanted(self._playlist))
+
+    def _drop_agreed(self) -> None:
+        agreed, self._agreed = self._agreed, None
+        if agreed is None:
+            return
+        if agreed.decoded is not None and agreed.decoded is not self._decoded:
+            agreed.decoded.close()
+        if agreed.on_result is not None:
+            agreed.on_result(superseded())
 
     def live(self, path: Path, white: float | None) -> dict[str, Any]:
         """Show what is written to a frame file as it comes: finished frames, or with ``white`` targets.
@@ -214,8 +244,9 @@ class Player:
 
     def withdraw(self) -> None:
         """Present nothing more, keep the picture; pending requests get an error."""
+        self._drop_agreed()
         live, self._live = self._live, None
-        coming, self._coming, self._playlist = self._coming, None, None
+        coming, self._coming, self._playlist, self._timetable = self._coming, None, None, None
         if live is not None:
             self._presenter.shown = live.end() or self.shown
         self._presenter.grid = Grid(self.rate_hz)
@@ -223,29 +254,29 @@ class Player:
             self._presenter.freeze(coming)
             self._hold_shown()
         if coming is not None and coming.on_result is not None:
-            coming.on_result(
-                UsageError(
-                    "superseded",
-                    what="Another request came before this one was presented.",
-                    remedy="Wait for the answer before you request the next picture, and let only one program send "
-                    "requests.",
-                )
-            )
+            coming.on_result(superseded())
 
     def load_bundle(self, path: Path) -> None:
         """Use this bundle from now on; the picture stays until something is played. Raises BundleError."""
+        self._use(self._opened(path))
+
+    def _opened(self, path: Path) -> DecodedAhead:
+        """The bundle of a file; of the loaded one, as it is. Raises BundleError."""
         bundle = Bundle.open_trusted(path, self._trust)
         try:
             check_fits(bundle, self.sizes)
         except BundleError:
             bundle.close()
             raise
+        return DecodedAhead(bundle, self.sizes, self._wake)
+
+    def _use(self, decoded: DecodedAhead) -> None:
         if self._decoded is not None:
             if self._busy_with_bundle():
                 self.withdraw()
             self._decoded.close()
-        self._decoded = DecodedAhead(bundle, self.sizes, self._wake)
-        self._warning = unsigned_warning(bundle.signed_by, self._trust)
+        self._decoded = decoded
+        self._warning = unsigned_warning(decoded.bundle.signed_by, self._trust)
         if self._warning is not None:
             log(f"WARNING: {self._warning.what} {self._warning.remedy}")
 
@@ -305,13 +336,57 @@ class Player:
             "bundle": self.bundle_identity,
             "signed_by": None if signed_by is None else signed_by.hex(),
             "warning": None if self._warning is None else player_codec.error_fields(self._warning),
+            "reported": self._reports[-1][0] if self._reports else 0,
+            "alone": self._alone,
             "rss_bytes": pages * os.sysconf("SC_PAGESIZE"),
         }
 
     # --- presenting ---------------------------------------------------------------------------------------------
 
+    def reports(self, after: int) -> list[list[Any]]:
+        """What was presented by schedules: [count, due_s, at_s, appearance] each, of the common clock, the first of
+        which is above ``after``; at most a thousand.
+        """
+        return [report for report in self._reports if report[0] > after][:_REPORTS_AT_ONCE]
+
+    @property
+    def _now_tick(self) -> int:
+        """The tick that was last, whether or not it was met."""
+        return self._presenter.grid.after(time.monotonic()) - 1
+
+    def _keep_times(self) -> None:
+        """What a common clock wants: begin what was agreed on, leave out what is over, and notice being alone."""
+        now_s = time.monotonic()
+        if self._alone_at_s is not None and now_s > self._alone_at_s:
+            self._alone, self._alone_at_s = True, None
+            log(f"This player has had no news of the common clock for too long. Its rule: {self._alone_then}.")
+            if self._alone_then == "black":
+                self.stop(None)
+            elif self._alone_then == "still":
+                self.withdraw()
+        coming, agreed, table = self._coming, self._agreed, self._timetable
+        grid = self._presenter.grid
+        if agreed is not None:
+            due_s = agreed.at_s - self.ahead_s
+            first = coming is not None and grid.at_s(coming.tick) < due_s
+            if not first or now_s > due_s - 0.5 / grid.rate_hz:
+                self._agreed = None
+                agreed.begin()
+        elif table is not None and coming is not None and coming.share == 0:
+            number = table.number_at(self._now_tick)
+            if number > coming.number:
+                self._presenter.late += number - coming.number
+                self._make_scheduled(number, coming.on_result)
+
     def _patience_s(self) -> float:
         """How long the loop may wait for requests before it must look again."""
+        waited_s = self._patience_for_pictures_s()
+        if self._agreed is not None:
+            due_s = self._agreed.at_s - self.ahead_s - 0.5 / self._presenter.grid.rate_hz
+            waited_s = min(waited_s, max(0.0, due_s - time.monotonic()))
+        return waited_s
+
+    def _patience_for_pictures_s(self) -> float:
         if self._coming is None:
             idle_s = _IDLE_S if self._live is None else _LIVE_WAIT_S
             return min(idle_s, self._notifier.interval_s or idle_s)
@@ -347,18 +422,22 @@ class Player:
         if coming.on_result is not None:
             coming.on_result(error)
         if self._playlist is not None and self._playlist.has_others(coming.appearance):
-            self._go_on(coming.tick + self._presenter.grid.ticks(self._playlist.seconds))
+            self._go_on(coming.tick + self._presenter.grid.ticks(self._playlist.seconds), coming.number)
         else:
-            self._playlist = None
+            self._playlist = self._timetable = None
 
     def _present_if_due(self, *, wait: bool = False) -> None:
         coming = self._coming
         if not self._take_frames() or coming is None or coming.frames is None:
             return
-        before = self._presenter.last
+        before, begins = self._presenter.last, coming.share == 0
         whole = self._presenter.present(coming, coming.frames, wait=wait)
         if self._presenter.last is not before:
             self._showing, self._appearance = coming.showing, coming.appearance
+            if begins and coming.due_tick is not None:
+                grid, last = self._presenter.grid, self._presenter.last
+                due_s = grid.at_s(coming.due_tick) + grid.ahead_s
+                self._reports.append([last.sequence, due_s, last.at_s + grid.ahead_s, coming.appearance])
         if whole:
             self._presented(coming)
 
@@ -371,7 +450,7 @@ class Player:
             self._on_appearance()
             self._on_appearance = None
         if self._playlist is not None:
-            self._go_on(coming.first_tick + self._presenter.grid.ticks(self._playlist.seconds))
+            self._go_on(coming.first_tick + self._presenter.grid.ticks(self._playlist.seconds), coming.number)
         if coming.on_result is not None:
             coming.on_result(self._presenter.last)
 
@@ -379,17 +458,37 @@ class Player:
         if self._decoded is not None:
             self._decoded.hold(self.shown)
 
-    def _go_on(self, tick: int) -> None:
-        """Make the next item of the sequence coming, no sooner than ``tick``; end the sequence after its last."""
-        playlist = self._playlist
-        if playlist is None or not playlist.advance():
-            self._playlist = None
-            return
-        self._make_coming(tick, None)
+    def _go_on(self, tick: int, number: int) -> None:
+        """Make the item after ``number`` coming, no sooner than ``tick``, or as it is scheduled; end the sequence after
+        its last.
+        """
+        if self._timetable is not None and number < self._timetable.last:
+            self._make_scheduled(max(number + 1, self._timetable.number_at(self._now_tick)), None)
+        elif self._timetable is None and self._playlist is not None and self._playlist.advance():
+            self._make_coming(tick, None)
+        else:
+            self._playlist = self._timetable = None
 
-    def _make_coming(self, tick: int, on_result: ResultCallback | None) -> None:
+    def _make_scheduled(self, number: int, on_result: ResultCallback | None) -> None:
+        """Make the item of this number coming, at its time, or at once if that has passed."""
+        assert self._timetable is not None
+        assert self._playlist is not None
+        self._playlist.seek(number)
+        tick = self._timetable.start(number)
+        coming = self._make_coming(tick, on_result)
+        coming.due_tick, coming.number = tick, number
+
+    def _make_coming(self, tick: int, on_result: ResultCallback | None) -> PendingPresentation:
         assert self._decoded is not None
         assert self._playlist is not None
-        self._decoded.want(self._playlist.upcoming)
+        self._decoded.want(self._wanted(self._playlist))
         name, fade_s = self._playlist.appearance, self._playlist.fade_s
         self._coming = PendingPresentation("appearance", name, None, tick, on_result, fade_s, paced=True)
+        return self._coming
+
+    def _wanted(self, playlist: Playlist) -> list[str]:
+        """What is decoded ahead: the first picture of what was agreed on is among it, whatever comes before."""
+        agreed = self._agreed
+        if agreed is None or agreed.decoded is not self._decoded:
+            return playlist.upcoming
+        return [*playlist.upcoming[: max(1, playlist.look_ahead - 1)], *agreed.names]

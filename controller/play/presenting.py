@@ -14,7 +14,8 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from controller.core.errors import VelaturaError
+from controller.core.errors import UsageError, VelaturaError
+from controller.play.cache import DecodedAhead
 from controller.play.display.outputs import Output, mix_sets
 from controller.play.frames import FrameSet, OutputSize
 
@@ -25,17 +26,20 @@ _CLASSES: Final = 58_000
 
 
 class Grid:
-    """Moments k / rate on the monotonic clock, k whole: deadlines that never drift."""
+    """Moments k / rate, k whole, on a clock that is ``ahead_s`` ahead of the monotonic one: deadlines that never drift.
 
-    def __init__(self, rate_hz: float) -> None:
-        self.rate_hz = rate_hz
+    Moments are monotonic seconds. Players with one clock have the same ticks.
+    """
+
+    def __init__(self, rate_hz: float, ahead_s: float = 0.0) -> None:
+        self.rate_hz, self.ahead_s = rate_hz, ahead_s
 
     def after(self, moment_s: float) -> int:
         """The first tick that is not before ``moment_s``."""
-        return math.ceil(moment_s * self.rate_hz)
+        return math.ceil((moment_s + self.ahead_s) * self.rate_hz)
 
     def at_s(self, tick: int) -> float:
-        return tick / self.rate_hz
+        return tick / self.rate_hz - self.ahead_s
 
     def ticks(self, seconds: float) -> int:
         """How many ticks last about ``seconds``; at least one."""
@@ -106,6 +110,8 @@ class PendingPresentation:
     ``frames`` None: the appearance is taken from the cache once it is decoded. ``fade_s``: it comes in over what is
     shown, in ``steps``, the first at ``begun_tick``; ``share`` of it is shown already. ``paced``: it is one of a
     sequence, whose intervals are measured. ``prepare``: makes the output ready where that does not take ``frames``.
+    ``due_tick``: when it is due by a schedule, even if it begins later; None: its begin may be delayed. ``number``: of
+    the schedule's pictures, from 0.
     """
 
     showing: str
@@ -119,15 +125,18 @@ class PendingPresentation:
     begun_tick: int | None = None
     steps: int = 1
     share: float = 0.0
+    due_tick: int | None = None
+    number: int = 0
 
     def begin(self, steps: int) -> None:
-        """The first step is presented at ``tick``."""
-        self.begun_tick, self.steps = self.tick, steps
+        """The first step is presented at ``tick``, or was due before."""
+        self.begun_tick, self.steps = self.tick if self.due_tick is None else self.due_tick, steps
 
     def delay(self, tick: int) -> None:
-        """It begins at ``tick`` after all."""
+        """It begins at ``tick`` after all; the fade of one that is due by a schedule has begun without it."""
         self.tick = tick
-        self.begun_tick = None if self.begun_tick is None else tick
+        if self.begun_tick is not None and self.due_tick is None:
+            self.begun_tick = tick
 
     def step(self, next_tick: int) -> bool:
         """Its step of ``tick`` is shown. Whether that was the last; else the next is not before ``next_tick``."""
@@ -146,6 +155,28 @@ class PendingPresentation:
     def next_share(self) -> float:
         """How much of it is shown at ``tick``: by the clock, so a slow machine leaves out steps and not time."""
         return 1.0 if self.begun_tick is None else min(1.0, (self.tick - self.begun_tick + 1) / self.steps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreed:
+    """What begins at a moment of the common clock; what is shown continues until then.
+
+    ``decoded``: the bundle that it is of; ``names``: what has to be decoded before, of that.
+    """
+
+    at_s: float
+    begin: Callable[[], None]
+    on_result: ResultCallback | None
+    decoded: DecodedAhead | None = None
+    names: tuple[str, ...] = ()
+
+
+def superseded() -> UsageError:
+    return UsageError(
+        "superseded",
+        what="Another request came before this one was presented.",
+        remedy="Wait for the answer before you request the next picture, and let only one program send requests.",
+    )
 
 
 _EARLY_S: Final = 0.0005
@@ -170,9 +201,9 @@ class Presenter:
         self.late = 0
         self._prepare_s = self._slowest_s = 0.0
 
-    def begin_sequence(self, rate_hz: float) -> None:
+    def begin_sequence(self, rate_hz: float, ahead_s: float = 0.0) -> None:
         """Pictures come on this grid from now on; the count restarts."""
-        self.grid, self.intervals, self.late = Grid(rate_hz), Intervals(), 0
+        self.grid, self.intervals, self.late = Grid(rate_hz, ahead_s), Intervals(), 0
 
     def soon(self) -> int:
         """The first tick that can be met."""

@@ -34,7 +34,8 @@ from controller.play.control.protocol import (
 )
 from controller.play.display.identification import identification
 from controller.play.frames import FrameFile, FrameSet
-from controller.play.loop import Player, Playlist
+from controller.play.loop import Player
+from controller.play.playlist import Playlist
 from controller.play.presenting import PresentedSet
 from hal.codecs import player as player_codec
 from hal.codecs.player import error_line
@@ -209,6 +210,7 @@ class Server:
 
 SUFFIX: Final = ".playing"
 _BLACK: Final = b'{"op": "stop"}\n'
+_SHOWS_NOTHING: Final = protocol.Hello | protocol.Status | protocol.LoadBundle | protocol.Clock | protocol.Reports
 
 
 class SavedRequest:
@@ -258,6 +260,7 @@ class Commands:
         """``first``: what to begin with where nothing is kept."""
         self._player, self._server, self._inbox, self._kept = player, server, inbox, kept
         self._first = first
+        self._waits_for_clock = False
         # One may be shown, and be what the next picture fades from, while the other is read into.
         self._patterns = [FrameSet.black(player.sizes), FrameSet.black(player.sizes)]
 
@@ -268,17 +271,21 @@ class Commands:
 
     def resume(self) -> None:
         """Continue with what is kept, or else begin with what there is to begin with; black if that can't be played."""
-        request = self._kept.request() or self._first
-        if request is not None:
-            with contextlib.suppress(VelaturaError):
-                self._do(request, lambda _: None)
+        request, self._waits_for_clock = self._kept.request() or self._first, False
+        if request is None:
+            return
+        try:
+            self._do(request, lambda _: None)
+        except VelaturaError as error:
+            self._waits_for_clock = error.code == "clock-unknown"
 
     def _handle(self, client: Client, line: bytes) -> None:
         ticket = None
         try:
             ticket, request = protocol.parse_request(line)
             values = self._do(request, partial(self._answer, client, ticket))
-            if not isinstance(request, protocol.Hello | protocol.Status | protocol.LoadBundle):
+            if not isinstance(request, _SHOWS_NOTHING):
+                self._waits_for_clock = False
                 self._kept.accepted(request, line)
         except protocol.InvalidRequest as error:
             self._server.send(client, player_codec.error_line(error.ticket, error))
@@ -300,34 +307,49 @@ class Commands:
     ) -> dict[str, Any] | None:
         """Carry a request out; return its answer, or None where that comes once it is presented."""
         match request:
-            case protocol.Hello():
-                return self._hello()
-            case protocol.Status():
-                return self._player.status()
-            case protocol.Show(sequence):
+            case protocol.Show(sequence, at_s):
                 self._player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
-                self._player.show(self._read_inbox(sequence), on_result)
-            case protocol.Play(appearance, fade_s, brightness):
+                self._player.show(self._read_inbox(sequence), on_result, at_s=at_s)
+            case protocol.Play(appearance, fade_s, brightness, at_s, bundle):
                 playlist = Playlist(((appearance, 0.0, fade_s),), repeat=1)
-                self._player.play(playlist, on_result, brightness=brightness)
-            case protocol.Sequence(items, repeat, rate_hz, brightness, first_fade_s):
+                self._player.play(playlist, on_result, brightness=brightness, at_s=at_s, bundle=_path(bundle))
+            case protocol.Sequence(items, repeat, rate_hz, brightness, first_fade_s, at_s, bundle):
                 playlist = Playlist(items, repeat, first_fade_s)
-                self._player.play(playlist, on_result, rate_hz=rate_hz, brightness=brightness)
+                self._player.play(
+                    playlist, on_result, rate_hz=rate_hz, brightness=brightness, at_s=at_s, bundle=_path(bundle)
+                )
             case protocol.Suggested(repeat):
                 self._player.play(self._player.suggested(repeat), on_result)
-            case protocol.Live(file, white):
-                return self._player.live(Path(file), white)
-            case protocol.Stop(fade_s):
-                self._player.stop(on_result, fade_s=fade_s)
+            case protocol.Stop(fade_s, at_s):
+                self._player.stop(on_result, fade_s=fade_s, at_s=at_s)
             case protocol.Identify():
                 self._player.show(identification(self._player.sizes), on_result, showing="identification")
+            case _:
+                return self._answered(request)
+        return None
+
+    def _answered(self, request: protocol.Request) -> dict[str, Any]:
+        """Carry out a request that is answered at once."""
+        answer: dict[str, Any] = {}
+        match request:
+            case protocol.Hello():
+                answer = self._hello()
+            case protocol.Status():
+                answer = self._player.status()
+            case protocol.Live(file, white):
+                answer = self._player.live(Path(file), white)
             case protocol.LoadBundle(path):
                 self._player.load_bundle(Path(path))
-                return {"bundle": self._player.bundle_identity}
+                answer = {"bundle": self._player.bundle_identity}
+            case protocol.Clock(ahead_s, keep_s, then):
+                self._player.clock(ahead_s, keep_s, then)
+                if self._waits_for_clock:
+                    self.resume()
+            case protocol.Reports(after):
+                answer = {"reports": self._player.reports(after)}
             case protocol.Quit():
                 self._player.end()
-                return {}
-        return None
+        return answer
 
     def _read_inbox(self, sequence: int) -> FrameSet:
         pattern = next(pattern for pattern in self._patterns if pattern is not self._player.shown)
@@ -353,3 +375,7 @@ class Commands:
             "inbox": str(self._inbox.path.resolve()),
             "bundle": player.bundle_identity,
         }
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeAlias
 
 from controller.core.errors import UsageError
 
-MINOR: Final = 4
+MINOR: Final = 5
 """Raised when the protocol gets an addition that older clients can ignore."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
@@ -20,6 +20,8 @@ MAX_RATE_HZ: Final = 1000.0
 MAX_SECONDS: Final = 7 * 24 * 3600.0
 MAX_FADE_S: Final = 600.0
 MAX_RADIANCE: Final = 1e9
+MAX_MOMENT_S: Final = 1e11
+THEN: Final = ("on", "black", "still")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,21 +31,25 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Show:
-    """Present the frames in the inbox, which have this (even) sequence number."""
+    """Present the frames in the inbox, which have this (even) sequence number; ``at_s``: when, on the common clock."""
 
     sequence: int
+    at_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Play:
     """Present an appearance of the loaded bundle, ``fade_s`` seconds long over what is shown.
 
-    ``brightness``: the share of its light that is shown, 0..1.
+    ``brightness``: the share of its light that is shown, 0..1. ``at_s``: when, on the common clock; ``bundle``: the
+    file that it is of from then on.
     """
 
     appearance: str
     fade_s: float
     brightness: float = 1.0
+    at_s: float | None = None
+    bundle: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +59,7 @@ class Sequence:
     An item lasts ``seconds``, in the first ``fade_s`` of which it fades in over the previous one.
     ``rate_hz``: during it pictures change at multiples of 1 / rate_hz seconds; None: at the player's own.
     ``brightness``: the share of their light that is shown, 0..1; ``first_fade_s``: for how long the first item comes
-    in at the beginning, None: as it says.
+    in at the beginning, None: as it says. ``at_s`` and ``bundle`` as for ``Play``: each item is due by the same clock.
     """
 
     items: tuple[tuple[str, float, float], ...]
@@ -61,6 +67,8 @@ class Sequence:
     rate_hz: float | None
     brightness: float = 1.0
     first_fade_s: float | None = None
+    at_s: float | None = None
+    bundle: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +80,30 @@ class Suggested:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Present black, ``fade_s`` seconds long over what is shown."""
+    """Present black, ``fade_s`` seconds long over what is shown; ``at_s``: when, on the common clock."""
 
     fade_s: float
+    at_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The common clock is ``ahead_s`` ahead of this computer's monotonic one.
+
+    If this is not said again within ``keep_s`` (None: for ever), the player ``then`` continues ("on"), shows "black"
+    or stays "still".
+    """
+
+    ahead_s: float
+    keep_s: float | None
+    then: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reports:
+    """When the pictures of schedules were presented, of those that count more than ``after``."""
+
+    after: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +139,9 @@ class Quit:
     """Present black and end."""
 
 
-Request: TypeAlias = Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Quit
+Request: TypeAlias = (
+    Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Clock | Reports | Quit
+)
 
 
 def parse_request(line: bytes) -> tuple[Any, Request]:
@@ -173,16 +204,39 @@ def _text(value: Any, key: str) -> str:
     return value
 
 
-def _show(*, sequence: Any) -> Show:
-    return Show(_integer(sequence, "sequence", 2**64 - 1))
+def _show(*, sequence: Any, at: Any = None) -> Show:
+    return Show(_integer(sequence, "sequence", 2**64 - 1), _moment(at))
 
 
-def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0) -> Play:
-    return Play(_text(appearance, "appearance"), _fade(fade_s), _share(brightness))
+def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0, at: Any = None, bundle: Any = None) -> Play:
+    name = _text(appearance, "appearance")
+    return Play(name, _fade(fade_s), _share(brightness), _moment(at), _file(bundle, at))
 
 
-def _stop(*, fade_s: Any = 0.0) -> Stop:
-    return Stop(_fade(fade_s))
+def _stop(*, fade_s: Any = 0.0, at: Any = None) -> Stop:
+    return Stop(_fade(fade_s), _moment(at))
+
+
+def _clock(*, ahead_s: Any, keep_s: Any = None, then: Any = "on") -> Clock:
+    if isinstance(ahead_s, bool) or not isinstance(ahead_s, int | float) or not abs(ahead_s) <= MAX_MOMENT_S:
+        raise ValueError(f"ahead_s is not a number of at most {MAX_MOMENT_S:g} either way")
+    if then not in THEN:
+        raise ValueError(f"then is not one of {', '.join(THEN)}")
+    return Clock(float(ahead_s), None if keep_s is None else _number(keep_s, "keep_s", MAX_SECONDS), then)
+
+
+def _reports(*, after: Any = 0) -> Reports:
+    return Reports(_integer(after, "after", 2**63 - 1))
+
+
+def _moment(value: Any) -> float | None:
+    return None if value is None else _number(value, "at", MAX_MOMENT_S)
+
+
+def _file(value: Any, at: Any) -> str | None:
+    if value is not None and at is None:
+        raise ValueError("bundle is only for a request with at; load-bundle is for the others")
+    return None if value is None else _text(value, "bundle")
 
 
 def _share(value: Any) -> float:
@@ -198,7 +252,14 @@ def _live(*, file: Any, white: Any = None) -> Live:
 
 
 def _sequence(
-    *, items: Any, repeat: Any = 0, rate_hz: Any = None, brightness: Any = 1.0, first_fade_s: Any = None
+    *,
+    items: Any,
+    repeat: Any = 0,
+    rate_hz: Any = None,
+    brightness: Any = 1.0,
+    first_fade_s: Any = None,
+    at: Any = None,
+    bundle: Any = None,
 ) -> Sequence:
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ITEMS:
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
@@ -208,6 +269,8 @@ def _sequence(
         rate_hz=None if rate_hz is None else _number(rate_hz, "rate_hz", MAX_RATE_HZ),
         brightness=_share(brightness),
         first_fade_s=None if first_fade_s is None else _fade(first_fade_s),
+        at_s=_moment(at),
+        bundle=_file(bundle, at),
     )
 
 
@@ -240,5 +303,7 @@ _READERS: Final[dict[str, Any]] = {
     "identify": Identify,
     "status": Status,
     "load-bundle": _load_bundle,
+    "clock": _clock,
+    "reports": _reports,
     "quit": Quit,
 }
