@@ -32,6 +32,8 @@ from controller.optics.capture.profile import CameraNoise
 
 NAMED: Final = 0.002
 """Standard deviation from which flicker is named; steady lamps are measured with 0.0009 at most."""
+SURE, BANDS = 3.0, 6
+"""Standard errors from which it is, by bands of rows that say it each by itself."""
 
 
 def lamp_flicker(strengths: Float64 | None) -> float:
@@ -46,9 +48,12 @@ def lamp_flicker(strengths: Float64 | None) -> float:
     return float(np.sqrt(np.sum(off**2) / (off.size - len(off))))
 
 
-def unsteady(name: str, flicker: float) -> str | None:
-    """What a technician should know of ``lamp_flicker``; None where the lamp is steady."""
-    if flicker < NAMED:
+def unsteady(name: str, flicker: float, sigma: float = 0.0) -> str | None:
+    """What a technician should know of ``lamp_flicker``; None where the lamp is steady.
+
+    ``sigma``: of ``separation.SinusoidContrast``: a lamp changes the light of all parts of a picture alike.
+    """
+    if flicker < max(NAMED, SURE * sigma):
         return None
     return (
         f"The light of projector {name} is not steady: it differs by {100 * flicker:.1f} % (standard deviation) from "
@@ -147,6 +152,7 @@ class SinusoidContrast:
     ``fine_around`` (rows, columns): the fine contrast of the light of all pixels around, of all channels together
     ``white`` (rows, columns, 3): the white image with less noise, from all steps, which add up to it
     ``strengths`` (sinusoids, steps): how strong the lamp was at each step, 1 at white; None where steps are computed
+    ``sigma``: their standard error, by how far parts of the picture disagree
     """
 
     coarse: Sinusoids
@@ -154,6 +160,7 @@ class SinusoidContrast:
     fine_around: FloatImage
     white: FloatImage
     strengths: Float64 | None = None
+    sigma: float = 0.0
 
 
 def sinusoid_contrast(
@@ -174,13 +181,14 @@ def sinusoid_contrast(
     sums = WhiteSums()
     coarse, _, gains = _measured(captures, plan, COARSE, black, white, noise, sums)
     fine, powers, more = _measured(captures, plan, FINE, black, white, noise, sums)
-    strengths = 1 / np.array([*gains, *more]) if gains else None
+    strengths = 1 / np.array([gain for gain, _ in (*gains, *more)]) if gains else None
+    sigma = float(np.sqrt(np.mean([one**2 for _, one in (*gains, *more)]))) if gains else 0.0
     averaged = sums.averaged(white)
     with np.errstate(invalid="ignore", divide="ignore"):
         noise_of_white = white / averaged
         for one in (coarse, fine):
             np.multiply(one.contrast, noise_of_white, out=one.contrast)
-    return SinusoidContrast(coarse, fine, _contrast_around(powers, averaged), averaged, strengths)
+    return SinusoidContrast(coarse, fine, _contrast_around(powers, averaged), averaged, strengths, sigma)
 
 
 def indirect_share(
@@ -260,7 +268,7 @@ def _measured(
     white: FloatImage,
     camera: CameraNoise,
     white_sums: WhiteSums,
-) -> tuple[Sinusoids, list[FloatImage], list[Float64]]:
+) -> tuple[Sinusoids, list[FloatImage], list[tuple[Float64, Float64]]]:
     """Contrast of sinusoids along both axes, freed of the lamp's flicker and of the bias by noise.
 
     And (rows, columns, 3) of each axis: their squared amplitude, without noise; and ``_gains`` of each axis, if any.
@@ -268,7 +276,7 @@ def _measured(
     """
     powers: list[FloatImage] = []
     sums: list[FloatImage] = []
-    gains: list[Float64] = []
+    gains: list[tuple[Float64, Float64]] = []
     for prefix in prefixes:
         steps = plan.sinusoids(prefix)
         images = (coloured(captures, step.name, black.shape[:2]) - black for step in steps)
@@ -277,7 +285,7 @@ def _measured(
         else:
             kept = list(images)
             gains.append(_gains(kept, white))
-            kept = [image * np.float32(gain) for image, gain in zip(kept, gains[-1], strict=True)]
+            kept = [image * np.float32(gain) for image, gain in zip(kept, gains[-1][0], strict=True)]
             along, across = _amplitude(kept, steps)
             sums.append(np.asarray(sum(kept), np.float32))
             white_sums.add(sums[-1] * np.float32(2 / len(steps)))
@@ -324,18 +332,23 @@ def _add_wave(image: FloatImage, cosine: np.float32, sine: np.float32, along: Fl
         across[k] += sine * image[k]
 
 
-def _gains(images: list[FloatImage], white: FloatImage) -> Float64:
-    """How much brighter the lamp was at white than at each step: the steps must add up to half the white each."""
+def _gains(images: list[FloatImage], white: FloatImage) -> tuple[Float64, Float64]:
+    """How much brighter the lamp was at white than at each step: the steps must add up to half the white each.
+
+    And the standard error of that, by how far ``BANDS`` of rows disagree.
+    """
     use = channels.finite(white) & channels.every(white > FAINTEST * 10 * _bright(white))
     for image in images:
         use &= channels.finite(image)
     at = np.flatnonzero(use)
     if at.size < 10 * len(images):
-        return np.ones(len(images))
+        return np.ones(len(images)), np.zeros(len(images))
     at = at[:: max(1, at.size // SOME_PIXELS)]
     full = white.reshape(-1, 3)[at].astype(np.float64)
     equations = np.stack([(i.reshape(-1, 3)[at] / full).ravel() for i in images], axis=1)
-    return np.asarray(np.linalg.lstsq(equations, np.full(equations.shape[0], len(images) / 2), rcond=None)[0])
+    bands = [equations, *np.array_split(equations, BANDS)]
+    whole, *each = (np.linalg.lstsq(one, np.full(len(one), len(images) / 2), rcond=None)[0] for one in bands)
+    return np.asarray(whole), np.std(each, axis=0, ddof=1) / np.sqrt(BANDS)
 
 
 def _bright(white: FloatImage) -> FloatImage:

@@ -78,7 +78,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     gain = _gain(white, light.white)
     found = Indirect(share, radiometry.response, radiometry.mixing, segment, stripes, gain, radiometry.paint)
     troubles = {
-        TroubleCode.UNSTEADY_LAMP: unsteady(name, flicker),
+        TroubleCode.UNSTEADY_LAMP: unsteady(name, flicker, seen.sigma),
         # In direct light alone tiles differ less, so that paint is seen where it was not before.
         TroubleCode.PAINT_COLOURS: painted(name, report.paint),
     }

@@ -49,3 +49,17 @@ def test_a_steady_lamp_is_not_named_whatever_the_response(bent: float) -> None:
 def test_computed_steps_tell_nothing() -> None:
     made, _ = pictures(0.03, few=True)
     assert lamp_flicker(sinusoid_contrast(made, plan_patterns(SIZE, few=True), made["white"]).strengths) == 0
+
+
+@pytest.mark.parametrize("flicker", [0.0, 0.005])
+def test_what_darkens_a_part_of_the_picture_is_no_lamp(flicker: float) -> None:
+    """Somebody's shadow in one photograph. A lamp that flickers is named yet."""
+    made, _ = pictures(flicker)
+    plan = plan_patterns(SIZE)
+    shown = made[plan.sinusoids("phase-x")[0].name]
+    if not flicker:
+        shown[:30] *= np.float32(0.9)
+    seen = sinusoid_contrast(made, plan, made["white"])
+    found = lamp_flicker(seen.strengths)
+    assert found > 0.002, "the photographs differ in light"
+    assert (unsteady("left", found, seen.sigma) is None) is (flicker == 0)
