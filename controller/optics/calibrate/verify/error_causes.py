@@ -33,8 +33,11 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
         "usually no action is needed; move the projector or the camera if such lines disturb",
     ),
     ErrorCause.MOVED: ("moved", "the pattern lies elsewhere than predicted", "something moved: run `velatura drift`"),
-    ErrorCause.DIMMED: ("brightness", "it is evenly brighter or darker than predicted",
-                    "let the lamps warm up longer, keep other light out, and calibrate again"),
+    ErrorCause.DIMMED: (
+        "brightness", "it is evenly brighter or darker than predicted",
+        "let the lamps warm up longer, keep other light out, and calibrate again; if it stays, the projector's picture "
+        "mode may bend its response",
+    ),
     ErrorCause.DARK: (
         "noise", "most of the error is the camera's noise",
         "usually no action is needed; longer exposures, more light or a camera with less noise would help",

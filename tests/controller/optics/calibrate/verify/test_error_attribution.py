@@ -75,7 +75,9 @@ def test_each_fault_is_blamed_on_what_caused_it(reason: ErrorCause) -> None:
     inner = found.labels[38:52, 50:70]
     assert np.mean(inner == reason) > 0.8
     assert ranked(found)[0]["sentence"].endswith(".")
-    if reason is not ErrorCause.DARK:
+    if reason is ErrorCause.DARK:
+        assert ranked(found)[0]["reason"] == "noise"
+    else:
         assert not found.labels[:15].any()
         assert "in the middle" in ranked(found)[0]["sentence"]
 
