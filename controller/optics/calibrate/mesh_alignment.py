@@ -47,6 +47,11 @@ class Pose(NamedTuple):
         """(..., 3) in metres in the camera's frame of (..., 3) in the file's units."""
         return np.asarray(self.scale * points @ self.rotation.T + self.shift_m)
 
+    def then(self, other: Pose) -> Pose:
+        """This pose, and then ``other``."""
+        shift_m = other.scale * other.rotation @ self.shift_m + other.shift_m
+        return Pose(other.scale * self.scale, np.asarray(other.rotation @ self.rotation), np.asarray(shift_m))
+
     def moved(self, step: Float64, centre_m: Float64) -> Pose:
         """After a small turn (3), shift (3) and relative scale (1) about ``centre_m``."""
         turn, grown = cv2.Rodrigues(step[:3])[0], float(np.exp(step[6]))

@@ -31,7 +31,7 @@ from controller.optics.solve.bounded.solver import check_target, solve_bounded
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import ExposedTarget, expose_target
 from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.indirect.indirect_light import ReflectedLight
 from controller.optics.transport.planes import frame_planes, plane_frames, planes_above
 
 BaseKind = Literal["minimum", "white"]
@@ -62,7 +62,7 @@ class StageLight:
 
     transport: LightTransport
     black: FloatImage
-    indirect: IndirectLight | None = None
+    indirect: ReflectedLight | None = None
     drive: DriveLevels | None = None
 
 
@@ -314,7 +314,7 @@ def traditional_compensation(calibration: Calibration, target: FloatImage, n: in
 
 
 def exposed_for_one(
-    calibration: Calibration, picture: FloatImage, n: int, *, share: float, indirect: IndirectLight | None = None
+    calibration: Calibration, picture: FloatImage, n: int, *, share: float, indirect: ReflectedLight | None = None
 ) -> ExposedTarget:
     """``picture`` (rows, columns, 3), like reflectance, as bright as projector ``n`` can make it alone.
 

@@ -23,6 +23,7 @@ import scipy.sparse as sp
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError
+from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.optics.transport.operator import LightTransport
 from controller.optics.transport.planes import CameraBox
 from controller.optics.transport.windows.transport import borrow
@@ -253,3 +254,29 @@ def _beside(views: Sequence[LightTransport]) -> npt.NDArray[np.bool_] | None:
     on_object = [(view.per_weight > 0) & ~beside for view, beside in zip(views, room, strict=True)]
     found = np.asarray(np.any(room, axis=0) & ~np.any(on_object, axis=0))
     return found if found.any() else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewsIndirect:
+    """Light by way of other surfaces as each view knows it, on a sheet; None for a view without any."""
+
+    views: tuple[IndirectLight | None, ...]
+    sheet: Sheet
+
+    def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
+        """As ``IndirectLight.forward``."""
+        out = np.zeros_like(direct)
+        for view, box in zip(self.views, self.sheet.boxes(), strict=True):
+            if view is not None:
+                room = None if beside is None else beside[box.window]
+                out[box.window] = view.forward(np.ascontiguousarray(direct[box.window]), room)
+        return out
+
+    def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage:
+        """As ``IndirectLight.direct_target``."""
+        out = np.array(total, np.float32)
+        for view, box in zip(self.views, self.sheet.boxes(), strict=True):
+            if view is not None:
+                most = None if reach is None else reach[box.window]
+                out[box.window] = view.direct_target(total[box.window], reach=most)
+        return out

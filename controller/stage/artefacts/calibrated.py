@@ -2,31 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from controller.core.arrays import FloatImage
+import numpy as np
+
+from controller.core.arrays import FloatImage, Mask, array_in_file
+from controller.core.errors import UsageError
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
-from controller.optics.calibrate.values import Calibration
+from controller.optics.calibrate.photometry.view_colours import ViewColour, in_common_units, view_colours
+from controller.optics.calibrate.values import Calibration, Geometry, ProjectorCalibration
 from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.engine import Engine, Processor
 from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.targets.sheets import Places, mesh_places, on_sheet
+from controller.optics.solve.targets.values import connected, pieces
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.views import Sheet, ViewsIndirect, ViewsTransport
 from controller.stage.artefacts.calibration import read_calibration
-from controller.stage.artefacts.geometry import camera_px, known_geometry
+from controller.stage.artefacts.geometry import (
+    camera_px,
+    known_geometry,
+    read_camera,
+    read_geometry,
+    read_view_pose,
+)
+from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import SolvedBase
+from controller.stage.artefacts.views import first_view, view_folders
+
+
+class View(NamedTuple):
+    """``folder`` of a view; ``part`` takes its part of a camera image (rows, columns, ...); ``gain`` (3,): as of
+    ``ViewColour``, None for the only view."""
+
+    folder: Path
+    part: Callable[[Any], Any]
+    gain: FloatImage | None
+
+    def own_light(self, image: FloatImage) -> FloatImage:
+        """Its part of light (rows, columns, 3), in its own units."""
+        part: FloatImage = self.part(image)
+        return part if self.gain is None else part / self.gain
 
 
 class Calibrated:
     """The calibration of a run and its transport, read at the first use and kept.
 
-    ``engine``: what does the heavy loops of its solves
+    ``engine``: what does the heavy loops of its solves; ``names``: of its views
     """
 
     def __init__(self, folder: Path, projectors: Sequence[str], engine: Engine | None = None) -> None:
         self.folder = folder
+        self.names: tuple[str, ...] = (first_view(folder),)
         self.projectors = tuple(projectors)
         self.engine: Engine = Processor() if engine is None else engine
         self._calibration: Calibration | None = None
@@ -58,6 +90,38 @@ class Calibrated:
         if self._transport is None:
             self._transport = build_transport(self.calibration)
         return self._transport
+
+    @property
+    def geometry(self) -> Geometry:
+        """Points and poses in the camera's frame. Raises UsageError("shape-unknown")."""
+        return read_geometry(self.folder, self.projectors)
+
+    def places(self, mesh: RegisteredMesh) -> Places:
+        """Where the camera's pixels lie on a mesh's sheet."""
+        return mesh.places(read_camera(self.folder))
+
+    def objects(self, mask: Mask) -> list[Mask]:
+        """``mask`` (rows, columns) split into objects that stand apart."""
+        return pieces(mask)
+
+    def views(self) -> list[View]:
+        """The first one first."""
+        return [View(self.folder, lambda image: image, None)]
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Of the views."""
+        return (self.folder,)
+
+    def joined(self, images: Sequence[Any]) -> Any:
+        """One camera image (rows, columns, ...) of each view's."""
+        (image,) = images
+        return image
+
+    @property
+    def first(self) -> Calibrated:
+        """The first view alone."""
+        return self
 
     @property
     def indirect(self) -> IndirectLight | None:
@@ -117,3 +181,133 @@ class Calibrated:
 
     def keep_base(self, base: Base) -> None:
         self._base = base.in_files(self.folder)
+
+
+def all_views(run: Path, projectors: Sequence[str], engine: Engine | None = None) -> Calibrated:
+    """The calibration of a run with all of its whole views; of one view it is that view's own."""
+    folders = view_folders(run)
+    return AllViews(folders, projectors, engine) if len(folders) > 1 else Calibrated(run, projectors, engine)
+
+
+class AllViews(Calibrated):
+    """Several views of a run as one: their camera images lie on one sheet, in the units of the first view."""
+
+    def __init__(self, folders: Mapping[str, Path], projectors: Sequence[str], engine: Engine | None = None) -> None:
+        super().__init__(next(iter(folders.values())), projectors, engine)
+        self.names = tuple(folders)
+        self._views = [Calibrated(folder, projectors, self.engine) for folder in folders.values()]
+        self._colours: list[ViewColour] | None = None
+
+    @property
+    def first(self) -> Calibrated:
+        """The first view alone, which is in its own units anyway."""
+        return self._views[0]
+
+    @property
+    def colours(self) -> list[ViewColour]:
+        """How each view's light is brought to the units of the first one's."""
+        if self._colours is None:
+            self._colours = view_colours([view.calibration for view in self._views])
+            for view, colour in zip(self._views, self._colours, strict=True):
+                view._calibration = in_common_units(view.calibration, colour, self.folder)
+        return self._colours
+
+    @property
+    def sheet(self) -> Sheet:
+        """Where the views' pictures lie."""
+        sizes = (view.calibration.object_mask.shape for view in self._views)
+        return Sheet(tuple((rows, columns) for rows, columns in sizes))
+
+    def views(self) -> list[View]:
+        parts = [(lambda image, box=box: image[box.window]) for box in self.sheet.boxes()]
+        every = zip(self._views, parts, self.colours, strict=True)
+        return [View(view.folder, part, colour.gain) for view, part, colour in every]
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        return tuple(view.folder for view in self._views)
+
+    def joined(self, images: Sequence[Any]) -> Any:
+        return self.sheet.joined(images)
+
+    @property
+    def calibration(self) -> Calibration:
+        """As of one camera whose picture is the sheet; where it looks is known to the views alone."""
+        if self._calibration is None:
+            _ = self.colours
+            own = [view.calibration for view in self._views]
+            parts = tuple(self._projector([one.projectors[n] for one in own]) for n in range(len(self.projectors)))
+            black, mask = (self.sheet.joined([getattr(one, name) for one in own]) for name in ("black", "object_mask"))
+            self._calibration = dataclasses.replace(own[0], projectors=parts, black=black, object_mask=mask)
+        return self._calibration
+
+    def _projector(self, seen: Sequence[ProjectorCalibration]) -> ProjectorCalibration:
+        """One projector by all views; its response is that of the view that sees most of its light."""
+        best = max(seen, key=lambda part: int(np.count_nonzero(part.metapixels.valid)))
+        white = array_in_file(self.folder, (*self.sheet.shape, 3))
+        white[:] = 0
+        for part, box in zip(seen, self.sheet.boxes(), strict=True):
+            white[box.window] = part.white
+        return dataclasses.replace(best, white=white, phase_map=None, indirect=None, stripes=None, spread=None)
+
+    @property
+    def transport(self) -> LightTransport:
+        if self._transport is None:
+            _ = self.colours
+            self._transport = ViewsTransport.of([view.transport for view in self._views])
+        return self._transport
+
+    @property
+    def light(self) -> StageLight:
+        _ = self.colours
+        indirect = tuple(view.indirect for view in self._views)
+        known = None if all(one is None for one in indirect) else ViewsIndirect(indirect, self.sheet)
+        return StageLight(self.transport, self.calibration.black, known, self.drive)
+
+    @property
+    def base(self) -> Base:
+        if self._base is None:
+            solved = [SolvedBase.read(view.folder, self.projectors) for view in self._views]
+            image = self.sheet.joined([one.image * own.gain for one, own in zip(solved, self.colours, strict=True)])
+            self.keep_base(prepare_base(self.transport, image, self.calibration.black, solved[0].solution))
+        assert self._base is not None
+        return self._base
+
+    @property
+    def geometry(self) -> Geometry:
+        """All views' points on the sheet, in the first camera's frame.
+
+        Raises UsageError("shape-unknown", "views-apart").
+        """
+        geometries = [view.geometry for view in self._views]
+        poses = [read_view_pose(view.folder) for view in self._views]
+        points, normals = [], []
+        for name, pose, own in zip(self.names, poses, geometries, strict=True):
+            if pose is None:
+                raise UsageError(
+                    "views-apart",
+                    what=f"It is not known where the view {name} stands, and this needs the shape from all sides.",
+                    remedy="Let it see two projectors that another view sees, too, and calibrate again; or use an"
+                    " appearance that needs no shape.",
+                )
+            points.append((own.points_m - pose.shift_m.astype(np.float32)) @ pose.rotation.astype(np.float32))
+            normals.append(own.normals @ pose.rotation.astype(np.float32))
+        points_m, normals_there = (self.sheet.joined(images, np.nan) for images in (points, normals))
+        return dataclasses.replace(geometries[0], points_m=points_m, normals=normals_there)
+
+    def places(self, mesh: RegisteredMesh) -> Places:
+        _ = self.geometry  # refuses views that stand apart
+        poses = [read_view_pose(view.folder) for view in self._views]
+        seen = [
+            mesh_places(mesh.solid, mesh.arrays["uv"], mesh.pose.then(pose), read_camera(view.folder))
+            for view, pose in zip(self._views, poses, strict=True)
+            if pose is not None
+        ]
+        return on_sheet(seen, [box.top for box in self.sheet.boxes()])
+
+    def objects(self, mask: Mask) -> list[Mask]:
+        parts = [(box, piece) for box in self.sheet.boxes() for piece in pieces(mask[box.window])]
+        whole = [np.zeros(mask.shape, np.bool_) for _ in parts]
+        for one, (box, piece) in zip(whole, parts, strict=True):
+            one[box.window] = piece
+        return connected(whole, self.geometry.points_m)

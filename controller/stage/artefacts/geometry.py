@@ -12,6 +12,7 @@ import numpy as np
 from controller.core.arrays import FloatImage, load_arrays, save_arrays
 from controller.core.errors import UsageError
 from controller.optics.calibrate.geometry.shape import FoundShape, Shape
+from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.mesh import RegisteredMesh
@@ -113,6 +114,18 @@ def read_camera(run: Path) -> Pinhole:
     """The camera of a finished run, without the arrays of its points. Raises UsageError("shape-unknown")."""
     require_shape(run, "This")
     return _read_pinhole(read_geometry_figures(run)["camera"])
+
+
+def write_view_pose(run: Path, pose: Pose) -> Path:
+    """From the first camera's frame to that of this view, whose geometry is in ``run``."""
+    row = {"rotation": pose.rotation.tolist(), "translation_m": pose.shift_m.tolist()}
+    return write_json(json_path(run, StepKind.GEOMETRY), read_geometry_figures(run) | {"from_first": row})
+
+
+def read_view_pose(run: Path) -> Pose | None:
+    """The pose of ``write_view_pose``, of scale 1; None where the views of a run were not joined."""
+    row = read_geometry_figures(run).get("from_first")
+    return None if row is None else Pose(1.0, np.array(row["rotation"]), np.array(row["translation_m"]))
 
 
 def known_points_m(run: Path) -> FloatImage | None:

@@ -5,8 +5,8 @@ The solver is imported only to read its values, because the kiosk looks for file
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -150,6 +150,17 @@ class Solved:
         if self.asked is not None:
             return self.asked
         return RequestedTarget(self.target, self.reachable, np.ones_like(self.reachable))
+
+    def seen(self, part: Callable[[Any], Any], gain: FloatImage | None) -> Self:
+        """The same for one of several views, in its own units; both: as of ``calibrated.View``."""
+        if gain is None:
+            return self
+        asked = self.asked
+        if asked is not None:
+            asked = RequestedTarget(part(asked.target) / gain, part(asked.reachable), part(asked.valid))
+        figures = {**self.figures, "exposure": self.exposure / float(gain.mean())}
+        target = part(self.target) / gain
+        return replace(self, target=target, reachable=part(self.reachable), asked=asked, figures=figures)
 
     def write(self, run: Path, name: str) -> list[Path]:
         frames = {**_named("device", self.frames), **_named("linear", self.linear)}

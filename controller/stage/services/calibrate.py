@@ -18,7 +18,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Reporter
 from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import Calibrated, all_views
 from controller.stage.artefacts.grade import is_graded, passes
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
 from controller.stage.rig.ambient_light import dark_after
@@ -155,7 +155,7 @@ def make_appearances(
     engine = choose_engine(solve.device if order.device is None else order.device, reporter.say, solve.method)
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=order.accept_grade)
-        calibrated = Calibrated(run, checked.names, engine)
+        calibrated = all_views(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, order.names) if order.names or not order.scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in order.scenes]
         options = _options(checked.stage.tables.solve, chosen, quick=order.quick)
@@ -167,12 +167,12 @@ def make_appearances(
         ):
             steps = [
                 *compiled,
-                *([] if is_graded(run) else [verify_step(calibrated, (), scale)]),
+                *([] if is_graded(run) else [verify_step(calibrated.first, (), scale)]),
                 gate_step(worst_grade(checked), accepted=order.accept_grade, reporter=reporter),
                 *solve_steps(calibrated, requests, options, (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
-            publish = publishing(checked, calibrated, names)
+            publish = publishing(checked, calibrated.first, names)
             whole = [*steps, publish] if order.refinement is None else steps
             Runner(whole, journal, reporter=reporter).run("appearance", deadline=in_seconds(LONGEST_RUN_S, cancel))
     refined: Mapping[str, Any] = {}

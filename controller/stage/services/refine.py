@@ -60,6 +60,11 @@ def refine(
     Nothing is published. Raises what the devices and the steps raise, where refining was ``asked``.
     """
     folder = calibrated.folder
+    if len(calibrated.names) > 1:
+        # what is right from one side would be wrong from the others
+        if refinement.asked and refinement.photographs:
+            reporter.say("Appearances for several views stay as they were solved.", Level.WARNING)
+        return {}
     if refinement.photographs == 0:
         with session.locked():
             for name in titles:

@@ -19,7 +19,7 @@ from controller.optics.solve.bounded.solver import check_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
-from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.indirect.indirect_light import ReflectedLight
 
 FORGIVEN_DRIVE: Final = 2e-3
 """So much drive beyond black and white still counts as in reach."""
@@ -161,7 +161,7 @@ def expose_target(
     *,
     share: float,
     drive: DriveLevels | None = None,
-    indirect: IndirectLight | None = None,
+    indirect: ReflectedLight | None = None,
     asked: float | None = None,
 ) -> ExposedTarget:
     """Expose ``picture`` (rows, columns, 3), reflectance-like, so that ``share`` of the object can be that bright.
@@ -186,7 +186,7 @@ HARDLY_ANY: Final = 0.99
 
 def with_less_light(
     transport: LightTransport, target: Target, black: FloatImage, *,
-    share: float, drive: DriveLevels, indirect: IndirectLight | None = None,
+    share: float, drive: DriveLevels, indirect: ReflectedLight | None = None,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Whether more of a target is in reach with less light than its exposure, or that by ``share`` where it has none.
 
@@ -207,7 +207,7 @@ def with_less_light(
 
 
 def direct_part(
-    transport: LightTransport, wanted: FloatImage, black: FloatImage, indirect: IndirectLight | None
+    transport: LightTransport, wanted: FloatImage, black: FloatImage, indirect: ReflectedLight | None
 ) -> FloatImage:
     """What the projectors' direct light and the black image are to make of ``wanted`` (rows, columns, 3)."""
     if indirect is None:
@@ -222,7 +222,7 @@ def exposures(
     share: float,
     *,
     drive: DriveLevels,
-    indirect: IndirectLight | None = None,
+    indirect: ReflectedLight | None = None,
 ) -> tuple[float, float]:
     """As ``choose_exposure``, where a part of the picture's light comes by way of other surfaces.
 

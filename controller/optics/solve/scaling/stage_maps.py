@@ -57,7 +57,9 @@ def scaling_maps(
     by way of other surfaces is left out of what the projectors make; colours that depend on the paint are corrected.
     Raises UsageError("response-not-rising").
     """
-    transport, black, indirect = light.transport, light.black, light.indirect
+    # those of several views have no maps
+    indirect = light.indirect if isinstance(light.indirect, IndirectLight) else None
+    transport, black = light.transport, light.black
     factor = reduction(transport.camera_shape, largest_px)
     lit = base.inverse > 0
     unit = float(np.median(1 / base.inverse[lit])) if lit.any() else 1.0

@@ -6,7 +6,7 @@ light, and alpha, with which the light is not multiplied.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final, TypeAlias
 
@@ -51,6 +51,21 @@ def mesh_places(mesh: SolidMesh, uv: FloatImage, pose: Pose, camera: Pinhole) ->
         steps = np.stack([on_sheet(rays_of(camera, *(px + step).T)) - at for step in ((1.0, 0.0), (0.0, 1.0))], axis=1)
         at[face < 0] = np.nan
         return at, np.nan_to_num(steps, posinf=1.0, neginf=-1.0)
+
+    return places
+
+
+def on_sheet(views: Sequence[Places], tops: Sequence[int]) -> Places:
+    """Of the pixels of several views whose pictures lie below each other, from the rows ``tops`` on."""
+
+    def places(px: Float64) -> tuple[Float64, Float64]:
+        at, steps = np.full(px.shape, np.nan), np.zeros((*px.shape, 2))
+        view = np.searchsorted(tops, px[:, 1], side="right") - 1
+        for v, (own, top) in enumerate(zip(views, tops, strict=True)):
+            mine = view == v
+            if mine.any():
+                at[mine], steps[mine] = own(px[mine] - (0, top))
+        return at, steps
 
     return places
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask
 from controller.core.blur import masked_blur
 from controller.optics.calibrate.values import Geometry
@@ -63,12 +65,42 @@ def pieces(mask: Mask) -> list[Mask]:
     return [mask & (owner == label) for label in large]
 
 
-def on_each(mask: Mask, make: Callable[[Mask], Target]) -> Target:
-    """The targets that ``make`` gives for each object of ``mask``, side by side in one."""
+CELLS: Final = 40
+"""Of the space that all parts take, each way, in which they are compared."""
+LEAST_COMMON: Final = 0.02
+"""Share of a part's cells that it has in common with another view's part of the same object."""
+
+
+def connected(parts: Sequence[Mask], points_m: FloatImage) -> list[Mask]:
+    """Parts of a picture (rows, columns), joined where they are the same object seen from several places.
+
+    ``points_m`` (rows, columns, 3): where each pixel lies in space, NaN where unknown
+    """
+    known = [part & channels.finite(points_m) for part in parts]
+    every = points_m[np.logical_or.reduce(known)] if parts else np.zeros((0, 3), np.float32)
+    if not len(every):
+        return list(parts)
+    low, high = np.percentile(every, (1, 99), axis=0)
+    side = max(float((high - low).max()) / CELLS, 1e-9)
+    cells = [{tuple(cell) for cell in np.unique(np.floor((points_m[one] - low) / side), axis=0)} for one in known]
+    joined: list[tuple[Mask, set[Any]]] = []
+    for part, own in zip(parts, cells, strict=True):
+        same = [one for one in joined if len(one[1] & own) > LEAST_COMMON * min(len(own), len(one[1]))]
+        joined = [one for one in joined if not any(one is other for other in same)]
+        whole = np.logical_or.reduce([part, *(mask for mask, _ in same)])
+        joined.append((whole, own.union(*(others for _, others in same))))
+    return [mask for mask, _ in joined]
+
+
+def on_each(mask: Mask, make: Callable[[Mask], Target], objects: Sequence[Mask] | None = None) -> Target:
+    """The targets that ``make`` gives for each object of ``mask``, side by side in one.
+
+    ``objects``: None for its ``pieces``
+    """
     image: FloatImage = np.zeros((*mask.shape, 3), np.float32)
     said: Mask = np.zeros(mask.shape, np.bool_)
     softened = ""
-    for piece in pieces(mask):
+    for piece in pieces(mask) if objects is None else objects:
         part = make(piece)
         image[piece] = part.image[piece]
         said |= part.mask & piece

@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,14 @@ NO_MATRICES: Final[FloatImage] = np.empty((3, 3, 0, 0), np.float32)
 
 Colours = npt.NDArray[np.floating[Any]]
 """A matrix for the colours of each pixel (3, 3, rows, columns); float16 where it is kept."""
+
+
+class ReflectedLight(Protocol):
+    """What solves ask of light by way of other surfaces; all images (rows, columns, 3), as of ``IndirectLight``."""
+
+    def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage: ...
+
+    def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,8 +35,9 @@ from controller.optics.solve.targets.values import Target, in_box, on_each, thro
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.artefacts.geometry import read_camera, read_geometry, require_shape
+from controller.stage.artefacts.geometry import camera_px, require_shape
 from controller.stage.artefacts.mesh import RegisteredMesh
+from controller.stage.artefacts.names import safe_name
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
 from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
 from controller.stage.blender.run import find_blender, render
@@ -58,6 +59,10 @@ TITLES: Mapping[str, str] = {
 """Title of every kind of appearance."""
 
 NEEDS_FILE = ("photograph", "picture", "restoration", "texture")
+OF_ONE_VIEW: Final = ("blender", "restoration")
+"""Kinds that are made from where one camera stands."""
+VIEW: Final = "{view}"
+"""Stands for the name of each view in the file of a picture."""
 NEEDS_NO_SHAPE: Final = ("recolour", "picture", "restoration", "texture")
 """Kinds that are made in the camera's picture alone; a texture may be."""
 
@@ -91,19 +96,27 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         require_shape(calibrated.folder, f"The appearance {table.name} of kind {table.kind}")
     _ = table.hint_ms  # report its errors before an hour of solving
     wanted = _options(table.kind)
+    if table.kind in OF_ONE_VIEW and len(calibrated.names) > 1:
+        raise UsageError(
+            "appearance-of-one-view",
+            what=f"The appearance {table.name} of kind {table.kind} is made for one camera, and the stage has"
+            f" {len(calibrated.names)} views.",
+            remedy='Use kind = "texture" on a mesh, which is the same for all views.',
+        )
     required = ("tint",) if table.kind == "recolour" else ()
     settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)
     options = checked_arguments(table.place, settings, wanted)
     file = None if table.file is None else stage.path(table.file)
     if table.kind in NEEDS_FILE and file is None:
         raise table.place.missing("file", "a picture file, relative to the stage's folder", written=settings)
-    if file is not None:
-        _check_picture(table, file, calibrated.camera_px, options.get("colour"))
+    files = [] if file is None else [file] if table.kind != "picture" else _pictures(table, file, calibrated)
+    for one, folder in zip(files, calibrated.folders, strict=False):
+        _check_picture(table, one, camera_px(folder), options.get("colour"))
     inputs = {"kind": table.kind, "settings": repr(sorted(options.items()))}
     if table.kind == "blender":
         return blender_request(table.name, calibrated, options, inputs, folder=stage.folder)
-    if file is not None:
-        inputs["file"] = sha256_of(file)
+    for name, one in zip(calibrated.names, files, strict=False):
+        inputs[f"file of {name}" if one is not files[0] else "file"] = sha256_of(one)
     if table.kind == "restoration":
         assert file is not None
         return restoration_request(table.name, file, options, calibrated, stage.tables.solve, inputs)
@@ -120,6 +133,18 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         return make_target(table.kind, file, arguments, calibrated)
 
     return AppearanceRequest(table.name, title, target, inputs)
+
+
+def _pictures(table: AppearanceTable, file: Path, calibrated: Calibrated) -> list[Path]:
+    """The picture of each view."""
+    if len(calibrated.names) > 1 and VIEW not in file.name:
+        problem = f"is one picture, and the stage has {len(calibrated.names)} views"
+        raise table.place.wrong_value("file", table.file, problem, f"a name with {VIEW}, which stands for each view's")
+    return _of_views(file, calibrated)
+
+
+def _of_views(file: Path, calibrated: Calibrated) -> list[Path]:
+    return [file.with_name(file.name.replace(VIEW, safe_name(name))) for name in calibrated.names]
 
 
 _MAKERS: Mapping[str, tuple[Callable[..., Target], type[Any]]] = {
@@ -218,8 +243,9 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         return Restoration(file, {**options, "colour": colour}, calibrated).made[0]
     if kind == "picture":
         assert file is not None
-        rows, columns = mask.shape
-        return load_target(file, (columns, rows), colour)
+        sizes = (view.part(mask).shape[1::-1] for view in calibrated.views())
+        made = [load_target(one, size, colour) for one, size in zip(_of_views(file, calibrated), sizes, strict=True)]
+        return Target(calibrated.joined([one.image for one in made]), calibrated.joined([one.mask for one in made]))
     if kind == "recolour":
         return recolour(as_it_is(calibrated.transport), mask, **options)
     if kind == "texture":
@@ -228,9 +254,9 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         if sheet.shape[2] == 3:
             sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
         mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
-        places = None if mesh is None else mesh.places(read_camera(calibrated.folder))
+        places = None if mesh is None else calibrated.places(mesh)
         return texture(sheet, places, as_it_is(calibrated.transport), mask)
-    geometry = read_geometry(calibrated.folder, calibrated.projectors)
+    geometry = calibrated.geometry
     if kind == "photograph":
         assert file is not None
         photograph = np.maximum(read_picture(file, colour)[..., :3], 0)
@@ -238,7 +264,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
     else:
         maker, look = _MAKERS[kind]
         make = partial(maker, look=look(**options))
-    return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make)))
+    return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make), calibrated.objects(mask)))
 
 
 PREFIX: Final = "builtin:"
@@ -265,7 +291,7 @@ def blender_request(
     def prepare(context: Context) -> Sequence[Path]:
         work = render_folder(context.folder, name)
         work.mkdir(exist_ok=True)
-        geometry, mask = read_geometry(calibrated.folder, calibrated.projectors), calibrated.transport.object_mask
+        geometry, mask = calibrated.geometry, calibrated.transport.object_mask
         write_job(work, geometry, mask, calibrated.transport.reach(), scene=scene, settings=settings)
         picture = render(blender, work, context.advance)
         return [write_target(context.folder, name, as_seen(read_picture(picture), geometry.camera, mask))]

@@ -133,7 +133,11 @@ def _solve_base(calibrated: Calibrated, options: SolveOptions, context: Context)
     context.reporter.say(check_memory(need, free_bytes()))
     base = solved_base(calibrated, options, _watched(context))
     calibrated.keep_base(base)
-    return SolvedBase(base.image, base.solution).write(context.folder, calibrated.projectors)
+    return [
+        path
+        for view in calibrated.views()
+        for path in SolvedBase(view.own_light(base.image), base.solution).write(view.folder, calibrated.projectors)
+    ]
 
 
 def solved_base(
@@ -193,7 +197,11 @@ def _solve_appearance(
         figures=figures,
         asked=RequestedTarget(made.asked, made.asked_reachable, made.valid),
     )
-    return solved.write(context.folder, request.name)
+    return [
+        path
+        for folder, part, gain in calibrated.views()
+        for path in solved.seen(part, gain).write(folder, request.name)
+    ]
 
 
 def _limits(title: str, figures: Mapping[str, object], asked: float) -> list[str]:

@@ -1,0 +1,142 @@
+"""Several views of a run as one: the same units, one solve, and results for each view."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.core.errors import UsageError
+from controller.optics.calibrate.mesh_alignment import Pose
+from controller.optics.calibrate.photometry.view_colours import in_common_units, view_colours
+from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.request import SolveOptions
+from controller.optics.solve.targets.values import Target, connected
+from controller.run.journal import Journal
+from controller.run.progress import Silent
+from controller.run.runner import Runner
+from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views
+from controller.stage.artefacts.projectors import Light
+from controller.stage.artefacts.solved import SolvedBase, read_solved
+from controller.stage.artefacts.views import view_folder, write_view
+from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
+from hal.deadline import in_seconds
+from lab.timings.tools.synthetic import synthetic_calibration, write_synthetic_run
+
+PROJECTOR = (14, 18)
+CAMERAS = {"left": (36, 50), "right": (52, 70)}
+GAIN = np.array([0.7, 1.9, 1.2], np.float32)
+
+
+def other_units(calibration: Calibration, matrix: np.ndarray) -> Calibration:
+    """As a camera sees it whose colours are ``matrix`` (3, 3) times these."""
+    parts = []
+    for part in calibration.projectors:
+        radiometry = part.radiometry
+        level = (matrix @ radiometry.mixing).sum(axis=1)
+        mixing = matrix @ radiometry.mixing / level[:, None]
+        radiometry = dataclasses.replace(radiometry, mixing=mixing)
+        parts.append(dataclasses.replace(part, white=(part.white * level).astype(np.float32), radiometry=radiometry))
+    black = (calibration.black * matrix.sum(axis=1)).astype(np.float32)
+    return dataclasses.replace(calibration, projectors=tuple(parts), black=black)
+
+
+def two_views(run: Path) -> tuple[list[str], AllViews]:
+    """The same object by two cameras in one place, one of them with more pixels and other units."""
+    for number, (name, camera) in enumerate(CAMERAS.items()):
+        folder = run if number == 0 else view_folder(run, name)
+        folder.mkdir(parents=True, exist_ok=True)
+        names = write_synthetic_run(folder, projector=PROJECTOR, camera=camera)
+        if number:
+            for projector in names:
+                light = Light.read(folder, projector)
+                changed = dataclasses.replace(light, white=light.white * GAIN, black=light.black * GAIN)
+                changed.write(folder, projector)
+        write_view(folder, name, number)
+    made = all_views(run, names)
+    assert isinstance(made, AllViews)
+    return names, made
+
+
+def test_colour_differences_are_measured_on_the_overlap_and_removed(tmp_path: Path) -> None:
+    first = synthetic_calibration(projector=(40, 52), camera=(100, 140))
+    matrix = np.diag([0.5, 1.4, 0.9]) @ np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.15, 0.85]])
+    second = other_units(synthetic_calibration(projector=(40, 52), camera=(150, 210)), matrix)
+    colours = view_colours([first, second])
+    np.testing.assert_allclose(colours[0].gain, 1, atol=1e-3)
+    np.testing.assert_allclose(colours[1].gain, 1 / matrix.sum(axis=1), rtol=0.02)
+    common = in_common_units(second, colours[1], tmp_path)
+    # what a projector's red is to the eye is the same by both
+    for colour in range(3):
+        seen = [one.camera_to_xyz @ (one.projectors[1].radiometry.mixing[:, colour]
+                * np.median(one.projectors[1].white[one.object_mask], axis=0)) for one in (first, common)]  # fmt: skip
+        np.testing.assert_allclose(seen[1], seen[0], rtol=0.04, atol=0.004)
+    assert colours[1].shared > 1000
+    assert colours[1].rest < 0.05
+
+
+def test_views_that_share_nothing_are_as_bright_as_each_other(tmp_path: Path) -> None:
+    first = synthetic_calibration(projector=(20, 26), camera=(50, 70))
+    parts = [dataclasses.replace(part, metapixels=dataclasses.replace(
+        part.metapixels, valid=np.zeros_like(part.metapixels.valid))) for part in first.projectors]  # fmt: skip
+    colours = view_colours([first, dataclasses.replace(first, projectors=tuple(parts))])
+    assert colours[1].shared == 0
+    assert np.isfinite(colours[1].gain).all()
+
+
+def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_path: Path) -> None:
+    names, calibrated = two_views(tmp_path)
+
+    def target() -> Target:
+        parts = [np.full((*camera, 3), 0.4, np.float32) for camera in CAMERAS.values()]
+        return Target(
+            calibrated.joined(parts), calibrated.joined([np.ones(size, np.bool_) for size in CAMERAS.values()])
+        )
+
+    with Journal(tmp_path) as journal:
+        steps = solve_steps(calibrated, [AppearanceRequest("look", "Look", target, {})],
+                            SolveOptions(0.9, 0.001, "full"), ())  # fmt: skip
+        Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
+    for folder, camera in zip((tmp_path, view_folder(tmp_path, "right")), CAMERAS.values(), strict=True):
+        solved, own = read_solved(folder, "look", names), Calibrated(folder, names)
+        assert solved.target.shape == (*camera, 3)
+        assert SolvedBase.read(folder, names).image.shape == (*camera, 3)
+        frames = [solved.linear[name] for name in names]
+        light = own.predicted_light(frames) + own.calibration.black
+        off = np.abs(light - solved.target)[solved.reachable]
+        assert np.median(off) < 0.06 * np.median(solved.target[solved.reachable])
+    again = all_views(tmp_path, names)
+    np.testing.assert_allclose(again.base.image, calibrated.base.image)
+
+
+def test_one_view_is_read_as_ever(tmp_path: Path) -> None:
+    names = write_synthetic_run(tmp_path, projector=PROJECTOR, camera=CAMERAS["left"])
+    assert type(all_views(tmp_path, names)) is Calibrated
+
+
+def test_views_without_a_common_place_are_refused_where_the_shape_counts(tmp_path: Path) -> None:
+    _, calibrated = two_views(tmp_path)
+    with pytest.raises(UsageError) as refused:
+        _ = calibrated.geometry
+    assert refused.value.code == "shape-unknown"
+
+
+def test_parts_of_two_views_are_one_object_where_they_meet_in_space() -> None:
+    points = np.full((20, 30, 3), np.nan, np.float32)
+    y, x = np.mgrid[:20, :10].astype(np.float32)
+    for start, shift in ((0, 0.0), (10, 5.0), (20, 40.0)):
+        points[:, start : start + 10] = np.stack([x + shift, y, 0 * x], -1)
+    parts = [np.zeros((20, 30), np.bool_) for _ in range(3)]
+    for n, part in enumerate(parts):
+        part[:, 10 * n : 10 * n + 10] = True
+    objects = connected(parts, points)
+    assert [int(one.sum()) for one in objects] == [400, 200]
+
+
+def test_a_pose_after_another_places_as_both() -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    one, other = Pose(2.0, turn, np.array([1.0, 2, 3])), Pose(1.0, turn.T, np.array([-1.0, 0, 2]))
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(one.then(other).placed(points), other.placed(one.placed(points)))
