@@ -13,6 +13,7 @@ from controller.run.progress import Reporter
 from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_refining, remove_refined
+from controller.stage.artefacts.views import view_folders
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
@@ -60,7 +61,7 @@ def refine(
     Nothing is published. Raises what the devices and the steps raise, where refining was ``asked``.
     """
     folder = calibrated.folder
-    if len(calibrated.names) > 1:
+    if len(view_folders(folder)) > 1:
         # what is right from one side would be wrong from the others
         if refinement.asked and refinement.photographs:
             reporter.say("Appearances for several views stay as they were solved.", Level.WARNING)
