@@ -232,10 +232,10 @@ class SolveTable(ConfigTable):
         le=100,
         description="the weight of smoothness in a compensation image (equal neighbours), 0 to 100",
     )
-    mode: Literal["auto", "full", "scale"] = Field(
-        default="auto",
-        description='"full" (a solve for every appearance), "scale" (base image x scale image), or "auto" (full '
-        "where the target has finer detail than scaling can show, or scaling would miss it)",
+    mode: Literal["full", "scale"] = Field(
+        default="full",
+        description='"full" (a solve for every appearance), or "scale" (base image x scale image, which loses detail '
+        "finer than a projector's pixels)",
     )
     base: Literal["minimum", "white", "high-pass"] = Field(
         default="white",

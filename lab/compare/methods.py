@@ -60,7 +60,7 @@ def inversion(stage: MeteredStage) -> MakeFrames:
     transport = raw_transport(plain, [stage.dots(n).shares for n in range(len(plain.projectors))])
 
     def frames(target: ComparisonTarget) -> list[ByteImage]:
-        wanted = direct_part(transport, target.radiance, plain.black, known.indirect)
+        wanted = direct_part(transport.reach(), target.radiance, plain.black, known.indirect)
         return _device(plain, unbounded_inverse(transport, wanted, plain.black, iterations=STEPS))
 
     return frames
@@ -136,7 +136,7 @@ def _bounded(
     calibration: Calibration,
     indirect: IndirectLight | None,
 ) -> list[ByteImage]:
-    wanted = direct_part(transport, target.radiance, black, indirect)
+    wanted = direct_part(transport.reach(), target.radiance, black, indirect)
     weights = appearance_weights(target.radiance, target.in_reach, target.white)
     solution = solve_bounded(transport, np.maximum(wanted, black), black, SolveSettings(weights=weights))
     return _device(calibration, solution.frames)

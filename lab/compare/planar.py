@@ -41,7 +41,7 @@ def superresolution(stage: MeteredStage) -> MakeFrames:
     transport = build_transport(model)
 
     def frames(target: ComparisonTarget) -> list[ByteImage]:
-        wanted = direct_part(transport, target.radiance, plain.black, known.indirect)
+        wanted = direct_part(transport.reach(), target.radiance, plain.black, known.indirect)
         light = np.where(target.valid[..., None], np.maximum(wanted - plain.black, 0), 0).astype(np.float32)
         return list(device_frames(model, descended(transport, light, target.valid)).values())
 

@@ -24,7 +24,6 @@ class SolveChoice:
     base: Annotated[
         Literal["minimum", "white", "high-pass"] | None, typer.Option(help="Base image (default: from stage.toml).")
     ] = None
-    quick: Annotated[bool, typer.Option("--quick", help="Only a quick preview, with base times scale.")] = False
     scheduler: Annotated[
         str | None, typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786.")
     ] = None
@@ -61,8 +60,7 @@ def appearance(
                 accept_grade=accept_grade,
                 base=solve.base,
                 scheduler=solve.scheduler,
-                quick=solve.quick,
-                refinement=refinement_of(stage, solve.refine, quick=solve.quick),
+                refinement=refinement_of(stage, solve.refine),
                 device=solve.device,
             ),
             session=OwnSession(stage),

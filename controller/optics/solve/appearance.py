@@ -11,7 +11,6 @@ at each pixel (Nayar 2003, Grossberg 2004). It ignores neighbours, other project
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -20,7 +19,7 @@ import cv2
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, moved_to_file
+from controller.core.arrays import FloatImage, moved_to_file
 from controller.core.channels import largest
 from controller.core.checks import check_image
 from controller.core.errors import UsageError
@@ -36,7 +35,7 @@ from controller.optics.transport.planes import frame_planes, plane_frames, plane
 
 BaseKind = Literal["minimum", "white"]
 BaseChoice = Literal["minimum", "white", "high-pass"]
-Mode = Literal["auto", "scale", "full"]
+Mode = Literal["scale", "full"]
 
 FAINTEST_BASE: Final = 1e-2
 """Below this fraction of the mean base light, a pixel is not used in its metapixels' means."""
@@ -44,9 +43,6 @@ HEADROOM: Final = 0.5
 """A white base uses this part of the reachable light, so that scales above 1 are possible."""
 FINE_DETAIL: Final = 0.02
 """Share of a target's light above one projector's frequency limit from which a full solve is advised."""
-
-MOST_LOST, LITTLE_LOST = 1.7, 0.02
-"""Base x scale may miss so many times what the base misses, or so much of the light; else the solve is a full one."""
 WELL_BELOW: Final = 0.5
 """Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
 
@@ -94,11 +90,13 @@ class Base:
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """Frames (rows, columns, 3) linear in [0, 1], one a projector; ``mode`` is how they were made."""
+    """Frames (rows, columns, 3) linear in [0, 1], one a projector.
+
+    ``fine_detail``: what a scale loses of the target; ``solution``: of a full solve. The other one is None.
+    """
 
     frames: tuple[FloatImage, ...]
-    mode: Literal["scale", "full"]
-    fine_detail: float
+    fine_detail: float | None
     solution: Solution | None
 
 
@@ -215,27 +213,6 @@ def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black
     return float(np.sqrt(fine / whole)) if whole > 0 else 0.0
 
 
-def _as_good(light: StageLight, base: Base, frames: Sequence[FloatImage], target: FloatImage, reachable: Mask) -> bool:
-    """Whether scaled frames come about as near their target in reach as the base's own frames come to the base image.
-
-    Beside the shadow of a projector, and around what is out of reach, the pixels of one projector have to make up for
-    another's. A scale, a mean over each pixel's light, does not know of that; a full solve does.
-    """
-    if not reachable.any():
-        return True
-    lost, least = (
-        _lost(light.transport.forward(shown) + light.black, wanted, reachable)
-        for shown, wanted in ((frames, target), (base.solution.frames, base.image))
-    )
-    return lost < max(MOST_LOST * least, LITTLE_LOST)
-
-
-def _lost(seen: FloatImage, wanted: FloatImage, mask: Mask) -> float:
-    """95th percentile over a mask of how far a picture misses another, as a share of the pixel's light."""
-    missed = np.abs(seen - wanted)[mask].sum(axis=1)
-    return float(np.percentile(missed / np.maximum(wanted[mask].sum(axis=1), 1e-30), 95))
-
-
 def _low_pass(
     transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
 ) -> FloatImage:
@@ -259,26 +236,21 @@ def make_appearance(
     settings: SolveSettings = DEFAULT_SETTINGS,
     context: SolveContext = ALONE,
     *,
-    mode: Mode = "auto",
-    reachable: Mask | None = None,
+    mode: Mode = "full",
 ) -> Appearance:
-    """Frames for a target radiance: by base and scale, by a full solve, or depending on target and result.
+    """Frames for a target radiance: by a full solve, or by base and scale.
 
     ``target`` (rows, columns, 3): to be made by direct light, black image included; ``settings`` are of a full solve
-    ``reachable`` (rows, columns): where base and scale must come near the target, for the mode "auto" to keep them;
-    None: they are judged by the target's detail alone
 
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 8).
     """
     transport, black = light.transport, light.black
     check_target(transport, target)
-    detail = fine_detail(transport, base, target, black)
-    if mode == "scale" or (mode == "auto" and detail < FINE_DETAIL):
+    if mode == "scale":
         scaled = scale_frames(transport, base, target, black, engine=context.engine)
-        if mode == "scale" or reachable is None or _as_good(light, base, scaled, target, reachable):
-            return Appearance(tuple(scaled), "scale", detail, None)
+        return Appearance(tuple(scaled), fine_detail(transport, base, target, black), None)
     solution = solve_bounded(transport, target, black, settings, context)
-    return Appearance(solution.frames, "full", detail, solution)
+    return Appearance(solution.frames, None, solution)
 
 
 def traditional_compensation(calibration: Calibration, target: FloatImage, n: int) -> list[FloatImage]:

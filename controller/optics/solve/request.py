@@ -28,7 +28,6 @@ from controller.optics.solve.appearance import (
 )
 from controller.optics.solve.bounded.engine import ALONE, SolveContext
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings, appearance_weights
-from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.engines import Method
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
@@ -65,7 +64,7 @@ class SolveOptions:
 
     share: float
     smoothness: float
-    mode: Mode = "auto"
+    mode: Mode = "full"
     base: BaseChoice = "white"
     adapt: float = 0.0
     method: Method = "global"
@@ -126,10 +125,10 @@ def solve_appearance(
     began_s = time.perf_counter()
     made = _solved(light, base, aim, options, context)
     figures = aim.figures | {
-        "mode": made.mode,
+        "mode": options.mode,
         "seconds": time.perf_counter() - began_s,
         "fine_detail": made.fine_detail,
-        "advice": ADVICE_FULL_SOLVE if made.mode == "scale" and made.fine_detail >= FINE_DETAIL else None,
+        "advice": None if (made.fine_detail or 0) < FINE_DETAIL else ADVICE_FULL_SOLVE,
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
@@ -171,6 +170,7 @@ class _ExposedPicture:
             share=options.share, drive=light.drive, indirect=light.indirect, asked=options.exposure,
         )  # fmt: skip
         self._light, self._folder = light, folder
+        self._drive = light.drive or DriveLevels(light.transport, folder)
         self.asked = self.wanted = moved_to_file(exposed.wanted, folder)
         self.exposure, self.needed, self.possible = exposed.exposure, exposed.needed, exposed.possible
         self.held_back = exposed.held_back
@@ -178,7 +178,7 @@ class _ExposedPicture:
     def adapt(self, strength: float) -> None:
         """Bend ``wanted`` into what the stage can make, around what ``needed`` throws back."""
         self.wanted = self._bent(strength)
-        self.needed = direct_part(self._light.transport, self.wanted, self._light.black, self._light.indirect)
+        self.needed = direct_part(self._drive.reach, self.wanted, self._light.black, self._light.indirect)
 
     def _bent(self, strength: float) -> FloatImage:
         floor = self._floor()
@@ -191,7 +191,7 @@ class _ExposedPicture:
         light = self._light
         if light.indirect is None:
             return light.black
-        return light.black + light.indirect.forward(np.clip(self.needed - light.black, 0, light.transport.reach()))
+        return light.black + light.indirect.forward(np.clip(self.needed - light.black, 0, self._drive.reach))
 
 
 def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder: Path | None = None) -> Aim:
@@ -232,10 +232,7 @@ def _solved(light: StageLight, base: Base, aim: Aim, options: SolveOptions, cont
     left = target_radiance(aim.wanted - indirect, light.black, 1.0)
     del indirect
     settings = replace(settings, start=first.frames)
-    if first.mode == "scale":
-        return solve(left, settings)
-    solution = solve_bounded(light.transport, left, light.black, settings, context)
-    return replace(first, frames=solution.frames, solution=solution)
+    return solve(left, settings)
 
 
 def _solved_directly(
@@ -246,5 +243,4 @@ def _solved_directly(
     if options.base == "high-pass":
         image = high_pass_base(light.transport, base.image, target, light.black)
         base = solve_base(light.transport, image, light.black, SolveSettings(options.smoothness), context)
-    reachable = aim.possible.reachable
-    return make_appearance(light, base, target, settings, context, mode=options.mode, reachable=reachable)
+    return make_appearance(light, base, target, settings, context, mode=options.mode)

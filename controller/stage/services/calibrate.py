@@ -9,10 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from controller.bundle.install import current
-from controller.config.models import SolveTable
-from controller.optics.solve.appearance import BaseChoice
 from controller.optics.solve.engines import choose_engine
-from controller.optics.solve.request import SolveOptions
 from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
 from controller.run.progress import Reporter
@@ -123,7 +120,6 @@ class AppearanceOrder:
     names : of stage.toml; none: all, unless there are scenes
     scenes : Blender scenes to render in addition to ``names``, or only these if no names are given
     base : the base image instead of stage.toml's
-    quick : a preview by base times scale only; the next run without it solves them as stage.toml says
     refinement : how photographs then correct them; None keeps refined frames
     device : what solves, instead of stage.toml's
     scheduler : a Dask cluster that solves the appearances
@@ -133,7 +129,6 @@ class AppearanceOrder:
     names: Sequence[str] = ()
     scenes: Sequence[str] = ()
     base: str | None = None
-    quick: bool = False
     refinement: Refinement | None = None
     device: str | None = None
     scheduler: str | None = None
@@ -158,7 +153,7 @@ def make_appearances(
         calibrated = all_views(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, order.names) if order.names or not order.scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in order.scenes]
-        options = _options(checked.stage.tables.solve, chosen, quick=order.quick)
+        options = options_of(solve) if chosen is None else replace(options_of(solve), base=chosen)
         scale = costs.scale(size for _, size in output_sizes(checked).values())
         with (
             kernels_compiled(reporter) as compiled,
@@ -190,15 +185,6 @@ def publishing(checked: Checked, calibrated: Calibrated, names: Sequence[str]) -
     name, run = stage.tables.stage.name, calibrated.folder.name
     target = BundleTarget(stage.folder, name, run, output_sizes(checked), signing_key(checked))
     return publish_step(target, names, calibrated=calibrated)
-
-
-def _options(table: SolveTable, chosen: BaseChoice | None, *, quick: bool) -> SolveOptions:
-    """``chosen``: the base image instead of the table's; ``quick``: base times scale alone."""
-    kept = base_choice(table.base)
-    if quick:
-        # a high-pass base would be solved again for each
-        return replace(options_of(table), mode="scale", base=chosen or ("white" if kept == "high-pass" else kept))
-    return replace(options_of(table), base=chosen or kept)
 
 
 def report_grade(checked: Checked, run: Path, last: Path | None, reporter: Reporter, *, accept_grade: bool) -> None:

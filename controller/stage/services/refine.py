@@ -39,11 +39,11 @@ class Refinement:
     asked: bool = True
 
 
-def refinement_of(stage: Path, typed: int | None, *, quick: bool = False) -> Refinement:
-    """What a person ``typed``, else what the stage.toml in this folder says; a ``quick`` preview is not refined."""
+def refinement_of(stage: Path, typed: int | None) -> Refinement:
+    """What a person ``typed``, else what the stage.toml in this folder says."""
     if typed is not None:
         return Refinement(typed)
-    return Refinement(0 if quick else load_stage(stage).tables.solve.refine, asked=False)
+    return Refinement(load_stage(stage).tables.solve.refine, asked=False)
 
 
 def refine(

@@ -176,7 +176,7 @@ def expose_target(
     if asked is None:
         found, following = exposures(transport, picture, black, share, drive=drive, indirect=indirect)
     wanted = np.float32(found) * picture
-    needed = direct_part(transport, wanted, black, indirect)
+    needed = direct_part(drive.reach, wanted, black, indirect)
     possible = feasibility(transport, needed, black, drive=drive)
     return ExposedTarget(found, wanted, needed, possible, following / found)
 
@@ -200,19 +200,22 @@ def with_less_light(
     most = exposed(float(1 - (1 - HARDLY_ANY) * asked.sum() / max(1, drive.mask.sum())))[0]
     shares = []
     for level in (wanted, min(most, wanted)):
-        direct = direct_part(transport, np.float32(level) * target.image, black, indirect)
+        direct = direct_part(drive.reach, np.float32(level) * target.image, black, indirect)
         reachable = feasibility(transport, direct, black, drive=drive).reachable
         shares.append(float(reachable[asked].mean()) if asked.any() else 0.0)
     return shares[0], min(most / wanted, 1.0), shares[1]
 
 
 def direct_part(
-    transport: LightTransport, wanted: FloatImage, black: FloatImage, indirect: ReflectedLight | None
+    reach: FloatImage, wanted: FloatImage, black: FloatImage, indirect: ReflectedLight | None
 ) -> FloatImage:
-    """What the projectors' direct light and the black image are to make of ``wanted`` (rows, columns, 3)."""
+    """What the projectors' direct light, up to ``reach``, and the black image are to make of ``wanted``.
+
+    All (rows, columns, 3)
+    """
     if indirect is None:
         return wanted
-    return black + indirect.direct_target(wanted - black, reach=transport.reach())
+    return black + indirect.direct_target(wanted - black, reach=reach)
 
 
 def exposures(

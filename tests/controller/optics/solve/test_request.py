@@ -41,21 +41,18 @@ def picture(pitch_px: float) -> Target:
 
 
 @pytest.mark.parametrize(
-    ("pitch_px", "mode", "made", "advised"),
+    ("pitch_px", "mode", "advised"),
     [
-        (80, "auto", "scale", False),
-        (40, "auto", "full", False),
-        (5, "auto", "full", False),
-        (5, "scale", "scale", True),
-        (40, "scale", "scale", False),
-        (40, "full", "full", False),
+        (5, "full", False),
+        (5, "scale", True),
+        (40, "scale", False),
     ],
 )
-def test_fine_detail_is_solved_in_full_or_advised_to_be(
-    transport: LightTransport, base: Base, pitch_px: float, mode: Mode, made: str, advised: bool
+def test_a_full_solve_is_advised_where_a_scale_loses_fine_detail(
+    transport: LightTransport, base: Base, pitch_px: float, mode: Mode, advised: bool
 ) -> None:
     found = solve_appearance(StageLight(transport, STAGE.black), base, picture(pitch_px), replace(OPTIONS, mode=mode))
-    assert found.figures["mode"] == made
+    assert found.figures["mode"] == mode
     assert (found.figures["advice"] is not None) is advised
 
 

@@ -93,11 +93,9 @@ def stage(tmp_path: Path) -> Stage:
     return Stage(tmp_path, run)
 
 
-def test_what_is_typed_goes_before_stage_toml_and_a_preview_is_not_refined(tmp_path: Path) -> None:
+def test_what_is_typed_goes_before_stage_toml(tmp_path: Path) -> None:
     write(tmp_path)
     assert refinement_of(tmp_path, None) == Refinement(1, asked=False), "the default"
-    assert refinement_of(tmp_path, None, quick=True) == Refinement(0, asked=False)
-    assert refinement_of(tmp_path, 2, quick=True) == Refinement(2)
     file = tmp_path / "stage.toml"
     file.write_text(file.read_text() + "\n[solve]\nrefine = 3\n")
     assert refinement_of(tmp_path, None) == Refinement(3, asked=False)
