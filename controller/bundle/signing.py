@@ -19,7 +19,7 @@ from nacl.signing import SigningKey, VerifyKey
 
 from controller.bundle.format import damaged
 from controller.core.errors import BundleError, UsageError
-from controller.core.storage import sync_folder, write_atomically
+from controller.core.storage import write_atomically
 
 BLOCK: Final = struct.Struct("<8s32s64s24x")
 BLOCK_BYTES: Final = BLOCK.size
@@ -75,7 +75,6 @@ def generate_key(path: Path) -> bytes:
     public = bytes(key.verify_key)
     write_atomically(path, f"{_SIGNING_PREFIX}{bytes(key).hex()}\n".encode(), mode=0o600)
     write_public_key(path.with_name(path.name + ".pub"), public)
-    sync_folder(path.parent)
     return public
 
 

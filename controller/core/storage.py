@@ -30,7 +30,7 @@ def stream_atomically(path: Path, write: Callable[[BinaryIO], object], *, mode: 
     """As ``write_atomically``, for content that ``write`` writes to an open binary file."""
     temporary: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
         temporary = Path(name)
         with os.fdopen(handle, "wb") as file:
@@ -51,6 +51,14 @@ def clear_unfinished_writes(folder: Path) -> None:
     """Remove the temporary files of a killed process below ``folder``; no process may be writing there."""
     for temporary in folder.rglob(".*.part"):
         temporary.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path, mode: int = 0o777) -> None:
+    """Make a folder, and those above it, where they are missing, so that none is lost in a power cut."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(mode, exist_ok=True)
+        sync_folder(folder.parent)
 
 
 def sync_folder(folder: Path) -> None:
@@ -109,7 +117,7 @@ def exclusive(path: Path, *, what_is_running: str) -> Iterator[None]:
 
 def _opened_lock(path: Path) -> int:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     except OSError as error:
         if error.errno != errno.EROFS:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import WorkError
-from controller.core.storage import sha256_of, sync_folder
+from controller.core.storage import make_folder, sha256_of, sync_folder
 from controller.core.text import well_formed
 from controller.run.state_machine import Change
 from controller.run.step_id import ShotId, StepId
@@ -316,7 +316,7 @@ class JournalError(WorkError):
 def _opened(path: Path) -> sqlite3.Connection:
     """A connection to the journal at ``path``, which is created if it is missing."""
     with _explained(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         database = sqlite3.connect(path, timeout=BUSY_S, check_same_thread=False)
         try:
             _prepare(database, path)

@@ -71,7 +71,6 @@ def _nights(stage: Path) -> list[Path]:
 
 
 def _write(path: Path, inventory: Inventory) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(asdict(inventory)).encode(), mode=0o600)
 
 

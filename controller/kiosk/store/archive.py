@@ -28,7 +28,7 @@ from controller.config.table import Holds, texts
 from controller.config.writer import KeyChange, edited
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import read_text
-from controller.core.storage import sync_folder
+from controller.core.storage import make_folder, sync_folder
 from controller.core.text import printable
 from controller.kiosk.outputs import outputs_of_x
 from controller.kiosk.store.references import BUILDING, OWN, Reference, building, linked, references
@@ -408,7 +408,7 @@ def clear_cut_off(stage: Path) -> None:
 def new_file(stage: Path, what: str, suffix: str) -> Path:
     """The path of a new archive of one kind; the oldest of the others go."""
     folder = stage / FOLDER
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_folder(folder, 0o700)
     for old in sorted(folder.glob(f"{what}-*"))[: -KEPT + 1]:
         old.unlink(missing_ok=True)
     return folder / f"{what}-{time.strftime('%Y%m%d-%H%M%S')}-{time.monotonic_ns() % 1_000_000:06d}.{suffix}"

@@ -153,7 +153,6 @@ class BundleStore:
             if not file.parent.is_dir():
                 # Those of older bundles.
                 shutil.rmtree(file.parent.parent, ignore_errors=True)
-                file.parent.mkdir(parents=True)
             write_atomically(file, cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
         except (BundleError, VelaturaError, OSError):
             return False

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from controller.core.storage import make_folder
 from controller.kiosk.state import EventLevel, EventRow
 
 MOST_EVENTS: Final = 20_000
@@ -164,7 +165,7 @@ class LogFile:
 
     def _connected(self, path: Path) -> sqlite3.Connection:
         if str(path) != ":memory:":
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
         database = self._connect(path, check_same_thread=False, timeout=2.0)
         database.text_factory = _text
         try:

@@ -219,7 +219,6 @@ class GoodSettings:
         path, content = self._waiting
         try:
             if not path.exists() or read_bytes(path) != content:
-                path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(path, content, mode=0o600)
         except (OSError, VelaturaError):
             return

@@ -143,6 +143,7 @@ def _unpack_one(member: tarfile.TarInfo, content: IO[bytes] | None, place: Path)
     else:
         with content, place.open("xb") as file:
             shutil.copyfileobj(content, file, _AT_ONCE)
+            file.flush()
             os.fchmod(file.fileno(), 0o600 | member.mode & 0o666)
             os.utime(file.fileno(), (member.mtime, member.mtime))
             os.fsync(file.fileno())

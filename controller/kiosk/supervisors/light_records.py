@@ -46,7 +46,6 @@ class LampHistory:
                 self._add(LampDay(lamp.projector, today.isoformat(), round(lamp.hours, 2), lamp.strikes))
             content = [[row.projector, row.day, row.hours, row.strikes] for row in self._days]
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, json.dumps(content).encode())
         except (OSError, VelaturaError):
             # Tried again in ten minutes; the event log reports the disk error.
@@ -108,7 +107,6 @@ class LightDose:
         if self._last is None:
             return
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, json.dumps({"lux_hours": round(self.lux_hours, 3)}).encode())
         except (OSError, VelaturaError):
             # Tried again in ten minutes; the event log reports the disk error.

@@ -116,12 +116,6 @@ def test_state_changes_errors_and_outcomes_are_there_after_a_restart(tmp_path: P
     assert (busy.level, busy.code, busy.text) == ("warning", "camera-busy", "model \x1b[31mX")
 
 
-def test_it_is_written_through_to_the_disk(tmp_path: Path) -> None:
-    with Journal(tmp_path) as journal:
-        assert journal._database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-        assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)
-
-
 def test_threads_may_write_at_once(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
 

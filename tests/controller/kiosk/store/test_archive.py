@@ -91,6 +91,13 @@ def test_restored_on_another_machine_the_stage_is_as_it_was_and_that_ones_secret
     assert not list(other.glob(".restore-*"))
 
 
+def test_a_restored_file_keeps_its_time_however_small_it_is(stage: Path, tmp_path: Path) -> None:
+    os.utime(stage / "stage.toml", (1_700_000_000, 1_700_000_000))
+    other = vase(tmp_path / "other")
+    archive.restore(other, archive.backup(stage))
+    assert (other / "stage.toml").stat().st_mtime == 1_700_000_000
+
+
 def test_a_restored_calibration_counts_though_there_is_a_newer_one(stage: Path) -> None:
     file = archive.backup(stage)
     graded_run(stage, "20260701-100000-calibrate", {"left": 0.2})
