@@ -175,6 +175,10 @@ class DistanceTable(ConfigTable):
     sigma_m: Positive = Field(default=0.001, description="standard uncertainty of distance_m in metres, above 0")
 
 
+Corner = Annotated[tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=1)]], Field(strict=False)]
+Region = Annotated[tuple[Corner, ...], Field(strict=False, min_length=3, max_length=1000)]
+
+
 class ObjectTable(ConfigTable):
     shape: Literal["auto", "surface", "plane", "unknown"] = Field(
         default="auto",
@@ -183,6 +187,11 @@ class ObjectTable(ConfigTable):
     )
     distances: Annotated[tuple[DistanceTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[object.distances]] tables with from_px, to_px and distance_m"
+    )
+    outline: Annotated[tuple[Region, ...], Field(strict=False, max_length=100)] = Field(
+        default=(),
+        description="what is the object, instead of what is found: regions as lists of corners [x, y] in the camera's "
+        "picture, each from 0 to 1, such as [[[0.2, 0.1], [0.8, 0.1], [0.5, 0.9]]]",
     )
 
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.storage import write_atomically
+from controller.stage.artefacts.outline import outline_digest
 
 if TYPE_CHECKING:
     from controller.optics.solve.reach.drive_levels import DriveLevels
@@ -29,7 +30,7 @@ FOLDER: Final = "kiosk/preview"
 LONGEST_PX: Final = 480
 """About the longer side of what is calculated; the pictures are for a screen."""
 _UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
-_known: dict[Path, PreviewLight] = {}
+_known: dict[str, PreviewLight] = {}
 _lock = threading.Lock()
 
 
@@ -54,8 +55,9 @@ def preview_light(stage: Path, run: Path, names: tuple[str, ...]) -> PreviewLigh
     Raises what reading a calibration raises.
     """
     with _lock:
-        if run not in _known:
-            file = stage / FOLDER / f"{run.name}.npz"
+        name = _name(run)
+        if name not in _known:
+            file = stage / FOLDER / f"{name}.npz"
             found = _read(file)
             if found is None:
                 from controller.stage.artefacts.calibrated import Calibrated
@@ -68,16 +70,21 @@ def preview_light(stage: Path, run: Path, names: tuple[str, ...]) -> PreviewLigh
                 write_atomically(file, _bytes(found))
                 write_atomically(file.with_suffix(".png"), _in_white(calibrated))
             _known.clear()
-            _known[run] = found
-        return _known[run]
+            _known[name] = found
+        return _known[name]
+
+
+def _name(run: Path) -> str:
+    """Of what is known of a run's light, for one outline of the object."""
+    return "-".join(part for part in (run.name, outline_digest(run)) if part)
 
 
 def view_picture(stage: Path, run: Path, names: tuple[str, ...]) -> Path:
     """A PNG of the object in white light, as large as the camera's picture. Seconds at the first time."""
-    file = stage / FOLDER / f"{run.name}.png"
+    file = stage / FOLDER / f"{_name(run)}.png"
     if not file.exists():
         with _lock:
-            _known.pop(run, None)
+            _known.pop(_name(run), None)
             file.with_suffix(".npz").unlink(missing_ok=True)
     # A person who paints on it wants a preview next.
     preview_light(stage, run, names)

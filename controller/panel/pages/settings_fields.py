@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from controller.config.models import (
     CalibrationTable,
     DiskTable,
     LightSensorTable,
+    ObjectTable,
     StageTable,
 )  # fmt: skip
 from controller.config.table import ConfigTable
@@ -30,6 +32,7 @@ _FIELDS: Final[Mapping[tuple[str, str, type[ConfigTable]], Mapping[str, str]]] =
     ("light_sensor", mark("Room light"), LightSensorTable): {
         "most_lux": mark("Most lux at the object for a calibration"),
     },
+    ("object", mark("The object"), ObjectTable): {"outline": mark("Outline of the object")},
     ("calibration", mark("Calibration"), CalibrationTable): {
         "photographs": mark("Number of photographs"),
         "worst_grade": mark("Largest error that is published, in per cent"),
@@ -88,6 +91,9 @@ class SettingField:
         """The value that a text stands for; the text itself where it stands for none, and None for an empty one."""
         if not text:
             return None
+        if text.startswith("["):
+            with contextlib.suppress(ValueError):
+                return json.loads(text)
         if "array" in self.kinds:
             return [word for one in text.split(",") if (word := one.strip())]
         if "boolean" in self.kinds:
@@ -128,6 +134,8 @@ def _text(table: Mapping[str, Any], key: str, rules: Mapping[str, Any]) -> str:
     value = table.get(key, rules[key].get("default"))
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, list) and any(isinstance(one, list) for one in value):
+        return json.dumps(value)
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

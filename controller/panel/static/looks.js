@@ -18,7 +18,7 @@
   }
 
   function outline(place) {
-    const form = place.querySelector("form"), field = form.elements.outline, svg = place.querySelector("#draw");
+    const field = place.querySelector("#outline"), svg = place.querySelector("#draw");
     const over = place.querySelector(".over"), through = place.querySelector("#through");
     let regions = [];
     const draw = () => {
@@ -53,12 +53,14 @@
     });
     place.querySelector("#clear").addEventListener("click", () => { regions = []; draw(); });
     field.addEventListener("change", typed);
-    const blink = place.querySelector("#blink");
-    blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
-    const fade = () => over.style.setProperty("opacity", String(through.value / 100));
-    through.addEventListener("input", fade);
-    place.hidden = false;
-    fade();
+    for (const hidden of [place, ...place.querySelectorAll("[hidden]")]) hidden.hidden = false;
+    if (over) {
+      const blink = place.querySelector("#blink");
+      blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
+      const fade = () => over.style.setProperty("opacity", String(through.value / 100));
+      through.addEventListener("input", fade);
+      fade();
+    }
     typed();
   }
   // The chosen picture in the camera's view, in each of the ways to fit it, as small as the drawings of them.
@@ -141,7 +143,7 @@
     place.hidden = false;
   }
   const place = document.getElementById("on-object"), byPoints = document.getElementById("by-points");
-  if (place) outline(place);
+  if (place && place.querySelector("#draw")) outline(place);
   if (byPoints) pairs(byPoints);
 
   // Of the live picture, as small as the eye needs: the energy of its edges, and how many pixels have which level.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +16,7 @@ from controller.optics.calibrate.values import Calibration, Correspondence, Phas
 from controller.optics.capture.brackets import MergedBracket, merge_brackets
 from controller.optics.capture.raw import CAMERA_BLUR_PX
 from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures
+from controller.stage.artefacts.outline import read_outline
 from controller.stage.artefacts.photographs import BLACK, TakenPhotograph, codes_of, light_of
 from controller.stage.artefacts.projectors import (
     Light,
@@ -60,6 +62,16 @@ def projectors_of(folder: Path) -> list[str]:
     return list(read_geometry_figures(folder)["projectors"])
 
 
+def _drawn(run: Path, shape: tuple[int, ...]) -> Mask | None:
+    """(rows, columns): inside the outline that a person drew; None where none was."""
+    regions = read_outline(run)
+    inside = np.zeros(shape, np.uint8)
+    for region in regions:
+        # one by one: where two overlap, both are the object
+        cv2.fillPoly(inside, [np.rint(np.array(region) * (shape[1], shape[0])).astype(np.int32)], 1)
+    return inside > 0 if regions else None
+
+
 def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     """The calibration of the finished run in ``folder``."""
     parts = []
@@ -85,7 +97,9 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     red, green, blue = CAMERA_BLUR_PX
     camera_blur_px = (red, green, blue)
     mask = object_mask(parts)
-    if (points_m := known_points_m(folder)) is not None:
+    if (drawn := _drawn(folder, mask.shape)) is not None:
+        mask &= drawn
+    elif (points_m := known_points_m(folder)) is not None:
         mask &= ~room_pixels(points_m)
     return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
 

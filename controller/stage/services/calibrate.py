@@ -17,6 +17,7 @@ from controller.run.runner import Runner, Step
 from controller.run.state_machine import Event
 from controller.stage.artefacts.calibrated import Calibrated, all_views
 from controller.stage.artefacts.grade import is_graded, passes
+from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
@@ -97,6 +98,7 @@ def calibrating(
     ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
     """
     longest_s = checked.stage.tables.capture.longest_exposure_s
+    keep_outline(run, checked.stage.tables.object.outline)
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     taking = photographs or PhotographOptions(checked.stage.tables.calibration.photographs)
     shape = checked.stage.tables.object.shape

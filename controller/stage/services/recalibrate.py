@@ -18,6 +18,7 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.drift import read_drift_figures
 from controller.stage.artefacts.grade import passes
 from controller.stage.artefacts.kinds import CALIBRATED, StepKind
+from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named
 from controller.stage.artefacts.projectors import mode_of
 from controller.stage.rig.ambient_light import dark_after
@@ -85,6 +86,7 @@ def recalibrate(
 
     def steps(rig: Rig, run: Path) -> Sequence[Step]:
         longest_s = _longest_s(checked)
+        keep_outline(run, checked.stage.tables.object.outline)
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
         taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
         shape = checked.stage.tables.object.shape

@@ -14,6 +14,7 @@ from controller.run.journal import Journal, JournalError
 from controller.run.progress import Reporter
 from controller.stage.artefacts.grade import passes
 from controller.stage.artefacts.kinds import CALIBRATED
+from controller.stage.artefacts.outline import keep_outline
 from controller.stage.sessions.check import Checked
 from controller.stage.steps.calibrate.gate import accept, below_grade
 
@@ -119,4 +120,5 @@ def usable_calibration(checked: Checked, reporter: Reporter, *, accept_grade: bo
         accept(run, reporter, worst)
     if not passes(run, worst):
         raise below_grade(run, worst)
+    keep_outline(run, checked.stage.tables.object.outline)
     return run

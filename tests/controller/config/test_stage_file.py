@@ -254,3 +254,11 @@ def test_a_written_stage_is_tidy_commented_and_loads(tmp_path: Path) -> None:
     written = load_stage(tmp_path).tables
     assert written.bundle.allow_unsigned
     assert written.projectors[1].settings({"port": "a tty"}) == {"port": "run/tty-right"}
+
+
+@pytest.mark.parametrize("outline", ["[[[0.1, 0.2], [0.3, 0.4]]]", "[[[0.1, 0.2], [0.3, 0.4], [0.5, 1.2]]]", "[0.1]"])
+def test_an_outline_has_regions_of_three_corners_inside_the_picture(tmp_path: Path, outline: str) -> None:
+    error = error_of(tmp_path, f"{STAGE}\n[object]\noutline = {outline}\n")
+    assert "outline" in error.what
+    right = load(tmp_path, f"{STAGE}\n[object]\noutline = [[[0, 0.2], [1, 0.4], [0.5, 0.9]]]\n").tables.object.outline
+    assert right == (((0, 0.2), (1, 0.4), (0.5, 0.9)),)

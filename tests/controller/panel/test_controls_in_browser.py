@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from controller.panel.app import STATIC
-from tests.controller.panel.browser import SHELL, chromium, enter, tab
+from tests.controller.panel.browser import SHELL, chromium, enter, picture, tab
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, csrf
 from tests.controller.panel.test_in_browser import violations
@@ -265,3 +265,24 @@ def test_the_first_page_with_its_pictures_is_small(panel: Served) -> None:
             size += len(client.get(address).content)
         assert csrf(page.text)
         assert size <= FIRST_PAGE_BYTES, f"{size:,} bytes"
+
+
+def test_an_outline_drawn_in_the_settings_says_what_the_object_is(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "tina")
+        page.goto("/settings")
+        place = page.locator("#draw")
+        place.scroll_into_view_if_needed()
+        box = place.bounding_box()
+        assert box is not None
+        for x, y in ((0.25, 0.25), (0.75, 0.25), (0.5, 0.75)):
+            place.click(position={"x": x * box["width"], "y": y * box["height"]})
+        assert not violations(page)
+        picture(page, "outline")
+        page.get_by_role("button", name="Check and save").first.click()
+        if page.url.endswith("/do/save-settings"):
+            page.get_by_role("button", name="Yes").click()
+        expect(page.get_by_text("The settings are in use.")).to_be_visible()
+        (region,) = json.loads(page.locator("#outline").input_value())
+        assert region == [pytest.approx(corner, abs=0.01) for corner in ([0.25, 0.25], [0.75, 0.25], [0.5, 0.75])]
+        assert "[object]\noutline = [[[0.2" in fresh.kiosk.settings()

@@ -26,6 +26,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.outline import outline_digest
 from controller.stage.artefacts.solved import RequestedTarget, Solved, SolvedBase
 from controller.stage.steps import costs
 from hal.notices import Level
@@ -85,11 +86,13 @@ def solve_steps(
     ``after``: the steps whose artefacts are read; ``scale``: the stage's size, see ``steps.costs``; ``answering``
     solves the appearances elsewhere.
     """
+    outline = outline_digest(calibrated.folder)
+    drawn = {"outline": outline} if outline else {}
     steps = [
         Step(
             BASE,
             partial(_solve_base, calibrated, options),
-            inputs=options.base_inputs(),
+            inputs=options.base_inputs() | drawn,
             after=tuple(after),
             title="Solving the base image",
             weight=costs.BASE_S * scale,
@@ -114,7 +117,7 @@ def solve_steps(
             Step(
                 StepId(StepKind.APPEARANCE, item=request.name),
                 partial(_solve_appearance, calibrated, request, options, answering),
-                inputs={**options.inputs(), **request.inputs},
+                inputs={**options.inputs(), **request.inputs, **drawn},
                 after=before,
                 title=f"Solving {request.title}",
                 weight=costs.APPEARANCE_S * scale,

@@ -265,6 +265,12 @@ keep_runs = 7
         ("disk.keep_runs", "9", "keep_runs = 7", "keep_runs = 9"),
         ("calibration.photograph_at_night", "true", "", "\n[calibration]\nphotograph_at_night = true\n"),
         ("backup.at", "02:30", "", '\n[backup]\nat = "02:30"\n'),
+        (
+            "object.outline",
+            "[[[0, 0.25], [1, 0.25], [0.5, 0.75]]]",
+            "",
+            "\n[object]\noutline = [[[0, 0.25], [1, 0.25], [0.5, 0.75]]]\n",
+        ),
     ],
 )
 def test_a_field_of_the_settings_changes_its_key_alone(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from controller.config.models import SolveTable
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.optics.solve.bounded.engine import IterationControl, Processor
 from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.solve.engines import choose_engine
@@ -19,6 +19,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.solved import read_solved
 from controller.stage.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
 from hal.deadline import in_seconds
@@ -77,6 +78,36 @@ def test_a_stage_can_be_solved_by_the_paper_s_regions(tmp_path: Path) -> None:
     kkt = float(str(read_solved(tmp_path, "grey", names).figures["kkt"]))
     assert 0 < kkt < 0.05
     assert calibrated.base.solution.converged
+
+
+def test_an_outline_that_was_drawn_says_what_the_object_is_and_what_was_solved_for_another_is_solved_again(
+    tmp_path: Path,
+) -> None:
+    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
+    request = AppearanceRequest(
+        "grey", "Grey", lambda: Target(0.5 * synthetic_target(CAMERA), np.ones(CAMERA, np.bool_)), {}
+    )
+
+    def solved() -> tuple[Mask, list[str]]:
+        engine = Watched()
+        calibrated = Calibrated(tmp_path, names, engine)
+        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+        with Journal(tmp_path) as journal:
+            Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(60))
+        return calibrated.calibration.object_mask, engine.did
+
+    whole, _ = solved()
+    columns = CAMERA[1]
+    left = np.arange(columns)[None, :] < columns // 2
+    keep_outline(tmp_path, [[(0, 0), (0.5, 0), (0.5, 1), (0, 1)]])
+    drawn, did = solved()
+    assert did == ["solve", "solve"]
+    assert not drawn[:, columns // 2 + 1 :].any()
+    assert drawn[:, : columns // 2].sum() == (whole & left).sum() > 0
+    assert solved()[1] == [], "as it was"
+    keep_outline(tmp_path, [])
+    again, _ = solved()
+    assert (again == whole).all()
 
 
 class Said(Silent):
