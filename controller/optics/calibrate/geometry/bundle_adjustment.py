@@ -9,7 +9,10 @@ camera's lens has (k2, p1, p2, pixels that are not square) stays as it was measu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -38,7 +41,7 @@ __all__ = [
     "adjust",
 ]
 
-_GAUGE_SIGMA = 1e-3
+GAUGE_SIGMA = 1e-3
 _CAUCHY = 2.4
 
 
@@ -159,10 +162,14 @@ def stepped(state: AdjustmentState, parameters: Float64, inverse_depth: Float64)
 
 def cost_of(problem: AdjustmentProblem, state: AdjustmentState) -> float:
     """Half of: Cauchy loss in noise units, priors, and the gauge that holds the rms baseline at 1."""
-    squared = channels.total(residuals(problem, state) ** 2) / problem.noise_px**2
-    data = _CAUCHY**2 * float(np.sum(np.log1p(squared[problem.seen] / _CAUCHY**2)))
     own = _prior_terms(problem, state)
-    return 0.5 * (data + float(own @ own))
+    return data_cost(problem, state) + 0.5 * float(own @ own)
+
+
+def data_cost(problem: AdjustmentProblem, state: AdjustmentState) -> float:
+    """Half of the Cauchy loss in noise units."""
+    squared = channels.total(residuals(problem, state) ** 2) / problem.noise_px**2
+    return 0.5 * _CAUCHY**2 * float(np.sum(np.log1p(squared[problem.seen] / _CAUCHY**2)))
 
 
 def adjust(
@@ -172,27 +179,52 @@ def adjust(
 
     ``tolerance``: stops when an iteration lowers the cost by a smaller share.
     """
-    state = normalised(state)
-    cost, damping = cost_of(problem, state), 1e-3
+
+    def proposals(now: AdjustmentState) -> Callable[[float], AdjustmentState]:
+        normal = _normal_equations(problem, now)
+        return lambda damping: stepped(now, *_solve(normal, damping))
+
+    state, cost = descended(
+        normalised(state), partial(cost_of, problem), proposals, iterations=iterations, tolerance=tolerance
+    )
+    normal = _normal_equations(problem, state)
+    information = reduced(normal.parameters, normal.cross, normal.depth)
+    return Adjusted(state, cost, covariance_of(information, normal.parameters), normal.depth_sensitivity)
+
+
+State = TypeVar("State")
+
+
+def descended(
+    state: State,
+    cost_of: Callable[[State], float],
+    proposals: Callable[[State], Callable[[float], State]],
+    *,
+    iterations: int,
+    tolerance: float,
+) -> tuple[State, float]:
+    """Levenberg-Marquardt: the last state and its cost. ``proposals``: of a state, the next one by damping."""
+    cost, damping = cost_of(state), 1e-3
     for _ in range(iterations):
-        normal = _normal_equations(problem, state)
+        proposed = proposals(state)
         before = cost
         while damping < 1e9:
-            proposal = stepped(state, *_solve(normal, damping))
-            proposed_cost = cost_of(problem, proposal)
+            proposal = proposed(damping)
+            proposed_cost = cost_of(proposal)
             if proposed_cost < cost:
                 state, cost, damping = proposal, proposed_cost, max(damping * 0.2, 1e-9)
                 break
             damping *= 6.0
         if before - cost < tolerance * before + 1e-9:
             break
-    normal = _normal_equations(problem, state)
-    depth = np.where(normal.depth > 0, normal.depth, np.inf)
-    sensitivity = -normal.cross / depth[:, None]
-    information = reduced(normal.parameters, normal.cross, normal.depth)
-    scale = 1.0 / np.sqrt(np.diag(normal.parameters))
+    return state, cost
+
+
+def covariance_of(information: Float64, parameters: Float64) -> Float64:
+    """The inverse (P, P) of the information without points, scaled by the diagonal of that with them."""
+    scale = 1.0 / np.sqrt(np.diag(parameters))
     covariance = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-14, hermitian=True)
-    return Adjusted(state, cost, covariance * np.outer(scale, scale), sensitivity)
+    return np.asarray(covariance * np.outer(scale, scale))
 
 
 def normalised(state: AdjustmentState) -> AdjustmentState:
@@ -202,7 +234,7 @@ def normalised(state: AdjustmentState) -> AdjustmentState:
 
 
 @dataclass(frozen=True, slots=True)
-class _Normal:
+class Normal:
     """Gauss-Newton blocks: parameters (P, P), cross (points, P), depth (points,) and the gradients."""
 
     parameters: Float64
@@ -211,12 +243,17 @@ class _Normal:
     gradient: Float64
     depth_gradient: Float64
 
+    @property
+    def depth_sensitivity(self) -> Float64:
+        """As of ``Adjusted``."""
+        return np.asarray(-self.cross / np.where(self.depth > 0, self.depth, np.inf)[:, None])
+
 
 def _prior_terms(problem: AdjustmentProblem, state: AdjustmentState) -> Float64:
     """Residuals in sigmas of priors and gauge."""
     camera = (state.camera - problem.camera_prior)[:CAMERA_PARAMETERS] / problem.camera_sigma
     own = (state.intrinsics - problem.projector_prior) / problem.projector_sigma
-    gauge = (np.vdot(state.centres, state.centres) / len(state.centres) - 1.0) / _GAUGE_SIGMA
+    gauge = (np.vdot(state.centres, state.centres) / len(state.centres) - 1.0) / GAUGE_SIGMA
     return np.concatenate([camera, own.ravel(), [gauge]])
 
 
@@ -231,23 +268,28 @@ def _prior_jacobian(problem: AdjustmentProblem, state: AdjustmentState) -> Float
         rows = CAMERA_PARAMETERS + LENS_PARAMETERS * n + np.arange(LENS_PARAMETERS)
         jacobian[rows, start + np.arange(LENS_PARAMETERS)] = 1.0 / problem.projector_sigma[n]
         jacobian[-1, start + LENS_PARAMETERS + 3 : start + PROJECTOR_PARAMETERS] = (
-            2.0 * state.centres[n] / (projectors * _GAUGE_SIGMA)
+            2.0 * state.centres[n] / (projectors * GAUGE_SIGMA)
         )
     return jacobian
 
 
-def _normal_equations(problem: AdjustmentProblem, state: AdjustmentState) -> _Normal:
+def _normal_equations(problem: AdjustmentProblem, state: AdjustmentState) -> Normal:
+    normal = data_equations(problem, state)
+    prior, jacobian = _prior_terms(problem, state), _prior_jacobian(problem, state)
+    return replace(
+        normal, parameters=normal.parameters + jacobian.T @ jacobian, gradient=normal.gradient + jacobian.T @ prior
+    )
+
+
+def data_equations(problem: AdjustmentProblem, state: AdjustmentState) -> Normal:
+    """Of the correspondences alone."""
     linear = linearise(problem, state)
     squared = channels.total(linear.residual_px**2) / (problem.noise_px * _CAUCHY) ** 2
     weight = problem.seen / (1.0 + squared) / problem.noise_px**2
-    parameters, cross, depth, gradient, depth_gradient = accumulate(
-        linear.by_camera, linear.by_projector, linear.by_depth, linear.residual_px, weight
-    )
-    prior, jacobian = _prior_terms(problem, state), _prior_jacobian(problem, state)
-    return _Normal(parameters + jacobian.T @ jacobian, cross, depth, gradient + jacobian.T @ prior, depth_gradient)
+    return Normal(*accumulate(linear.by_camera, linear.by_projector, linear.by_depth, linear.residual_px, weight))
 
 
-def _solve(normal: _Normal, damping: float) -> tuple[Float64, Float64]:
+def _solve(normal: Normal, damping: float) -> tuple[Float64, Float64]:
     depth = normal.depth * (1.0 + damping) + 1e-12
     damped = normal.parameters + damping * np.diag(np.diag(normal.parameters))
     right = np.sum(normal.cross * (normal.depth_gradient / depth)[:, None], axis=0) - normal.gradient

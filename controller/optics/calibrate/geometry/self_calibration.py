@@ -152,9 +152,9 @@ def reconstruct(
     problem, adjusted, kept_share = _refine(problem, correspondences, trial)
     report(0.8)
     _refuse_if_contradicted(problem, adjusted.state)
-    shape_sigma = _shape_sigma(problem, adjusted)
-    _refuse_if_uncertain(shape_sigma, margin, pairs)
-    stage = AdjustedStage(adjusted.state, problem.noise_px, shape_sigma, camera_size, projector_sizes)
+    uncertainty = shape_sigma(problem, adjusted)
+    _refuse_if_uncertain(uncertainty, margin, pairs)
+    stage = AdjustedStage(adjusted.state, problem.noise_px, uncertainty, camera_size, projector_sizes)
     points = object_points(stage, correspondences, prior)
     report(1.0)
     return Reconstruction(
@@ -162,7 +162,7 @@ def reconstruct(
         covariance=_in_metres(adjusted.covariance, points.unit_m, len(projector_sizes)),
         parameter_names=parameter_names(len(projector_sizes)),
         noise_px=problem.noise_px,
-        shape_rel_sigma=shape_sigma,
+        shape_rel_sigma=uncertainty,
         scale_rel_sigma=points.unit_rel_sigma,
         margin=margin,
         inlier_share=kept_share,
@@ -302,7 +302,7 @@ def _refine(
     for _ in range(2):
         adjusted = ba.adjust(problem, state)
         distance = channels.length(ba.residuals(problem, adjusted.state))
-        noise = _noise_px(problem, distance)
+        noise = noise_of(problem, distance)
         seen = problem.seen & (distance < 5.0 * noise)
         kept = np.asarray(seen.any(axis=1), np.bool_)
         state = replace(adjusted.state, inverse_depth=adjusted.state.inverse_depth[kept])
@@ -318,7 +318,7 @@ def _refine(
     return problem, ba.adjust(problem, state), share
 
 
-def _noise_px(problem: ba.AdjustmentProblem, distance: Float64) -> float:
+def noise_of(problem: ba.AdjustmentProblem, distance: Float64) -> float:
     """Standard deviation of one coordinate, from the median distance; the points' own freedom is allowed for."""
     measured = 2.0 * float(problem.seen.sum())
     free = measured - float(problem.seen.any(axis=1).sum()) - ba.PROJECTOR_PARAMETERS * distance.shape[1]
@@ -327,7 +327,7 @@ def _noise_px(problem: ba.AdjustmentProblem, distance: Float64) -> float:
     return max(median / 1.177 * float(np.sqrt(measured / max(free, 1.0))), 1e-3)
 
 
-def _shape_sigma(problem: ba.AdjustmentProblem, adjusted: ba.Adjusted) -> float:
+def shape_sigma(problem: ba.AdjustmentProblem, adjusted: ba.Adjusted) -> float:
     """Rms error of the points by wrong parameters, relative to their distance, best moved, turned and scaled."""
     xy, rays = ba.camera_rays(adjusted.state.camera, problem.camera_px)
     z = 1.0 / adjusted.state.inverse_depth
@@ -355,9 +355,9 @@ def _refuse_if_contradicted(problem: ba.AdjustmentProblem, state: ba.AdjustmentS
         )
 
 
-def _refuse_if_uncertain(shape_sigma: float, margin: float, pairs: Sequence[pose_initialisation.Pair]) -> None:
+def _refuse_if_uncertain(uncertainty: float, margin: float, pairs: Sequence[pose_initialisation.Pair]) -> None:
     parallax = max(pair.parallax_px for pair in pairs)
-    if shape_sigma > _LARGEST_SHAPE_SIGMA and all(pair.parallax_px < 20.0 * pair.noise_px for pair in pairs):
+    if uncertainty > _LARGEST_SHAPE_SIGMA and all(pair.parallax_px < 20.0 * pair.noise_px for pair in pairs):
         raise _flat(parallax)
     if margin < _CLEAR_MARGIN:
         raise CalibrationError(
@@ -366,10 +366,10 @@ def _refuse_if_uncertain(shape_sigma: float, margin: float, pairs: Sequence[pose
             remedy="Place the projectors farther apart, add one, or measure the camera's focal length with a "
             "ChArUco board.",
         )
-    if shape_sigma > _LARGEST_SHAPE_SIGMA:
+    if uncertainty > _LARGEST_SHAPE_SIGMA:
         raise CalibrationError(
             "geometry-uncertain",
-            what=f"The object's shape is known only to {shape_sigma:.1%} of its distance.",
+            what=f"The object's shape is known only to {uncertainty:.1%} of its distance.",
             remedy="Place the projectors farther apart, or measure the camera's focal length with a ChArUco board.",
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, astuple, replace
 from functools import partial
 from pathlib import Path
@@ -24,25 +24,28 @@ from controller.optics.calibrate.correspondence.colour_alignment import (
 )
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.geometry.lenses import bent
-from controller.optics.calibrate.geometry.self_calibration import jumps, one_projector
+from controller.optics.calibrate.geometry.self_calibration import jumps, one_projector, reconstruct
 from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
 from controller.optics.calibrate.geometry.values import CameraPrior
+from controller.optics.calibrate.geometry.view_poses import FEWEST_POINTS, SeenStage, join_views
 from controller.optics.calibrate.metapixels.from_phase import fit_pixels
 from controller.optics.calibrate.photometry.glare import spread_by_lens
 from controller.optics.calibrate.photometry.projector_glare import DarkPart, lens_veils, projector_glare
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry, white_segment
-from controller.optics.calibrate.values import Correspondence
+from controller.optics.calibrate.values import Correspondence, Pinhole
 from controller.optics.capture.pattern_frames import frame
 from controller.optics.capture.raw import CAMERA_BLUR_PX
 from controller.optics.transport.indirect.stripes import stride_of, stripe_parts, thinned
+from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
-from controller.stage.artefacts.geometry import write_geometry
+from controller.stage.artefacts.geometry import camera_px, has_geometry, read_geometry, write_geometry, write_view_pose
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.pattern_plans import PhotographOptions, PlanUsed
 from controller.stage.artefacts.photographs import Developed, light_of, noise_of, white_bracket
-from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels, write_radiometry_figures
+from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels, read_metapixels, write_radiometry_figures
+from controller.stage.artefacts.views import view_folders
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.calibrate.indirect import indirect_step
@@ -315,3 +318,60 @@ def _dark_parts(context: Context, projector: RigProjector, black: FloatImage, st
 
 
 __all__ = ["lens_troubles"]
+
+
+def join_geometry(
+    run: Path,
+    projectors: Sequence[str],
+    prior_of: Callable[[str], CameraPrior],
+    asked: AskedShape,
+    reporter: Reporter,
+) -> bool:
+    """Adjust all whole views of a run together, and write each one's geometry and place; whether that was done.
+
+    ``prior_of``: of the camera of a view. Raises CalibrationError as ``join_views`` where a surface is ``asked`` for;
+    else views that can't be joined stay as they are, and a warning says why.
+    """
+    folders = view_folders(run)
+    if len(folders) < 2 or asked in ("unknown", "plane"):
+        return False
+    masks = (read_metapixels(run, name).valid for name in projectors)
+    sizes = [(valid.shape[1], valid.shape[0]) for valid in masks]
+    try:
+        views = [_seen(name, folder, projectors, sizes, prior_of(name)) for name, folder in folders.items()]
+        joined = join_views(views, projectors, sizes)
+    except CalibrationError as error:
+        if asked == "surface":
+            raise
+        reporter.say(
+            f"The views have no common shape: {error.what} {error.remedy} What needs no shape works in all of them.",
+            Level.WARNING,
+        )
+        return False
+    for folder, view, one in zip(folders.values(), views, joined, strict=True):
+        write_geometry(folder, projectors, FoundShape("surface", view.camera_size, one.reconstruction))
+        write_view_pose(folder, one.pose)
+    reporter.say(f"{len(joined)} views are joined: their cameras and all projectors have one place each.")
+    return True
+
+
+def _seen(
+    name: str, folder: Path, projectors: Sequence[str], sizes: Sequence[tuple[int, int]], prior: CameraPrior
+) -> SeenStage:
+    size = camera_px(folder)
+    assert size is not None, "a whole view has a camera picture"
+    seen = [read_correspondence(folder, one) for one in projectors]
+    chosen = [n for n, own in enumerate(seen) if int(np.count_nonzero(own.valid)) >= FEWEST_POINTS]
+    found: Sequence[Pinhole]
+    if has_geometry(folder):
+        found = [read_geometry(folder, projectors).projectors[n] for n in chosen]
+    else:
+        # a view may see too little of a projector for a geometry with all of them
+        own = reconstruct([seen[n] for n in chosen], size, [sizes[n] for n in chosen], prior)
+        found = own.geometry.projectors
+    kept = [own if n in chosen else _nothing(own) for n, own in enumerate(seen)]
+    return SeenStage(name, kept, size, prior, dict(zip(chosen, found, strict=True)))
+
+
+def _nothing(own: Correspondence) -> Correspondence:
+    return Correspondence(np.full_like(own.projector_px, np.nan), own.modulation, np.zeros_like(own.valid))
