@@ -110,9 +110,9 @@ class Kiosk(Protocol):
         """
 
     def computed(self, target: Path) -> Computed:
-        """What the object will look like by a whole solve on a graphics processor. Seconds; more at the first target.
+        """What the object will look like by a whole solve. Seconds; more at the first target.
 
-        Raises UsageError("no-graphics-processor", "not-calibrated"), WorkError("preview-ended") while a job runs,
+        Raises UsageError("not-calibrated"), WorkError("preview-ended") while a job runs,
         WorkError("memory-too-small", "preview-slow").
         """
 

@@ -59,8 +59,7 @@ class Reach:
     ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
     not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
     ``light``: with so much of the light that the picture has by the settings, ``light_share`` of it is in reach.
-    ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all. ``computes``: a graphics processor
-    may be there for ``Computed``.
+    ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all.
     """
 
     share: float
@@ -69,14 +68,13 @@ class Reach:
     too_colourful: float
     pictures: Pictures = field(default_factory=dict)
     coarse: int = 1
-    computes: bool = False
     light: float = 1.0
     light_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Computed:
-    """What the object will look like by a whole solve of a target on a graphics processor, as the computation makes it.
+    """What the object will look like by a whole solve of a target, as the computation makes it.
     Calculated, not photographed: ``delta_e`` and ``delta_e_p95`` median and 95th percentile of the colour difference
     (CIEDE2000) from the target on the whole visible object, ``in_reach`` the median where the target can be reached,
     which is ``in_reach_share`` of the object; each None without such pixels. ``seconds`` it took on ``device``;

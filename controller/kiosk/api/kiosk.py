@@ -125,8 +125,7 @@ class StageKiosk(AttachedKiosk):
     def reach(self, target: Path) -> Reach:
         from controller.kiosk.preview.reach import reach
 
-        checked = self.service.checked
-        return replace(reach(checked, target), computes=self._previews.possible(checked))
+        return reach(self.service.checked, target)
 
     def computed(self, target: Path) -> Computed:
         service = self.service

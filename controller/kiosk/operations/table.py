@@ -304,13 +304,13 @@ def reach_picture(kiosk: Kiosk, target: TargetFile, picture: ReachPicture) -> Pi
 
 @operation("GET /targets/{target}/computed", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))
 def computed_preview(kiosk: Kiosk, target: TargetFile) -> Computed:
-    """What the object will look like by a whole solve on a graphics processor."""
+    """What the object will look like by a whole solve."""
     return kiosk.computed(target)
 
 
 @operation("GET /targets/{target}/computed/picture", OPERATOR, LOOKS, names=Names(part_of="kiosk add"))
 def computed_picture(kiosk: Kiosk, target: TargetFile) -> Picture:
-    """A picture of a whole solve on a graphics processor."""
+    """A picture of a whole solve."""
     return kiosk.computed(target).pictures["result"]
 
 

@@ -1,4 +1,4 @@
-"""Whole solves of targets before they are computed, where a graphics processor makes them fast.
+"""Whole solves of targets, as what the object will look like before they become appearances.
 
 A process of its own solves (`computing`): a driver that ends it ends no kiosk, and its memory goes with it. It stays
 for the next target, until no one asks, a job of the kiosk needs the memory, or calibration or settings change.
@@ -7,7 +7,6 @@ for the next target, until no one asks, a job of the kiosk needs the memory, or 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import subprocess
 import sys
@@ -15,11 +14,10 @@ import threading
 from pathlib import Path
 from typing import Any, Final
 
-from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.core.storage import write_atomically
 from controller.kiosk.preview.reach import kept_at
 from controller.kiosk.values import Computed
-from controller.optics.solve.engines import MODULE
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import Checked
 
@@ -28,7 +26,6 @@ PICTURE: Final = "computed.jpg"
 IDLE_S: Final = 120.0
 LONGEST_S: Final = 180.0
 """For one answer, with what is read first: a driver may hang."""
-NO_DEVICE: Final = "no-graphics-processor"
 
 
 class ComputedPreviews:
@@ -40,38 +37,22 @@ class ComputedPreviews:
         self._process: subprocess.Popen[str] | None = None
         self._stage = ""
         self._idle: threading.Timer | None = None
-        self._none_for: set[str] = set()
-        """Values of [solve] device for which this computer has none; it is not looked for again."""
-
-    def possible(self, checked: Checked) -> bool:
-        """Whether a graphics processor may be there; known for certain after the first target."""
-        solve = checked.stage.tables.solve
-        device = "cpu" if solve.method == "regions" else solve.device
-        return device != "cpu" and device not in self._none_for and importlib.util.find_spec(MODULE) is not None
 
     def of(self, checked: Checked, target: Path) -> Computed:
         """Solve ``target`` (PNG or EXR); kept until target, calibration or settings change.
 
-        Seconds, more at the first target. Raises UsageError("no-graphics-processor", "not-calibrated",
-        "target-unreadable"), WorkError("memory-too-small", "preview-ended", "preview-slow").
+        Seconds, more at the first target. Raises UsageError("not-calibrated", "target-unreadable"),
+        WorkError("memory-too-small", "preview-ended", "preview-slow"), and what ``choose_engine`` raises.
         """
         table = checked.stage.tables.solve
         run = finished_calibration(checked.stage.folder)
-        if not self.possible(checked):
-            raise no_device()
         folder, about = kept_at(checked, run, target)
         with self._one_at_a_time:
             if (known := _kept(folder, about)) is not None:
                 return known
             folder.mkdir(parents=True, exist_ok=True)
             stage = json.dumps({"run": str(run), "names": checked.names, "solve": table.model_dump(mode="json")})
-            try:
-                found = self._asked(stage, {"target": str(target), "picture": str(folder / PICTURE)})
-            except VelaturaError as error:
-                if error.code == NO_DEVICE:
-                    self._none_for.add(table.device)
-                    self.end()
-                raise
+            found = self._asked(stage, {"target": str(target), "picture": str(folder / PICTURE)})
             write_atomically(folder / FIGURES, json.dumps({"of": about, "figures": found}).encode())
             return _read(found, folder)
 
@@ -152,19 +133,14 @@ class ComputedPreviews:
             self._idle.start()
 
 
-def no_device() -> UsageError:
-    return UsageError(NO_DEVICE, what="This computer has no graphics processor that can solve.",
-                      remedy="Use the quick preview, or compute the appearance.")  # fmt: skip
-
-
 def _ended() -> WorkError:
-    return WorkError("preview-ended", what="The preview on the graphics processor was ended before it was there.",
+    return WorkError("preview-ended", what="The preview was ended before it was there.",
                      remedy="Look at the picture again when no job of the kiosk runs.")  # fmt: skip
 
 
 def _slow() -> WorkError:
-    return WorkError("preview-slow", what=f"The graphics processor gave no preview within {LONGEST_S:.0f} seconds.",
-                     remedy='Set device = "cpu" under [solve] in stage.toml if this happens again.')  # fmt: skip
+    return WorkError("preview-slow", what=f"There was no preview within {LONGEST_S:.0f} seconds.",
+                     remedy="Compute the appearance: that may take as long as it needs.")  # fmt: skip
 
 
 def _kept(folder: Path, about: dict[str, Any]) -> Computed | None:

@@ -25,10 +25,9 @@ import numpy as np
 from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage
 from controller.core.errors import SEND_DIAGNOSTICS, UsageError, VelaturaError
-from controller.kiosk.preview.computed import no_device
 from controller.kiosk.preview.reach import write_picture
 from controller.kiosk.store.targets import fitted, png_size
-from controller.optics.solve.bounded.engine import Processor, SolveContext
+from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.optics.solve.request import AppearanceResult, solve_appearance
@@ -40,6 +39,8 @@ from controller.stage.report.pictures import to_screen
 from controller.stage.steps.appearance.solving import options_of, solved_base
 from hal.runtime.compute import free_bytes
 
+NICENESS: Final = 10
+"""What plays, and what is being calibrated, goes before previews."""
 JUDGED_PX: Final = 960
 """About the longer side of what is judged and drawn: every so-many-th pixel of the camera."""
 
@@ -62,19 +63,16 @@ class Task:
 
 
 class Solver:
-    """A calibration on a graphics processor, read at the first target and kept.
+    """A calibration, read at the first target and kept. Raises what ``choose_engine`` raises.
 
-    Raises UsageError("no-graphics-processor", "extra-missing").
+    Also where appearances are solved by regions, previews are not: both come near the same optimum, regions in minutes.
     """
 
     def __init__(self, stage: Stage) -> None:
         table = SolveTable.model_validate(stage.solve)
-        engine = choose_engine(table.device, lambda note: None, table.method)
-        if isinstance(engine, Processor):
-            raise no_device()
-        self._engine = engine
+        self._engine = choose_engine(table.device, lambda note: None)
         self._options = options_of(table)
-        self._calibrated = Calibrated(Path(stage.run), stage.names, engine)
+        self._calibrated = Calibrated(Path(stage.run), stage.names, self._engine)
         self._begun = False
 
     def answer(self, task: Task) -> dict[str, Any]:
@@ -85,7 +83,7 @@ class Solver:
         calibration = calibrated.calibration
         made = solve_appearance(
             calibrated.light,
-            calibrated.base,
+            calibrated.base if self._options.mode == "scale" else None,
             self._target(Path(task.target)),
             self._options,
             SolveContext(calibrated.engine, folder=calibrated.folder),
@@ -100,7 +98,8 @@ class Solver:
     def _begin(self) -> None:
         if not self._begun:
             check_memory(solve_peak_bytes(stage_size(self._calibrated.calibration)), free_bytes())
-            self._calibrated.keep_base(solved_base(self._calibrated, self._options))
+            if self._options.mode == "scale":
+                self._calibrated.keep_base(solved_base(self._calibrated, self._options))
             self._begun = True
 
     def _target(self, file: Path) -> Target:
@@ -174,6 +173,7 @@ def serve(source: TextIO, out: TextIO) -> None:
 
 
 def main() -> None:
+    os.nice(NICENESS)
     # Drivers print as they like: only answers go to the parent.
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -231,7 +231,7 @@ def _pitch(transport: LightTransport, n: int) -> float:
 
 def make_appearance(
     light: StageLight,
-    base: Base,
+    base: Base | None,
     target: FloatImage,
     settings: SolveSettings = DEFAULT_SETTINGS,
     context: SolveContext = ALONE,
@@ -247,6 +247,7 @@ def make_appearance(
     transport, black = light.transport, light.black
     check_target(transport, target)
     if mode == "scale":
+        assert base is not None, "a scale needs a base"
         scaled = scale_frames(transport, base, target, black, engine=context.engine)
         return Appearance(tuple(scaled), fine_detail(transport, base, target, black), None)
     solution = solve_bounded(transport, target, black, settings, context)

@@ -110,9 +110,11 @@ class AppearanceResult:
 
 
 def solve_appearance(
-    light: StageLight, base: Base, requested: Target, options: SolveOptions, context: SolveContext = ALONE
+    light: StageLight, base: Base | None, requested: Target, options: SolveOptions, context: SolveContext = ALONE
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
+
+    ``base``: only of use in the mode "scale"
 
     With ``light.indirect`` the frames leave room in the target for the light by way of other surfaces.
     Raises what ``choose_exposure`` and ``solve_bounded`` raise.
@@ -217,7 +219,7 @@ def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder
     return Aim(exposed.wanted, direct, exposed.possible, exposed.asked, asked_possible, exposed.exposure, figures)
 
 
-def _solved(light: StageLight, base: Base, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:
+def _solved(light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:
     """Frames for an aim; with indirect light by two solves."""
     wanted = target_radiance(aim.wanted, light.black, 1.0)
     weights = appearance_weights(wanted, aim.possible.reachable, aim.exposure)
@@ -236,11 +238,11 @@ def _solved(light: StageLight, base: Base, aim: Aim, options: SolveOptions, cont
 
 
 def _solved_directly(
-    light: StageLight, base: Base, aim: Aim, options: SolveOptions, context: SolveContext,
+    light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext,
     target: FloatImage, settings: SolveSettings,
 ) -> Appearance:  # fmt: skip
     """Frames for a ``target`` radiance (rows, columns, 3), in direct light."""
-    if options.base == "high-pass":
+    if base is not None and options.base == "high-pass" and options.mode == "scale":
         image = high_pass_base(light.transport, base.image, target, light.black)
         base = solve_base(light.transport, image, light.black, SolveSettings(options.smoothness), context)
     return make_appearance(light, base, target, settings, context, mode=options.mode)

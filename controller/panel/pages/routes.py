@@ -344,7 +344,7 @@ class Pages:
         return {"target": target, "reach": found, "at": f"/see/targets/{target}/reach", **self._drawn_on(target)}
 
     def _computed(self, request: Request) -> dict[str, Any]:
-        """A whole solve; without one, why, and the quick preview stays."""
+        """A whole solve; without one, why, and what of the target is in reach by each pixel alone."""
         target = request.path_params["target"]
         file = self._panel.targets.path(target)
         found, problem = None, ""

@@ -195,10 +195,10 @@ class MemoryKiosk(MemoryWork):
 
     def reach(self, target: Path) -> Reach:
         pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
-        return Reach(0.45, 0.3, 0.15, 0.05, pictures, computes=True)
+        return Reach(0.45, 0.3, 0.15, 0.05, pictures)
 
     def computed(self, target: Path) -> Computed:
-        return Computed(0.9, 4.1, 0.5, 0.45, 0.4, "A graphics processor", {"result": self._drawn("computed", 120)})
+        return Computed(0.9, 4.1, 0.5, 0.45, 0.4, "processor", {"result": self._drawn("computed", 120)})
 
     def scenes(self) -> Sequence[Scene]:
         shipped = [Scene(name, True, self._drawn(name)) for name in BUILTIN]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -25,8 +26,7 @@ class DriveLevels:
     primaries of the projectors differ, a little more can be reached by unequal frames.) White segments make part of
     what the three colours have in common: levels are those of the colours' own light.
 
-    ``matrices`` (3, 3, rows, columns): B; ``reach`` (rows, columns, 3): the light with every projector at white;
-    ``segment_share`` (rows, columns): what white segments are of all light,
+    ``matrices`` (3, 3, rows, columns): B; ``segment_share`` (rows, columns): what white segments are of all light,
     0 x 0 where no projector has one
     """
 
@@ -38,7 +38,7 @@ class DriveLevels:
         shape = (3, 3, *transport.camera_shape)
         self.matrices = array_in_file(folder, shape)
         self.matrices[:] = 0
-        self.reach = array_in_file(folder, (*transport.camera_shape, 3))
+        self._folder = folder
         segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
         for n in range(len(transport.sizes)):
             mixing = transport.mixing_of(n)
@@ -49,10 +49,16 @@ class DriveLevels:
             if transport.segments:
                 segment += np.float32(transport.segment(n)) * white.sum(axis=0)
                 total += white.sum(axis=0)
-        np.sum(self.matrices, axis=1, out=np.moveaxis(self.reach, -1, 0))
         # projectors of one kind stand together: where they differ, the mean by their light
         share = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else NO_SEGMENTS
         self.segment_share: FloatImage = share
+
+    @cached_property
+    def reach(self) -> FloatImage:
+        """The light with every projector at white, (rows, columns, 3)."""
+        found = array_in_file(self._folder, (*self.mask.shape, 3))
+        np.sum(self.matrices, axis=1, out=np.moveaxis(found, -1, 0))
+        return found
 
     def of(self, light: FloatImage, rows: slice = ALL) -> FloatImage:
         """(rows, columns, 3) float32 for a light of that shape, without the black image; 0 outside the object.

@@ -170,7 +170,8 @@ def _answer_here(
     calibrated: Calibrated, request: AppearanceRequest, options: SolveOptions, context: Context
 ) -> AppearanceResult:
     solving = SolveContext(calibrated.engine, _watched(context), folder=calibrated.folder)
-    return solve_appearance(calibrated.light, calibrated.base, request.target(), options, solving)
+    base = calibrated.base if options.mode == "scale" else None
+    return solve_appearance(calibrated.light, base, request.target(), options, solving)
 
 
 def _solve_appearance(

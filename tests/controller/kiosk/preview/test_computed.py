@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.core.errors import UsageError, VelaturaError
+from controller.core.errors import VelaturaError
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
@@ -20,34 +20,18 @@ def a_stage(folder: Path, device: str) -> Path:
     return stage
 
 
-def test_a_computer_without_a_graphics_processor_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Vulkan's loader finds no driver here, and OpenGL is not looked for.
+@pytest.mark.parametrize(("device", "code"), [("cpu", "array-file-unreadable"), ("gpu", "no-graphics-processor")])
+def test_an_error_of_the_other_process_keeps_its_code_and_its_sentences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, code: str
+) -> None:
+    """The run has a grade, and none of its arrays. Vulkan's loader finds no driver here."""
     monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
     monkeypatch.setenv("VK_ICD_FILENAMES", str(tmp_path / "none.json"))
-    stage = a_stage(tmp_path / "stage", "auto")
-    checked, previews = check_stage(stage), ComputedPreviews()
-    assert previews.possible(checked)
-    for _ in range(2):
-        with pytest.raises(UsageError) as caught:
-            previews.of(checked, stage / "target.png")
-        assert caught.value.code == "no-graphics-processor"
-    assert not previews.possible(checked)
-
-
-def test_the_processor_gives_no_previews(tmp_path: Path) -> None:
-    stage = a_stage(tmp_path, "cpu")
-    with pytest.raises(UsageError) as caught:
-        ComputedPreviews().of(check_stage(stage), stage / "target.png")
-    assert caught.value.code == "no-graphics-processor"
-
-
-def test_an_error_of_the_other_process_keeps_its_code_and_its_sentences(tmp_path: Path) -> None:
-    """The run has a grade, and none of its arrays."""
-    stage = a_stage(tmp_path, "gpu")
+    stage = a_stage(tmp_path / "stage", device)
     previews = ComputedPreviews()
     try:
         with pytest.raises(VelaturaError) as caught:
             previews.of(check_stage(stage), stage / "target.png")
-        assert caught.value.code == "array-file-unreadable"
+        assert caught.value.code == code
     finally:
         previews.end()
