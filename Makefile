@@ -1,4 +1,4 @@
-# make demo   the whole job on an emulated stage, ending in demo/report.html; OBJECT=painting, relief or statue; PROJECTORS=1
+# make demo   the whole job on an emulated stage, ending in demo/report.html; OBJECT=painting, relief or statue; PROJECTORS=1; CAMERAS=2
 # make test   every test but the long ones; WORKERS=3 chooses how many run side by side, TESTS=tests/hal which
 # make test-long   the long ones: booted machines, whole stages, a second renderer
 # make test-all    both at once, in less time than one after the other: the others run while a long one waits
@@ -22,7 +22,8 @@ OBJECT_NAME = $(notdir $(basename $(subst $(empty) $(empty),_,$(OBJECT))))
 quoted = '$(subst ','\'',$(1))'
 ROOM ?=
 PROJECTORS ?=
-OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))$(if $(PROJECTORS),-$(PROJECTORS))
+CAMERAS ?=
+OUT ?= demo/$(SIZE)$(if $(OBJECT),-$(OBJECT_NAME))$(if $(ROOM),-$(ROOM))$(if $(PROJECTORS),-$(PROJECTORS))$(if $(CAMERAS),-$(CAMERAS)-cameras)
 SEED ?= 1
 OBJECT ?=
 DEBIAN ?= bookworm
@@ -42,7 +43,7 @@ DOCS_PYTHON ?= .venv/bin/python
 
 demo:
 	@.ci/setup demo
-	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(ROOM),--room $(ROOM)) $(if $(PROJECTORS),--projectors $(PROJECTORS)) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
+	@.venv/bin/velatura demo --size $(SIZE) --out $(call quoted,$(OUT)) --seed $(SEED) $(if $(ROOM),--room $(ROOM)) $(if $(PROJECTORS),--projectors $(PROJECTORS)) $(if $(CAMERAS),--cameras $(CAMERAS)) $(if $(OBJECT),--object $(call quoted,$(OBJECT)))
 
 blender:
 	@.ci/setup-blender

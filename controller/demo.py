@@ -101,6 +101,7 @@ class DemoStage:
     thing: str | None = None
     room: str = DEFAULT_ROOM
     projectors: int | None = None
+    cameras: int = 1
 
     @property
     def built_in(self) -> str | None:
@@ -128,11 +129,13 @@ def prepare(out: Path, asked: DemoStage) -> Path:
     options = {"size": asked.size, "seed": asked.seed, "object": thing, "room": asked.room}
     if asked.projectors is not None:
         options["projectors"] = asked.projectors
+    if asked.cameras > 1:
+        options["cameras"] = asked.cameras
     if (mark := stage / MARK).exists():
         if _read_mark(mark) != options:
             raise UsageError(
                 "demo-folder-taken",
-                what=f"{out} contains a demo with another size, object, seed, room or number of projectors.",
+                what=f"{out} contains a demo with another size, object, seed, room or number of devices.",
                 remedy="Choose another folder with --out, or delete this one.",
             )
         return stage
@@ -166,6 +169,7 @@ def _build(out: Path, stage: Path, options: Mapping[str, Any], asked: DemoStage)
 
 def _write(stage: Path, asked: DemoStage) -> Mapping[str, Any]:
     settings = {"room": asked.room, "object": asked.built_in, "projectors": asked.projectors}
+    settings |= {"cameras": asked.cameras} if asked.cameras > 1 else {}
     try:
         bench = bench_of(stage, {key: value for key, value in settings.items() if value is not None})
         devices = bench.prepare(stage, size=asked.size, object_file=asked.object_file, seed=asked.seed)
@@ -231,15 +235,17 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
     solve = checked.stage.tables.solve
     engine = choose_engine(solve.device, reporter.say, solve.method)
     steps = partial(demo_steps, checked=checked, engine=engine)
-    run = session.run(checked, StageWork("demo", steps), reporter=reporter, cancel=cancel)
+    run = session.run(checked, StageWork("demo", steps, views=True), reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")
     html, machine = write_demo_report(out, run, checked)
     return {"report": str(html), "figures": str(machine), "stage": str(stage)}
 
 
 def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequence[Step]:
-    """Calibrate, solve, refine, publish, photograph, compare with one projector, swap."""
+    """Calibrate, solve, refine, publish, photograph, compare with one projector, swap; other views only calibrate."""
     stage = checked.stage
+    if not rig.is_first:
+        return calibrating(rig, run, checked=checked)
     calibrated = Calibrated(run, checked.names, engine)
     scan = stage.path(SCAN)
     requests = [

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from controller.config.models import AlertsTable, ConfigTable, OpenConfigTable, SolveTable, StageTables
+from controller.config.models import AlertsTable, CameraTable, ConfigTable, OpenConfigTable, SolveTable, StageTables
 from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, read_bytes
@@ -225,6 +225,7 @@ def _check_agreement(tables: StageTables) -> None:
     _all_different(tables.display.outputs, "name")
     _all_different(tables.appearances, "name")
     _all_different(tables.relays, "name")
+    _check_cameras(tables)
     _check_mains(tables)
     _check_alerts(tables.alerts)
     _check_solve(tables.solve)
@@ -240,6 +241,20 @@ def _check_agreement(tables: StageTables) -> None:
         if projector.output not in outputs:
             problem = "is not an output of the display"
             raise projector.place.wrong_value("output", projector.output, problem, f"one of {listed}")
+
+
+def _check_cameras(tables: StageTables) -> None:
+    """One table for the only camera, or several with different names."""
+    if tables.camera is not None and tables.cameras:
+        problem = "can't stand beside [[cameras]]"
+        allowed = "for a stage with one camera. Write [[cameras]] and a name above its keys instead"
+        raise tables.place.wrong_value("camera", tables.camera.driver, problem, allowed)
+    if tables.camera is None and not tables.cameras:
+        raise tables.place.missing("camera", str(StageTables.model_fields["camera"].description), written=[])
+    for table in tables.cameras:
+        if not table.name:
+            raise table.place.missing("name", str(CameraTable.model_fields["name"].description), written=[])
+    _all_different(tables.cameras, "name")
 
 
 def _check_alerts(alerts: AlertsTable) -> None:

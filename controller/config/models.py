@@ -116,6 +116,10 @@ class ProjectorTable(OpenConfigTable):
 
 
 class CameraTable(OpenConfigTable):
+    name: Name = Field(
+        default="",
+        description="a name for people, different for every camera, 1 to 64 printable characters; needed with several",
+    )
     driver: Name = Field(description='the name of a camera driver, e.g. "ptp"')
     iso: int = Field(ge=25, le=819_200, description="the camera's sensitivity, a whole number from 25 to 819200")
     aperture_f: Annotated[float, Field(ge=0.5, le=128)] | None = Field(
@@ -186,7 +190,9 @@ class ObjectTable(ConfigTable):
         'shape is needed), or "auto" (the most that the photographs give)',
     )
     distances: Annotated[tuple[DistanceTable, ...], Field(strict=False)] = Field(
-        default=(), description="a list of [[object.distances]] tables with from_px, to_px and distance_m"
+        default=(),
+        description="a list of [[object.distances]] tables with from_px, to_px and distance_m, in the first camera's "
+        "picture",
     )
     outline: Annotated[tuple[Region, ...], Field(strict=False, max_length=100)] = Field(
         default=(),
@@ -226,6 +232,9 @@ class CalibrationTable(ConfigTable):
         description="true or false: whether the kiosk photographs the appearances after a nightly recalibration",
     )
 
+
+ONLY_CAMERA: Final = "camera"
+"""What the view of a camera without a name is called."""
 
 REFINE: Final = 1
 """Photographs by which each appearance is corrected, unless stage.toml says otherwise."""
@@ -401,7 +410,10 @@ class StageTables(ConfigTable):
     projectors: Annotated[tuple[ProjectorTable, ...], Field(strict=False, min_length=1, max_length=32)] = Field(
         description="1 to 32 tables [[projectors]], one for each projector"
     )
-    camera: CameraTable = Field(description="the table [camera]")
+    camera: CameraTable | None = Field(default=None, description="the table [camera]")
+    cameras: Annotated[tuple[CameraTable, ...], Field(strict=False, max_length=8)] = Field(
+        default=(), description="1 to 8 tables [[cameras]] instead of [camera], one for each camera"
+    )
     display: DisplayTable = Field(description="the table [display]")
     object: ObjectTable = Field(default_factory=ObjectTable, description="the table [object]")
     capture: CaptureTable = Field(default_factory=CaptureTable, description="the table [capture]")
@@ -421,3 +433,10 @@ class StageTables(ConfigTable):
     disk: DiskTable = Field(default_factory=DiskTable, description="the table [disk]")
     backup: BackupTable = Field(default_factory=BackupTable, description="the table [backup]")
     alerts: AlertsTable = Field(default_factory=AlertsTable, description="the table [alerts]")
+
+    @property
+    def views(self) -> tuple[tuple[str, CameraTable], ...]:
+        """The name of each camera's view, and its table."""
+        if self.camera is not None:
+            return ((self.camera.name or ONLY_CAMERA, self.camera),)
+        return tuple((table.name, table) for table in self.cameras)

@@ -18,6 +18,15 @@ Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[int, Field(ge=1, le=16_384)]
 
 
+def is_name(text: str) -> bool:
+    """Whether a text is one that stage.toml may have for a name."""
+    try:
+        TypeAdapter(Name).validate_python(text)
+    except ValidationError:
+        return False
+    return True
+
+
 class Holds(Enum):
     """What a text of a configuration file is to a backup. A field that names a file has one of these in its type."""
 

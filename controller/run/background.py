@@ -30,7 +30,7 @@ class BackgroundSteps:
     """
 
     def __init__(self, work: Work, deadline: Deadline) -> None:
-        self._work, self._stop = work, _Either(deadline.cancel)
+        self._work, self._stop = work, EitherEvent(deadline.cancel)
         self._deadline = Deadline(deadline.at_s, self._stop, deadline.time)
         self._waiting: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[tuple[int, bool]] = queue.SimpleQueue()
@@ -102,7 +102,7 @@ class BackgroundSteps:
         self._fraction = max(self._fraction, min(1.0, fraction))
 
 
-class _Either(threading.Event):
+class EitherEvent(threading.Event):
     """Set by itself, or by another event."""
 
     def __init__(self, other: threading.Event | None) -> None:

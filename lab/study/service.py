@@ -210,7 +210,7 @@ def _experiment(
 ) -> Sequence[Path]:
     before, began_s = context.journal.shot_count(), time.perf_counter()
     make = subject_of(str(conditions["size"]), int(conditions["seed"]), context)
-    hand = RigStageControl(rig, context, calibrated, one.name, checked.prior, longest_s, disturb, make)
+    hand = RigStageControl(rig, context, calibrated, one.name, checked.prior(), longest_s, disturb, make)
     light = RigPhotographer(rig, context, calibrated, one.name, longest_s)
     subject = make(calibrated, light, context.folder)
     subject.parts = SessionParts(hand, context)

@@ -44,8 +44,8 @@ from plugins.emulated.optics.scenes import BUILT_IN
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
-    INTRINSICS,
     device_tables,
+    intrinsics_name,
     intrinsics_of,
     random_truth,
     size_named,
@@ -137,13 +137,15 @@ class EmulatedBench:
         if object_file is None and self._built_in is not None:
             thing = BUILT_IN[self._built_in]
             (shape, files), hung = thing.on_stage(), thing.hung
-            if stands == Stands():
-                stands = Stands(names=thing.places)
+            if stands == Stands(cameras=stands.cameras):
+                stands = dataclasses.replace(stands, names=thing.places)
         else:
             shape = default_object() if object_file is None else load_object(object_file)
         kind = self._built_in or (VASE_AND_BUST if object_file is None else "mesh")
         kept = ObjectTruth(kind, OBJECT_FILE, seed)
-        truth = arranged(random_truth(size, seed, shape, kept, _free_ports(), stands), self._room, shape, hung=hung)
+        truth = arranged(
+            random_truth(size, seed, shape, kept, _free_ports(2 * stands.cameras), stands), self._room, shape, hung=hung
+        )
         truth = truth if self._engine is None else dataclasses.replace(truth, engine=self._engine)
         with _explained(stage):
             for folder in (FOLDER, "run"):
@@ -151,7 +153,8 @@ class EmulatedBench:
             shape.save(stage / OBJECT_FILE)
             _write_fast_profile(stage, DEFAULT_BOARD)
             write_truth(stage, truth)
-            (stage / INTRINSICS).write_text(intrinsics_of(truth), encoding="utf-8")
+            for n, camera in enumerate(truth.cameras):
+                (stage / intrinsics_name(n)).write_text(intrinsics_of(truth.seen_by(camera)), encoding="utf-8")
             for name, data in files.items():
                 (stage / name).write_bytes(data)
         return device_tables(truth, shape)
@@ -168,8 +171,13 @@ class EmulatedBench:
         """
 
         def start(out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event) -> Callable[[], None]:
-            world = _start(stage.resolve(), out, stack, stopped, scenario)
-            return lambda: _follow_bumps(world, out)
+            worlds = _start(stage.resolve(), out, stack, stopped, scenario)
+
+            def look() -> None:
+                for world in worlds:
+                    _follow_bumps(world, out)
+
+            return look
 
         return _serve(json_lines, start)
 
@@ -214,15 +222,20 @@ def _serve(json_lines: bool, start: Start) -> int:
 
 def _start(
     stage: Path, out: OutputLines, stack: contextlib.ExitStack, stopped: threading.Event, script: Path | None
-) -> World:
-    """Bring everything up; ``stack`` takes it down again. Ports are looked at first: casting rays takes a while."""
+) -> list[World]:
+    """Bring everything up, a world for each camera; ``stack`` takes it down again.
+
+    Ports are looked at first: casting rays takes a while.
+    """
     # Not at the top: a stage that is only prepared casts no rays, and all that these need takes a second to import.
     from plugins.emulated.optics.world import World
 
     truth = read_truth(stage)
     usb = _usb_devices(stage, truth)
-    if usb is None or not usb.have_camera:
-        _require_free(truth.camera.command_port, truth.camera.event_port)
+    # Only the first camera may be on the USB bus.
+    on_network = truth.cameras[0 if usb is None or not usb.have_camera else 1 :]
+    for camera in on_network:
+        _require_free(camera.command_port, camera.event_port)
     if script is None and truth.scenario:
         script = stage / truth.scenario
     scripted = extension("scenario", asked_by="A script of faults")(script) if script is not None else None
@@ -243,10 +256,13 @@ def _start(
             raise _Interrupted
         out.progress(share)
 
-    with _explained(stage):
-        world = stack.enter_context(World(stage, truth, lamps, progress=progress))
-    world.warm()
-    _follow_bumps(world, out)
+    worlds = []
+    for camera in truth.cameras:
+        with _explained(stage):
+            worlds.append(stack.enter_context(World(stage, truth.seen_by(camera), lamps, progress=progress)))
+    worlds[0].warm()
+    for world in worlds:
+        _follow_bumps(world, out)
     for name, wire in wires.items():
         if scripted is not None:
             wire.scenario = scripted(name, wire)
@@ -255,13 +271,12 @@ def _start(
     covered = {name: wire.lamp for name, wire in wires.items()}
     for node in dmx_nodes(truth.dousers, covered, out.douser):
         out.served("douser", "dmx", stack.enter_context(node).address)
-    if usb is None or not usb.have_camera:
-        camera = stack.enter_context(_network_camera(world, truth.camera))
-        out.served("camera", "camera", camera.address)
+    for world, camera in zip(worlds[-len(on_network) :], on_network, strict=False):
+        out.served(camera.name, "camera", stack.enter_context(_network_camera(world, camera)).address)
     out.served("display", "display", str(stage / truth.frames))
     if usb is not None:
-        usb.serve(stack, wires, world.expose, out, script)
-    return world
+        usb.serve(stack, wires, worlds[0].expose, out, script)
+    return worlds
 
 
 class UsbDevices(Protocol):
@@ -330,14 +345,13 @@ def _follow_bumps(world: World, out: OutputLines) -> None:
         out.say({"bumps": count}, f"The stage is as it was set up, except for {count} bumps.")
 
 
-def _free_ports() -> tuple[int, int]:
-    """Two TCP ports without a listener.
+def _free_ports(count: int) -> tuple[int, ...]:
+    """So many TCP ports without a listener.
 
     The stage keeps them while no bench serves it, so they lie outside the range from which the system gives free ports.
     """
     in_any_order = secrets.SystemRandom().sample(PORTS, len(PORTS))
-    first, second = itertools.islice(filter(_is_free, in_any_order), 2)
-    return first, second
+    return tuple(itertools.islice(filter(_is_free, in_any_order), count))
 
 
 def _is_free(port: int) -> bool:

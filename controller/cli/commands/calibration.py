@@ -12,6 +12,7 @@ import typer
 
 from controller.cli import console
 from controller.cli.groups import StageFolder, projector_names, work
+from controller.core.errors import UsageError
 from controller.stage.exchange.formats import FORMATS
 
 if TYPE_CHECKING:
@@ -56,6 +57,9 @@ def calibrate(
     projector: Annotated[
         str | None, typer.Option(help="Recalibrate only this projector.", autocompletion=projector_names)
     ] = None,
+    view: Annotated[
+        str | None, typer.Option(help="Photograph only from this place, and add it to the newest calibration.")
+    ] = None,
     accept_grade: AcceptGrade = False,
 ) -> None:
     """Photograph patterns, and calibrate the stage. Continues an unfinished calibration."""
@@ -66,6 +70,11 @@ def calibrate(
         from controller.stage.sessions.session import OwnSession
 
         session = OwnSession(stage)
+        if view is not None and (quick or projector is not None):
+            raise UsageError(
+                "view-alone", what="--view photographs everything from one place, so nothing can be left out.",
+                remedy="Remove --quick and --projector.",
+            )  # fmt: skip
         if quick or projector is not None:
             return recalibrate(
                 session=session, accept_grade=accept_grade, projector=projector, photographs=patterns.photographs,
@@ -73,7 +82,7 @@ def calibrate(
             )  # fmt: skip
         return calibrate(
             session=session, mode=patterns.mode, dot_spacing=patterns.dot_spacing, photographs=patterns.photographs,
-            accept_grade=accept_grade, reporter=reporter, cancel=cancel,
+            accept_grade=accept_grade, view=view, reporter=reporter, cancel=cancel,
         )  # fmt: skip
 
     work(do, stage=stage)

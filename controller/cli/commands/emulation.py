@@ -30,6 +30,7 @@ def demo(
         str | None, typer.Option(help="painting, relief, statue, or a mesh, .obj or .ply (default: a vase and a bust).")
     ] = None,
     projectors: Annotated[int | None, typer.Option(help="How many projectors (default: 3, painting 2).", min=1)] = None,
+    cameras: Annotated[int, typer.Option(help="How many cameras; from 4 on, all around the object.", min=1, max=8)] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
     room: Annotated[
@@ -43,7 +44,7 @@ def demo(
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.demo import DemoStage, prepare
 
-        stage = prepare(out.resolve(), DemoStage(size, seed, object, room, projectors))
+        stage = prepare(out.resolve(), DemoStage(size, seed, object, room, projectors, cameras))
         if prepare_only:
             from controller.stage.sessions.check import check_stage
 

@@ -24,7 +24,15 @@ from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
-from controller.stage.sessions.open import light_sensor, mains_circuits, open_device, open_projector, rig_of
+from controller.stage.sessions.open import (
+    light_sensor,
+    mains_circuits,
+    open_camera,
+    open_device,
+    open_projector,
+    rig_of,
+    views_opened,
+)
 from hal.deadline import Deadline
 from hal.errors import DeviceGone
 from hal.interfaces import Camera, Device, Display, LightSensor, WatchedCamera
@@ -52,8 +60,13 @@ class Devices:
         self.scene: Callable[[], str | None] = lambda: None
         self._room: str | None = None
         self._dose = LightDose(checked.stage.folder, monotonic=self._world.monotonic)
-        row = DeviceRow("camera", "camera", tables.camera.driver)
-        self.camera = DeviceSupervisor(row, self._open_camera, _look_at_camera, tell, every_s=60.0, world=self._world)
+        drivers = {name: table.driver for name, table in tables.views}
+        self.cameras = {
+            name: DeviceSupervisor(DeviceRow(name, "camera", drivers[name]), partial(self._open_camera, name),
+                                   _look_at_camera, tell, every_s=60.0, world=self._world)
+            for name in views_opened(checked)
+        }  # fmt: skip
+        self.camera = next(iter(self.cameras.values()))
         self.sensor = self._sensor()
 
     def use(self, checked: Checked) -> None:
@@ -63,7 +76,8 @@ class Devices:
     @property
     def others(self) -> tuple[DeviceSupervisor, ...]:
         """The supervisors of all devices that are not projectors."""
-        return tuple(supervisor for supervisor in (self.camera, self.sensor, self.mains) if supervisor is not None)
+        rest = (supervisor for supervisor in (self.sensor, self.mains) if supervisor is not None)
+        return (*self.cameras.values(), *rest)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -117,12 +131,13 @@ class Devices:
     def lent(self) -> Iterator[Rig]:
         """The opened devices for one job. Raises DeviceGone("device-missing") and what opening raises."""
         with contextlib.ExitStack() as stack:
-            for supervisor in (self.camera, *([] if self.sensor is None else [self.sensor])):
+            for supervisor in (*self.cameras.values(), *([] if self.sensor is None else [self.sensor])):
                 # The supervisor's thread must not use the device during the job.
                 stack.enter_context(supervisor.lent)
             # Only with the lock: before that, its supervisor may close it.
-            camera, guards = self.camera.device, [supervisor.guard for supervisor in self.projectors]
-            if camera is None or any(guard is None for guard in guards):
+            cameras = {name: one.device for name, one in self.cameras.items() if one.device is not None}
+            guards = [supervisor.guard for supervisor in self.projectors]
+            if self.camera.device is None or any(guard is None for guard in guards):
                 raise DeviceGone("device-missing", what="A device that the job needs is missing.",
                                  remedy="See the list of devices.")  # fmt: skip
             driver, settings = self._checked.display
@@ -130,9 +145,10 @@ class Devices:
             display = cast("Display", open_device(table, driver, settings, self._context, self._world.deadline(20)))
             stack.callback(display.close)
             held = [guard for guard in guards if guard is not None]
-            rig = rig_of(self._checked.stage, held, cast("Camera", camera), display)
+            rig = rig_of(self._checked.stage, held, cast("dict[str, Camera]", cameras), display)
+            absent = {name: self._absent(name) for name in self.cameras if name not in cameras}
             try:
-                yield replace(rig, ambient_limit=self._ambient_limit())
+                yield replace(rig, ambient_limit=self._ambient_limit(), absent=absent)
             except DeviceGone as error:
                 # The job sees only a closed device; its supervisor knows the reason.
                 lost = any(
@@ -180,9 +196,12 @@ class Devices:
         feeds = [name for table in self._checked.stage.tables.relays for mains in table.mains for name in mains.feeds]
         return self.mains.problem if self.mains is not None and projector in feeds else None
 
-    def _open_camera(self, deadline: Deadline) -> Device:
-        table, (driver, settings) = self._checked.stage.tables.camera, self._checked.camera
-        return cast("Device", open_device(table, driver, settings, self._context, deadline))
+    def _open_camera(self, view: str, deadline: Deadline) -> Device:
+        return open_camera(self._checked, view, self._context, deadline)
+
+    def _absent(self, view: str) -> DeviceGone:
+        problem = self.cameras[view].problem or Notice(NOT_YET, "The camera is not connected yet.", "Wait for it.")
+        return DeviceGone(problem.code, what=problem.what, remedy=problem.remedy)
 
     def _sensor(self) -> DeviceSupervisor | None:
         table = self._checked.stage.tables.light_sensor

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from controller.core.arrays import ByteImage
 from controller.core.errors import WorkError
@@ -46,6 +46,16 @@ class LastShown:
     sequence: int
 
 
+class Turns(Protocol):
+    """The display where several cameras photograph its pictures at the same time."""
+
+    def show(self, frames: Mapping[str, ByteImage], *, deadline: Deadline) -> Presented:
+        """As ``Display.show``, when no other camera needs the picture before any more."""
+
+    def done(self) -> None:
+        """This camera has photographed the picture."""
+
+
 class Acquirer:
     """Takes shots; sets the camera only when the exposure changes, and shows frames only when they change.
 
@@ -54,12 +64,20 @@ class Acquirer:
     settle_s : least seconds between the display's report that frames are presented and the release of the shutter.
         Where the delay of the stage has been measured (``set_delay``), the longer of the two is waited, so that no
         photograph shows the pattern before. None: the measured delay alone
+    turns : instead of ``display``, where other cameras photograph, too
     """
 
     def __init__(
-        self, display: Display, camera: Camera, *, iso: int, aperture_f: float | None, settle_s: float | None
+        self,
+        display: Display,
+        camera: Camera,
+        *,
+        iso: int,
+        aperture_f: float | None,
+        settle_s: float | None,
+        turns: Turns | None = None,
     ) -> None:
-        self._display = display
+        self._display, self._turns = display, turns
         self._camera = camera
         self._iso = iso
         self._aperture_f = aperture_f
@@ -91,6 +109,8 @@ class Acquirer:
 
     def present(self, frames: Mapping[str, ByteImage], *, deadline: Deadline) -> Presented:
         """Show frames; return when they were presented, and their number among all that the display has shown."""
+        if self._turns is not None:
+            return self._turns.show(frames, deadline=deadline)
         return self._display.show(frames, deadline=deadline.within(10.0))
 
     def exposures_s(self) -> tuple[float, ...]:
@@ -142,6 +162,9 @@ class Acquirer:
                 raise
             # The camera did its part: this is no failing device.
             raise WorkError(error.code, what=error.what, remedy=error.remedy) from error
+        finally:
+            if self._turns is not None:
+                self._turns.done()
         if not files:
             raise WorkError(
                 "camera-no-file",

@@ -15,6 +15,7 @@ from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
 from controller.run.step_id import StepId
 from controller.stage.artefacts.names import json_path, read_json, write_json
+from controller.stage.artefacts.views import view_folders
 from hal.notices import Notice
 
 PICTURE: Final = "verification.png"
@@ -103,14 +104,29 @@ def graded(run: Path) -> dict[str, float] | None:
 
 
 def worst_letter(run: Path) -> str:
-    """The grade of the worst projector, "A" being the best."""
-    return max(str(row["grade"]) for row in read_grade_figures(run).values())
+    """The grade of the worst projector in any view, "A" being the best."""
+    figures = [read_grade_figures(folder).values() for folder in view_folders(run).values()]
+    return max(str(row["grade"]) for rows in figures for row in rows)
 
 
 def worst_of(run: Path) -> tuple[str, float] | None:
-    """The projector with the largest error, in per cent; None for a run that was not graded."""
-    figures = graded(run)
-    return max(figures.items(), key=lambda item: math.inf if math.isnan(item[1]) else item[1]) if figures else None
+    """The projector with the largest error in any view, in per cent; None for a run that was not graded."""
+    rows = [_worst_in(folder) for folder in view_folders(run).values()]
+    return max((row for row in rows if row is not None), key=_percent, default=None)
+
+
+def worst_view(run: Path) -> tuple[str, Path]:
+    """The view with the largest error, and its folder; the first one, if none was graded."""
+    rows = {view: _worst_in(view[1]) for view in view_folders(run).items()}
+    return max(rows, key=lambda view: -1.0 if (row := rows[view]) is None else _percent(row))
+
+
+def _worst_in(folder: Path) -> tuple[str, float] | None:
+    return max((graded(folder) or {}).items(), key=_percent, default=None)
+
+
+def _percent(row: tuple[str, float]) -> float:
+    return math.inf if math.isnan(row[1]) else row[1]
 
 
 def write_accepted(run: Path, projector: str, percent: float) -> Path:
@@ -119,7 +135,7 @@ def write_accepted(run: Path, projector: str, percent: float) -> Path:
 
 
 def passes(run: Path, worst_grade: float) -> bool:
-    """Whether a run's calibration may be used: good enough, accepted by a person, or not graded yet."""
+    """Whether a run's calibration may be used: good enough in each view, accepted by a person, or not graded yet."""
     worst = worst_of(run)
     return worst is None or worst[1] <= worst_grade or (run / _ACCEPTED).exists()
 

@@ -56,6 +56,20 @@ def _segment(kept: Float64 | None) -> float:
     return 0.0 if kept is None else float(kept[0])
 
 
+def write_drawn_by(run: Path, projector: str, response: Float64) -> Path:
+    """``drawn-PROJECTOR.npz``: the response (3, 256) that patterns were drawn by, if it is not of this view."""
+    path = npz_path(run, "drawn", projector)
+    save_arrays(path, {"response": response})
+    return path
+
+
+def drawn_by(run: Path, projector: str) -> Float64:
+    """The response (3, 256) by which a projector's sinusoids and random pattern were drawn."""
+    path = npz_path(run, "drawn", projector)
+    response: Float64 = load_arrays(path)["response"] if path.exists() else Light.read(run, projector).response
+    return response
+
+
 @dataclass(frozen=True, slots=True)
 class Pixels:
     """``pixels-PROJECTOR.npz``: correspondences, metapixels and phase map from the sinusoids, in pixels.

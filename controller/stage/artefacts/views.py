@@ -10,10 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from controller.config.models import ONLY_CAMERA
 from controller.stage.artefacts.names import read_json, safe_name, write_json
 
-FIRST: Final = "camera"
-"""The name of a stage's only camera, from its table ``[camera]``."""
 _FOLDER: Final = "views"
 _RECORD: Final = "view.json"
 
@@ -41,7 +40,7 @@ def is_whole(folder: Path) -> bool:
 def first_view(run: Path) -> str:
     """The name of the view that is the run's folder itself."""
     record = run / _RECORD
-    return str(read_json(record)["name"]) if record.is_file() else FIRST
+    return str(read_json(record)["name"]) if record.is_file() else ONLY_CAMERA
 
 
 def view_folders(run: Path) -> Mapping[str, Path]:

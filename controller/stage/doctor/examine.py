@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from controller.config.loader import FILE
+from controller.config.models import ONLY_CAMERA
 from controller.core.errors import UsageError
 from controller.core.storage import exclusive
 from controller.optics.solve.engines import graphics_sentence
@@ -49,7 +50,10 @@ class Device:
     @property
     def title(self) -> str:
         """Its name in stage.toml, or "" for a kind of which a stage has at most one."""
-        return self.name if self.kind in ("projector", "power_switch") else ""
+        is_one_of_many = self.kind in ("projector", "power_switch") or (
+            self.kind == "camera" and self.name != ONLY_CAMERA
+        )
+        return self.name if is_one_of_many else ""
 
     @property
     def place(self) -> str:
@@ -67,7 +71,8 @@ def devices_of(checked: Checked) -> Iterator[Device]:
     for projector, douser in zip(tables.projectors, checked.dousers, strict=True):
         if douser is not None:
             yield Device(f"{projector.name} (douser)", "douser", *douser)
-    yield Device("camera", "camera", *checked.camera)
+    for (name, _), (driver, settings) in zip(tables.views, checked.cameras, strict=True):
+        yield Device(name, "camera", driver, settings)
     if checked.light_sensor is not None:
         yield Device("light sensor", "light_sensor", *checked.light_sensor)
     if checked.key_panel is not None:

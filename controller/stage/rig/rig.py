@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from controller.core.arrays import ByteImage
+from controller.config.models import ONLY_CAMERA
+from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
 from controller.optics.capture.acquire import Acquirer
 from controller.stage.rig.ambient_light import AmbientLightLimit
 from controller.stage.rig.lamp_guard import START_AGAIN, LampGuard, faulty
 from controller.stage.rig.power import Circuit
+from controller.stage.rig.shared_display import Seat
 from hal.deadline import Deadline
-from hal.errors import DeviceRefused
+from hal.errors import CodedError, DeviceRefused
 from hal.interfaces import BundleDisplay, Camera, Display
 from hal.values import Power
 
@@ -39,8 +41,24 @@ class RigProjector:
 
 
 @dataclass(frozen=True, slots=True)
+class RigCamera:
+    """A further camera: the ``name`` of its view, what photographs with it, and its place at the display."""
+
+    name: str
+    camera: Camera
+    acquirer: Acquirer
+    seat: Seat
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
-    """All devices of a run. Created only by ``controller.stage.sessions.open``."""
+    """All devices of a run. Created only by ``controller.stage.sessions.open``.
+
+    ``view``: the name of the view of ``camera``; ``seat``: its place at the display, if there are ``others``
+    ``absent``: cameras that could not be opened, by the names of their views
+    ``drawn_by``: the response by which a projector's patterns are drawn (3, 256), if it is not the view's own; it waits
+    until that is measured, and is None where it can't be
+    """
 
     stage: Path
     projectors: tuple[RigProjector, ...]
@@ -49,6 +67,23 @@ class Rig:
     acquirer: Acquirer
     circuits: tuple[Circuit, ...] = ()
     ambient_limit: AmbientLightLimit | None = None
+    view: str = ONLY_CAMERA
+    seat: Seat | None = None
+    others: tuple[RigCamera, ...] = ()
+    absent: Mapping[str, CodedError] = field(default_factory=dict)
+    drawn_by: Callable[[str, Deadline], Float64 | None] | None = None
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the view of the run's own folder."""
+        return self.drawn_by is None
+
+    def seen_by(self, other: RigCamera) -> Rig:
+        """The same stage with another camera alone; what concerns the room is left to the first one."""
+        return replace(
+            self, view=other.name, camera=other.camera, acquirer=other.acquirer, seat=other.seat, others=(), absent={},
+            ambient_limit=None,
+        )  # fmt: skip
 
     @property
     def guards(self) -> tuple[LampGuard, ...]:

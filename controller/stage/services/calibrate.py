@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from controller.bundle.install import current
+from controller.config.table import is_name
+from controller.core.errors import UsageError
+from controller.core.text import printable
 from controller.optics.solve.engines import choose_engine
 from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
 from controller.run.progress import Reporter
-from controller.run.runner import Runner, Step
+from controller.run.runner import Context, Runner, Step
 from controller.run.state_machine import Event
 from controller.stage.artefacts.calibrated import Calibrated, all_views
 from controller.stage.artefacts.grade import is_graded, passes
 from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named, photographs_sentence
+from controller.stage.artefacts.views import first_view, is_whole, reopen_view, view_folder, view_folders, write_view
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.services.refine import Refinement, refine
 from controller.stage.sessions.calibrations import (
+    finished_calibration,
     finished_calibrations,
     output_sizes,
     signing_key,
@@ -43,7 +50,8 @@ from controller.stage.steps.calibrate.gate import accept, below_grade, compare_w
 from controller.stage.steps.calibrate.grade import verify_step
 from controller.stage.steps.capture.camera import device_checks
 from controller.stage.steps.modes import DotOptions, dot_options
-from hal.deadline import in_seconds
+from hal.deadline import Cancelled, in_seconds
+from hal.errors import DeviceError
 from hal.notices import Level
 
 
@@ -56,8 +64,12 @@ def calibrate(
     dot_spacing: str | None = None,
     photographs: str | None = None,
     accept_grade: bool = False,
+    view: str | None = None,
 ) -> Mapping[str, Any]:
     """Calibrate the stage, or continue an unfinished calibration; returns where the results are.
+
+    ``view``: photograph only from this place, for the newest calibration; a view of this name is replaced once the new
+    one is whole, or completed if it was not. Raises UsageError("view-unknown", "view-is-first", "not-calibrated").
 
     ``mode``, ``dot_spacing`` and their errors: see ``steps.modes.dot_options``. ``photographs``: which set, instead
     of stage.toml's; its error: see ``photographs_named``.
@@ -65,23 +77,83 @@ def calibrate(
     options = dot_options(mode, dot_spacing)
     chosen = None if photographs is None else photographs_named(photographs)
     checked = check_stage(session.stage)
-    prior = checked.prior
+    place = None if view is None else _Place.of(checked, view)
+    for name, _ in checked.stage.tables.views:
+        checked.prior(name)
     last = next(iter(finished_calibrations(checked.stage.folder)), None)
-    taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
-    run = session.run(
-        checked,
-        StageWork(
-            "calibrate",
-            lambda rig, run: calibrating(rig, run, checked=checked, options=options, photographs=taking),
-            dark=True,
-            before=lambda rig: device_checks(rig, prior),
-        ),
-        reporter=reporter,
-        cancel=cancel,
-    )
-    join_geometry(run, checked.names, lambda view: prior, checked.stage.tables.object.shape, reporter)
+    before = {} if last is None else view_folders(last)
+
+    def steps(rig: Rig, folder: Path) -> Sequence[Step]:
+        of = chosen or checked.stage.tables.calibration.photographs
+        taking = PhotographOptions(of, before.get(rig.view))
+        return calibrating(rig, folder, checked=checked, options=options, photographs=taking)
+
+    work = StageWork("calibrate", steps, dark=True, before=partial(_all_checks, checked), views=place is None,
+                     place=None if place is None else (place.view, place.working))  # fmt: skip
+    run = session.run(checked, work, reporter=reporter, cancel=cancel)
+    if place is not None:
+        place.finish()
+        run, last = place.run, None
+    join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
     report_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
+
+
+def _all_checks(checked: Checked, rig: Rig) -> Sequence[Step]:
+    """Of the devices, for the camera of each view. A camera that fails and is not the first ends its view alone."""
+    steps = list(device_checks(rig, checked.prior(rig.view)))
+    for other in rig.others:
+        for step in device_checks(rig.seen_by(other), checked.prior(other.name)):
+            steps.append(replace(step, id=replace(step.id, item=other.name), run=partial(_unless_absent, step.run)))
+    return steps
+
+
+def _unless_absent(run: Callable[[Context], Sequence[Path]], context: Context) -> Sequence[Path]:
+    try:
+        return run(context)
+    except DeviceError as error:
+        if isinstance(error, Cancelled):
+            raise
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A view that is photographed alone. ``working``: where it is until it is whole."""
+
+    run: Path
+    view: str
+    number: int
+    working: Path
+
+    @classmethod
+    def of(cls, checked: Checked, view: str) -> _Place:
+        run = finished_calibration(checked.stage.folder)
+        names, there = [name for name, _ in checked.stage.tables.views], view_folders(run)
+        if view == first_view(run):
+            raise UsageError(
+                "view-is-first",
+                what=f"The view {view} is the one that the calibration {run.name} begins with.",
+                remedy="Run `velatura calibrate` without --view to photograph it again with all others.",
+            )
+        if view not in names and (len(names) > 1 or not is_name(view)):
+            raise UsageError(
+                "view-unknown",
+                what=f"The stage has no camera {printable(view)[:64]!r}.",
+                remedy=f"Choose one of {', '.join(names)}, or add a table [[cameras]] with this name.",
+            )
+        number = names.index(view) if view in names else len(names) + len(there)
+        folder = view_folder(run, view)
+        return cls(run, view, number, folder.with_name(f".{folder.name}.new") if is_whole(folder) else folder)
+
+    def finish(self) -> None:
+        """Put the whole view in its place."""
+        folder = view_folder(self.run, self.view)
+        if self.working != folder:
+            reopen_view(folder)
+            shutil.rmtree(folder)
+            self.working.rename(folder)
+        write_view(folder, self.view, self.number)
 
 
 def calibrating(
@@ -99,16 +171,20 @@ def calibrating(
     ``calibrated``: what reads the calibration of ``run``, where the caller needs it too.
     """
     longest_s = checked.stage.tables.capture.longest_exposure_s
-    keep_outline(run, checked.stage.tables.object.outline)
+    if rig.view == checked.stage.tables.views[0][0]:
+        # It is drawn in the first camera's picture.
+        keep_outline(run, checked.stage.tables.object.outline)
     scale = costs.scale(projector.size_px for projector in rig.projectors)
     taking = photographs or PhotographOptions(checked.stage.tables.calibration.photographs)
     shape = checked.stage.tables.object.shape
-    steps = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking, shape=shape),
+    prior = checked.prior(rig.view)
+    steps = [*calibration_steps(rig, prior, longest_exposure_s=longest_s, options=taking, shape=shape),
              *dot_steps(rig, options or DotOptions(), longest_exposure_s=longest_s)]  # fmt: skip
+    own = calibrated if calibrated is not None and rig.is_first else Calibrated(run, checked.names)
     return [
         marker("calibrating", "Calibrating", enter=Event.RECALIBRATE),
         *steps,
-        verify_step(calibrated or Calibrated(run, checked.names), [step.id for step in steps], scale),
+        verify_step(own, [step.id for step in steps], scale),
         *dark_after(rig.ambient_limit, rig.display),
         marker("calibrated", "Calibrated", leave=Event.CALIBRATED),
     ]

@@ -90,7 +90,8 @@ def recalibrate(
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
         taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
         shape = checked.stage.tables.object.shape
-        full = [*calibration_steps(rig, checked.prior, longest_exposure_s=longest_s, options=taking, shape=shape),
+        prior = checked.prior(rig.view)
+        full = [*calibration_steps(rig, prior, longest_exposure_s=longest_s, options=taking, shape=shape),
                 *dot_steps(rig, DotOptions(mode, None), longest_exposure_s=longest_s)]  # fmt: skip
         if projector is None:
             repeated = quick_steps(rig, run, calibrated, full, longest_exposure_s=longest_s)

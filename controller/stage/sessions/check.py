@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from controller.config import Stage, check_driver_settings, load_stage
-from controller.config.models import CameraTable, OpenConfigTable
+from controller.config.models import OpenConfigTable
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
 from controller.core.files import read_text
@@ -33,7 +33,7 @@ class Checked:
     stage: Stage
     drivers: Drivers
     projectors: tuple[tuple[Driver, dict[str, Any]], ...]
-    camera: tuple[Driver, dict[str, Any]]
+    cameras: tuple[tuple[Driver, dict[str, Any]], ...]
     display: tuple[Driver, dict[str, Any]]
     relays: tuple[tuple[Driver, dict[str, Any]], ...] = ()
     light_sensor: tuple[Driver, dict[str, Any]] | None = None
@@ -41,21 +41,23 @@ class Checked:
     faults: tuple[DriverFault, ...] = ()
     dousers: tuple[tuple[Driver, dict[str, Any]] | None, ...] = ()
 
-    @property
-    def prior(self) -> CameraPrior:
-        """The camera's values from stage.toml and from measurements on the stage.
+    def prior(self, view: str | None = None) -> CameraPrior:
+        """The values of a view's camera from stage.toml and from measurements on the stage; None: of the first view.
 
+        Distances were measured from the places, and in the pictures, of the cameras in stage.toml alone.
         Raises UsageError as ``read_intrinsics``, and "stage-key-missing" without any focal length.
         """
         from controller.optics.calibrate.geometry.intrinsics import read_intrinsics
         from controller.optics.calibrate.geometry.values import CameraPrior, MeasuredDistance
 
-        table: CameraTable = self.stage.tables.camera
-        measured = self.stage.tables.object.distances
+        views = self.stage.tables.views
+        name, table = views[0] if view is None else (view, dict(views).get(view, views[0][1]))
+        measured = self.stage.tables.object.distances if name == views[0][0] else ()
+        distance_m = table.distance_m if name in dict(views) else None
         distances = tuple(MeasuredDistance(d.from_px, d.to_px, d.distance_m, d.sigma_m) for d in measured)
         if table.intrinsics is not None:
             return read_intrinsics(self.stage.path(table.intrinsics)).prior(
-                distance_m=table.distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
+                distance_m=distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
             )
         if table.focal_length_px is None:
             allowed = "a number above 0, or intrinsics with a file from `velatura camera calibrate`"
@@ -63,7 +65,7 @@ class Checked:
         return CameraPrior(
             focal_length_px=table.focal_length_px,
             focal_length_rel_sigma=table.focal_length_rel_sigma,
-            distance_m=table.distance_m,
+            distance_m=distance_m,
             distance_rel_sigma=table.distance_rel_sigma,
             distances=distances,
         )
@@ -110,7 +112,7 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path |
         stage=stage,
         drivers=drivers,
         projectors=tuple(checked("projector", table, table.driver) for table in tables.projectors),
-        camera=checked("camera", tables.camera, tables.camera.driver),
+        cameras=tuple(checked("camera", table, table.driver) for _, table in tables.views),
         display=checked("display", tables.display, tables.display.driver),
         relays=tuple(checked("power_switch", table, table.driver) for table in tables.relays),
         light_sensor=(

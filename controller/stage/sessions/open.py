@@ -21,12 +21,13 @@ from controller.stage.rig.douser import ProjectorWithDouser
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile
 from controller.stage.rig.power import Circuit, close_circuits
-from controller.stage.rig.rig import Rig, RigProjector
+from controller.stage.rig.rig import Rig, RigCamera, RigProjector
+from controller.stage.rig.shared_display import SharedDisplay
 from controller.stage.sessions.check import Checked, mistake_in
 from controller.stage.sessions.run import open_context, used_runtime_folder
 from hal import registry
-from hal.deadline import Deadline, in_seconds
-from hal.errors import DeviceError, PluginError
+from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import CodedError, DeviceError, PluginError
 from hal.interfaces import ButtonPanel, Camera, Device, Display, Douser, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, OpenContext
 
@@ -35,10 +36,11 @@ OPEN_S = 20.0
 
 
 @contextlib.contextmanager
-def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False) -> Iterator[Rig]:
+def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False, only: str | None = None) -> Iterator[Rig]:
     """Open every device of the stage and start the player; on leaving, close the devices and end the player.
 
     ``plays``: the player starts with the installed bundle; the start fails if it shows no picture of it.
+    ``only``: the view of the only camera that is opened. A camera that is not the first may be missing.
 
     Mains relays are closed first. This function switches no relay or lamp off: ``lit`` does that.
     """
@@ -56,16 +58,44 @@ def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False) -> 
             guard = LampGuard(table.name, projector, ledger, at_least=at_least)
             _closed_by(stack, guard)
             guards.append(guard)
-        driver, settings = checked.camera
-        camera = cast("Camera", open_device(stage.tables.camera, driver, settings, context, deadline))
-        _closed_by(stack, camera)
+        cameras = {}
+        absent: dict[str, CodedError] = {}
+        for number, name in enumerate(views_opened(checked, only)):
+            try:
+                cameras[name] = open_camera(checked, name, context, deadline)
+            except DeviceError as error:
+                if isinstance(error, Cancelled) or not number:
+                    raise
+                absent[name] = error
+            else:
+                _closed_by(stack, cameras[name])
         # The player of an installed kiosk is systemd's.
         if checked.stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder):
             stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
         _closed_by(stack, display)
-        yield replace(rig_of(stage, guards, camera, display), circuits=circuits, ambient_limit=ambient_limit)
+        rig = rig_of(stage, guards, cameras, display)
+        yield replace(rig, circuits=circuits, ambient_limit=ambient_limit, absent=absent)
+
+
+def views_opened(checked: Checked, only: str | None = None) -> tuple[str, ...]:
+    """The views whose cameras are opened: all, or ``only`` one. A camera that is carried from place to place is in
+    stage.toml once for each place, and opened for the first.
+
+    A place that is not in stage.toml is photographed by the stage's only camera.
+    """
+    if only is not None:
+        return (only,)
+    views = [name for name, _ in checked.stage.tables.views]
+    return tuple(name for n, name in enumerate(views) if checked.cameras[n] not in checked.cameras[:n])
+
+
+def open_camera(checked: Checked, view: str, context: OpenContext, deadline: Deadline) -> Camera:
+    """The camera of a view. Raises as ``open_device``."""
+    views = checked.stage.tables.views
+    number = next((n for n, (name, _) in enumerate(views) if name == view), 0)
+    return cast("Camera", open_device(views[number][1], *checked.cameras[number], context, deadline))
 
 
 @contextlib.contextmanager
@@ -188,7 +218,8 @@ def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def rig_of(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: Display) -> Rig:
+def rig_of(stage: Stage, guards: Sequence[LampGuard], cameras: Mapping[str, Camera], display: Display) -> Rig:
+    """``cameras``: by the names of their views, at least one; the first is the rig's own."""
     sizes = {
         output.name: (output.width_px, output.height_px) for output in display.outputs(deadline=in_seconds(OPEN_S))
     }
@@ -200,11 +231,18 @@ def rig_of(stage: Stage, guards: Sequence[LampGuard], camera: Camera, display: D
         RigProjector(table.name, table.output, sizes[table.output], guard)
         for table, guard in zip(stage.tables.projectors, guards, strict=True)
     )
-    acquirer = Acquirer(
-        display,
-        camera,
-        iso=stage.tables.camera.iso,
-        aperture_f=stage.tables.camera.aperture_f,
-        settle_s=stage.tables.capture.settle_s,
-    )
-    return Rig(stage.folder, projectors, camera, display, acquirer)
+    tables, shared = dict(stage.tables.views), SharedDisplay(display)
+    found = []
+    for name, camera in cameras.items():
+        seat = shared.seat()
+        own = tables.get(name, stage.tables.views[0][1])
+        acquirer = Acquirer(
+            display, camera, iso=own.iso, aperture_f=own.aperture_f, settle_s=stage.tables.capture.settle_s,
+            turns=seat if len(cameras) > 1 else None,
+        )  # fmt: skip
+        found.append(RigCamera(name, camera, acquirer, seat))
+    first, *others = found
+    return Rig(
+        stage.folder, projectors, first.camera, display, first.acquirer, view=first.name, seat=first.seat,
+        others=tuple(others),
+    )  # fmt: skip

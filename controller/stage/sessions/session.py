@@ -6,9 +6,10 @@ import contextlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from controller.config.models import ONLY_CAMERA
 from controller.core.storage import clear_unfinished_writes
 from controller.run.compiling import kernels_compiled
 from controller.run.journal import Journal
@@ -21,10 +22,8 @@ from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
 from controller.stage.sessions.open import opened_rig
 from controller.stage.sessions.run import LONGEST_RUN_S, stage_lock, unfinished_run
-from hal.deadline import in_seconds
-
-MakeSteps = Callable[[Rig, Path], Sequence[Step]]
-"""The steps of a run on the opened stage; the path is the run's folder."""
+from controller.stage.sessions.views import MakeSteps, OtherViews
+from hal.deadline import Deadline, in_seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +33,11 @@ class StageWork:
     Parameters
     ----------
     name : the run's kind; an unfinished run of this name is continued
-    make_steps : its steps with the lamps on
+    make_steps : its steps with the lamps on, from the devices and the run's folder
     dark : refuse a bright room, if the stage has a light sensor
     plays : as in ``sessions.open.opened_rig``
+    views : the other cameras do the same steps, each in the folder of its view
+    place : the only view that is photographed, and its folder; a view of its own in an earlier run
     before : steps before the lamps are struck, if they are not lit yet
     """
 
@@ -44,6 +45,8 @@ class StageWork:
     make_steps: MakeSteps
     dark: bool = False
     plays: bool = False
+    views: bool = False
+    place: tuple[str, Path] | None = None
     before: Callable[[Rig], Sequence[Step]] = lambda rig: ()
 
 
@@ -91,23 +94,26 @@ class OwnSession(StageSession):
         stage = checked.stage
         deadline = in_seconds(LONGEST_RUN_S, cancel)
         safety = stage.tables.safety
+        only, place = (None, None) if work.place is None else work.place
         with (
             stage_lock(stage.folder),
             kernels_compiled(reporter) as compiled,
             self.around or contextlib.nullcontext(),
-            opened_rig(checked, deadline=deadline, plays=work.plays) as rig,
-            Journal(unfinished_run(stage.folder, work.name, finished=self.again)) as journal,
+            opened_rig(checked, deadline=deadline, plays=work.plays, only=only) as rig,
+            Journal(place or unfinished_run(stage.folder, work.name, finished=self.again)) as journal,
         ):
             clear_unfinished_writes(journal.folder)
             machine = Machine(journal.record_change)
             first = dark_before(rig.ambient_limit) if work.dark else []
-            made = work.make_steps(rig, journal.folder)
-            unsteady = [step for step in made if step.unsteady]
+            made, others = _with_others(rig, work, journal, reporter, deadline)
+            unsteady = [*(step for step in made if step.unsteady), *others.early()]
             power = power_steps(rig, power_up_s=safety.power_up_s, early=[*compiled, *unsteady] if unsteady else ())
             rest = [*(() if unsteady else compiled), *(step for step in made if not step.unsteady)]
             steps = [*first, *work.before(rig), *power, *rest]
             with lit(rig, machine, power_down_s=safety.power_down_s, reporter=reporter):
-                Runner(steps, journal, reporter=reporter, machine=machine).run(work.name, deadline=deadline)
+                runner = Runner(steps, journal, reporter=reporter, machine=machine)
+                with others.ending():
+                    runner.run(work.name, deadline=deadline)
             return journal.folder
 
 
@@ -132,6 +138,20 @@ class BorrowedSession(StageSession):
         with kernels_compiled(reporter) as compiled, Journal(unfinished_run(self.rig.stage, work.name)) as journal:
             clear_unfinished_writes(journal.folder)
             first = dark_before(self.rig.ambient_limit) if work.dark else []
-            steps = [*first, *compiled, *work.make_steps(self.rig, journal.folder)]
-            Runner(steps, journal, reporter=reporter).run(work.name, deadline=in_seconds(LONGEST_RUN_S, cancel))
+            deadline = in_seconds(LONGEST_RUN_S, cancel)
+            made, others = _with_others(self.rig, work, journal, reporter, deadline)
+            steps = [*first, *compiled, *others.early(), *made]
+            with others.ending():
+                Runner(steps, journal, reporter=reporter).run(work.name, deadline=deadline)
             return journal.folder
+
+
+def _with_others(
+    rig: Rig, work: StageWork, journal: Journal, reporter: Reporter, deadline: Deadline
+) -> tuple[list[Step], OtherViews]:
+    """The steps of the run, among them those that start and await its other views."""
+    of = rig if work.views else replace(rig, others=(), absent={})
+    others = OtherViews(of, journal, work.name, work.make_steps, reporter, deadline)
+    steps = list(work.make_steps(of, journal.folder))
+    alone = not of.others and not of.absent and of.view == ONLY_CAMERA
+    return (steps if alone or not work.views else others.around(steps)), others

@@ -12,9 +12,9 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.rig.rig import Rig
+from controller.stage.rig.shared_display import frames_digest
 from controller.stage.steps.appearance.photographing import ShownPicture, take_hdr
 from controller.stage.steps.appearance.solving import device_frames
-from controller.stage.steps.capture.photographs import frames_digest
 from lab.study.subject.dots import read_study_dots
 from lab.study.subject.subject import Dots
 

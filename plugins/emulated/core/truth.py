@@ -6,7 +6,7 @@ A device's own frame is that of its lens: x right, y down, z along the optical a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
@@ -143,6 +143,8 @@ class CameraTruth:
     ``glare``: share of the light that its lens spreads over the whole picture (``effects.flaws.veiled``);
     ``focus_m``: where along its axis it is focused, 0: all is sharp (``effects.depth_of_field``);
     ``bands_nm``: its filters, without which its colours are those of sRGB (``effects.spectra``);
+    ``name``: of its view;
+    ``tint``: the sensitivity of its colours, which it does not know;
     ``picture_s``: a picture takes at least so long from the release to its file, in seconds of the clock.
     """
 
@@ -159,6 +161,8 @@ class CameraTruth:
     focus_m: Annotated[float, Between(0.0, 100.0)] = 0.0
     bands_nm: Annotated[Bands, Between(0.0, 2000.0)] = NO_BANDS
     picture_s: Annotated[float, Between(0.0, 60.0)] = 0.0
+    name: str = "camera"
+    tint: Annotated[Three, Between(0.1, 10.0)] = (1.0, 1.0, 1.0)
 
     @property
     def spectral(self) -> bool:
@@ -332,6 +336,7 @@ class BenchTruth:
     ``surfaces``: of the room round the object; ``engine``: "direct" for light straight from the projectors alone,
     "radiosity" for light between object and surfaces, too, which counts it on so many ``patches``, "mitsuba" for the
     same along so many ``paths`` from each small spot of the picture through a scene of Mitsuba 3.
+    ``more_cameras``: beside ``camera``, photographing from elsewhere.
     """
 
     size: str
@@ -352,6 +357,21 @@ class BenchTruth:
     engine: Annotated[str, OneOf(*ENGINES)] = "direct"
     patches: Annotated[int, Between(10, 20000)] = 2000
     paths: Annotated[int, Between(1, 100000)] = 256
+    more_cameras: tuple[CameraTruth, ...] = ()
+
+    @property
+    def cameras(self) -> tuple[CameraTruth, ...]:
+        """All of them, the first one first."""
+        return (self.camera, *self.more_cameras)
+
+    def seen_by(self, camera: CameraTruth) -> BenchTruth:
+        """The same stage with this camera alone; no two have the same noise."""
+        number = self.cameras.index(camera)
+        return replace(self, camera=camera, more_cameras=(), seed=self.seed + NEXT_CAMERA * number)
+
+
+NEXT_CAMERA: Final = 7919
+"""Added to the seed for each further camera."""
 
 
 def write_truth(stage: Path, truth: BenchTruth) -> None:

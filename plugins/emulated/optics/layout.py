@@ -63,6 +63,7 @@ def arranged(truth: BenchTruth, room: str, thing: StageObject, *, hung: bool = F
         surfaces=truth.surfaces or table_and_wall(thing),
         engine="radiosity",
         camera=dataclasses.replace(truth.camera, glare=0.02),
+        more_cameras=tuple(dataclasses.replace(one, glare=0.02) for one in truth.more_cameras),
         projectors=tuple(
             dataclasses.replace(one, lamp=dataclasses.replace(one.lamp, flicker=0.01, drift=0.02))
             for one in truth.projectors
@@ -113,6 +114,8 @@ PLACES: Final = (
 )
 """Name, degrees to the right of the camera and above it, as seen from the object."""
 DEFAULT: Final = 3
+MOST_CAMERAS: Final = 8
+AROUND: Final = 4
 DRAWN: Final = -1.0
 """Instead of a blur: it is drawn, as lenses differ."""
 LUX_OF_LIGHT: Final = 9000.0
@@ -155,12 +158,21 @@ class Stands:
     ``count`` of them.
 
 
-    ``count`` None: as many as stages of the size have
+    ``count`` None: as many as stages of the size have; ``cameras``: how many; from ``AROUND`` on, all devices stand
+    all around
     """
 
     count: int | None = None
     placed: tuple[Stand, ...] = ()
     names: tuple[str, ...] = ()
+    cameras: int = 1
+
+    @property
+    def camera_degrees(self) -> tuple[float, ...]:
+        """How far to the right each camera stands: before the object, or four and more all around it."""
+        if self.cameras >= AROUND:
+            return tuple(360.0 * n / self.cameras for n in range(self.cameras))
+        return ((0.0,), (-30.0, 30.0), (-40.0, 0.0, 40.0))[self.cameras - 1]
 
     def places(self, usual: int) -> Sequence[tuple[str, float, float]]:
         """Name and two angles of each; ``usual``: how many stages of the size have."""
@@ -169,7 +181,10 @@ class Stands:
         if self.names:
             by_name = {place[0]: place for place in PLACES}
             return [by_name[name] for name in self.names]
-        return PLACES[: usual if self.count is None else self.count]
+        found = PLACES[: usual if self.count is None else self.count]
+        if self.cameras < AROUND:
+            return found
+        return [(name, 360.0 * (n + 0.5) / len(found), above) for n, (name, _, above) in enumerate(found)]
 
     def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
         """``projector`` (of this index) at its given position; unchanged where none was given."""
@@ -199,6 +214,7 @@ CHOICES: Final = {"object": tuple(BUILT_IN), "room": ROOMS, "engine": ENGINES}
 SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
     f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
+    "cameras": f"how many cameras there are, a whole number from 1 to {MOST_CAMERAS}; if omitted: 1",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens, pupil_m and sharpest_px; without the last, it is drawn at random",
     "object": f"one of {', '.join(BUILT_IN)}; if omitted: a mesh (`velatura demo --object FILE`), or a vase and a bust",
@@ -217,6 +233,13 @@ def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
 
     Raises PluginError("setting-wrong"), DeviceError as ``tables.load``.
     """
+    cameras = settings.get("cameras", 1)
+    if isinstance(cameras, bool) or not isinstance(cameras, int) or not 1 <= cameras <= MOST_CAMERAS:
+        raise _wrong("cameras", cameras)
+    return dataclasses.replace(_projectors(settings, folder), cameras=cameras)
+
+
+def _projectors(settings: Mapping[str, Any], folder: Path) -> Stands:
     count, file = settings.get("projectors"), settings.get("stands")
     if isinstance(count, list | tuple):
         names = [place[0] for place in PLACES]

@@ -81,14 +81,21 @@ def random_truth(
     seed: int,
     stage_object: StageObject,
     kept: ObjectTruth,
-    ports: tuple[int, int],
+    ports: tuple[int, ...],
     stands: Stands | None = None,
 ) -> BenchTruth:
     """A plausible stage round ``stage_object``; the same arguments give the same stage."""
     sizes, rng = size_named(size), np.random.default_rng(seed)
     points = stage_object.vertices[:: max(1, len(stage_object.vertices) // 6000)].astype(np.float64)
-    camera = _camera(sizes, rng, points, ports)
     stands = stands or Stands()
+    degrees = stands.camera_degrees
+    camera = _camera(sizes, rng, points, ports[:2], degrees[0])
+    others = []
+    for n, right in enumerate(degrees[1:], start=1):
+        own = np.random.default_rng([seed, 30 + n])
+        others.append(_differing(_camera(sizes, own, points, ports[2 * n : 2 * n + 2], right), n, own))
+    if others:
+        camera = dataclasses.replace(camera, name=CAMERA_NAME.format(1))
     aims = [points]
     if stage_object.paint != VASE_AND_BUST and len(stage_object.parts) > 1:
         parts = np.split(stage_object.faces, stage_object.parts[1:])
@@ -109,6 +116,7 @@ def random_truth(
         object=kept,
         camera=camera,
         projectors=projectors,
+        more_cameras=tuple(others),
     )
 
 
@@ -128,6 +136,13 @@ def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any
 
     ``distance_m`` is from the camera to the nearest point of ``stage_object``, which nothing can hide.
     """
+    if truth.more_cameras:
+        rows = []
+        for n, camera in enumerate(truth.cameras):
+            table = device_tables(truth.seen_by(camera), stage_object)["camera"]
+            rows.append({"name": camera.name, **table, "intrinsics": intrinsics_name(n)})
+        first = device_tables(truth.seen_by(truth.camera), stage_object)
+        return {key: value for key, value in first.items() if key != "camera"} | {"cameras": rows}
     rng = np.random.default_rng([truth.seed, 1])
     camera = truth.camera
     distance = float(np.linalg.norm(stage_object.vertices - np.asarray(camera.pose.position_m), axis=1).min())
@@ -155,6 +170,11 @@ def device_tables(truth: BenchTruth, stage_object: StageObject) -> dict[str, Any
     }
 
 
+def intrinsics_name(number: int) -> str:
+    """The file of the lens of a camera of this number, from 0."""
+    return INTRINSICS if not number else INTRINSICS.replace(".", f"-{number + 1}.")
+
+
 def intrinsics_of(truth: BenchTruth) -> str:
     """The file that a ChArUco session with this camera would have left: the truth, off by a session's errors."""
     rng = np.random.default_rng([truth.seed, 3])
@@ -179,12 +199,28 @@ def intrinsics_of(truth: BenchTruth) -> str:
     )
 
 
-def _camera(sizes: Size, rng: np.random.Generator, points: Floats, ports: tuple[int, int]) -> CameraTruth:
+CAMERA_NAME: Final = "view-{}"
+
+
+def _differing(camera: CameraTruth, n: int, rng: np.random.Generator) -> CameraTruth:
+    """Another body: more or less noise, light and colour than the first one's."""
+    sensor = camera.sensor
+    sensor = dataclasses.replace(
+        sensor,
+        electrons_per_light_s=sensor.electrons_per_light_s * float(rng.uniform(0.85, 1.15)),
+        read_noise_e=sensor.read_noise_e * float(rng.uniform(0.8, 1.3)),
+    )
+    tint = three(np.array([rng.uniform(0.96, 1.04), 1.0, rng.uniform(0.96, 1.04)]))
+    return dataclasses.replace(camera, sensor=sensor, tint=tint, name=CAMERA_NAME.format(n + 1))
+
+
+def _camera(sizes: Size, rng: np.random.Generator, points: Floats, ports: tuple[int, ...], right: float) -> CameraTruth:
     width, height = sizes.camera_px
     centre = (0.5 * (width - 1) + rng.normal(0.0, 0.004) * width, 0.5 * (height - 1) + rng.normal(0.0, 0.004) * width)
     distortion = (float(rng.uniform(-0.06, -0.02)), float(rng.uniform(0.0, 0.01)))
     lens = Lens((width, height), 1.0, (float(centre[0]), float(centre[1])), distortion)
-    position = _place(float(rng.uniform(-2.0, 2.0)), float(rng.uniform(7.0, 10.0)), float(rng.uniform(1.08, 1.16)))
+    right += float(rng.uniform(-2.0, 2.0))
+    position = _place(right, float(rng.uniform(7.0, 10.0)), float(rng.uniform(1.08, 1.16)))
     pose, lens = _aimed(position, lens, points, CAMERA_FILL, rng, middle=(0.5, 0.5))
     return CameraTruth(
         pose=pose,

@@ -148,7 +148,7 @@ class World:
     def _files(self, light: npt.NDArray[np.float32], settings: ShotSettings, taken: str) -> ShotFiles:
         camera = self._truth.camera
         raw = mosaic(
-            light,
+            light if camera.tint == (1.0, 1.0, 1.0) else light * np.asarray(camera.tint, np.float32),
             camera.sensor,
             self._rng,
             exposure_s=exposed_s(camera, self._truth.seed, settings.exposure_s),

@@ -69,7 +69,8 @@ def swapped(old: str, new: str) -> str:
 def test_a_right_stage_is_read_with_defaults(tmp_path: Path) -> None:
     stage = load(tmp_path)
     assert [projector.output for projector in stage.tables.projectors] == ["P1", "P2"]
-    assert stage.tables.camera.focal_length_px == 5200.0
+    ((view, camera),) = stage.tables.views
+    assert (view, camera.focal_length_px) == ("camera", 5200.0)
     assert stage.tables.bundle.allow_unsigned is False
     assert stage.tables.capture.longest_exposure_s > 0
     assert stage.path("run/tty-left") == tmp_path / "run" / "tty-left"
@@ -81,6 +82,8 @@ ONE_OUTPUT_TABLE = ONE_OUTPUT.replace("[[display.outputs]]", "[display.outputs]"
 CAMERA_IS_A_NUMBER = "camera = 3\n" + STAGE[: STAGE.index("[camera]")] + STAGE[STAGE.index("[display]") :]
 SHORT_POINT = "[object]\ndistances = [{from_px = [1.0], to_px = [1, 2], distance_m = 1}]\n"
 BAD_APPEARANCE = '[[appearances]]\nname = "../x"\nkind = "k"\n'
+
+CAMERA_KEYS = STAGE[STAGE.index("[camera]\n") + 9 : STAGE.index("[display]")].strip() + "\n"
 
 WRONG = {
     "text for a number": (swapped("iso = 100", 'iso = "fast"'), "stage-key-type", 19, "iso", "whole number from 25"),
@@ -121,6 +124,35 @@ WRONG = {
         "not used twice",
     ),
     "output that is not there": (swapped('output = "P2"', 'output = "P3"'), "stage-key-value", 13, "P3", "P1, P2"),
+    "no camera": (swapped("[camera]", "[[relays]]"), "stage-key-missing", 17, "name", "relay board"),
+    "one camera and several": (
+        STAGE + f"[[cameras]]\nname = 'a'\n{CAMERA_KEYS}",
+        "stage-key-value",
+        17,
+        "can't stand beside [[cameras]]",
+        "Write [[cameras]] and a name",
+    ),
+    "several cameras without names": (
+        swapped("[camera]", "[[cameras]]"),
+        "stage-key-missing",
+        17,
+        "name",
+        "different for every camera",
+    ),
+    "two cameras of one name": (
+        swapped("[camera]", f"[[cameras]]\nname = 'a'\n{CAMERA_KEYS}[[cameras]]\nname = 'a'"),
+        "stage-key-value",
+        24,
+        "already used in line 18",
+        "different",
+    ),
+    "nine cameras": (
+        swapped("[camera]", "".join(f"[[cameras]]\nname = 'a{n}'\n{CAMERA_KEYS}" for n in range(8)) + "[[cameras]]"),
+        "stage-key-value",
+        17,
+        "cameras",
+        "1 to 8",
+    ),
     "more projectors than outputs": (ONE_OUTPUT, "stage-key-value", 13, "2 projectors and 1 outputs", "P1"),
 }
 

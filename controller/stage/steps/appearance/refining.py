@@ -48,10 +48,10 @@ from controller.stage.artefacts.solved import (
     write_refined,
 )
 from controller.stage.rig.rig import Rig
+from controller.stage.rig.shared_display import frames_digest
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.photographing import brightest, speeds, take_bracket
 from controller.stage.steps.appearance.solving import device_frames
-from controller.stage.steps.capture.photographs import frames_digest
 from hal.notices import Level
 from hal.runtime.compute import free_bytes
 

@@ -20,8 +20,10 @@ from controller.stage.artefacts.grade import (
     read_grade_figures,
     worst_letter,
     worst_of,
+    worst_view,
     write_accepted,
 )
+from controller.stage.artefacts.views import view_folders
 from hal.notices import Level
 
 WORSE: Final = 1.25
@@ -30,9 +32,13 @@ WORSE: Final = 1.25
 
 def grade_figures(folder: Path) -> dict[str, str]:
     """For a command's result: the grade, each projector's error, and the error map."""
-    figures = graded(folder) or {}
-    text = ", ".join(f"{name} {percent:.2f} %" for name, percent in figures.items())
-    return {"grade": worst_letter(folder), "error": text, "map": str(folder / PICTURE)} if figures else {}
+    views = {name: figures for name, view in view_folders(folder).items() if (figures := graded(view))}
+    texts = {
+        name: ", ".join(f"{projector} {percent:.2f} %" for projector, percent in figures.items())
+        for name, figures in views.items()
+    }
+    text = "; ".join(texts.values() if len(texts) == 1 else [f"view {name}: {one}" for name, one in texts.items()])
+    return {"grade": worst_letter(folder), "error": text, "map": str(worst_view(folder)[1] / PICTURE)} if views else {}
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
@@ -51,13 +57,15 @@ def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:
 def below_grade(folder: Path, worst_grade: float) -> CalibrationError:
     """The error for a calibration below the limit."""
     name, percent = worst_of(folder) or ("", float("nan"))
-    reasons = read_grade_figures(folder)[name].get("reasons", [])
+    view, of_view = worst_view(folder)
+    reasons = read_grade_figures(of_view)[name].get("reasons", [])
+    seen = f" in view {view}" if len(view_folders(folder)) > 1 else ""
     because = f" {reasons[0]['sentence']}" if reasons else ""
     return CalibrationError(
         "calibration-below-grade",
         what=f"The calibration {folder.name} is not good enough to be published: projector {name} is predicted with "
-        f"{percent:.1f} % error, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
-        remedy=f"Check {folder / PICTURE}, correct the cause and calibrate again. To publish it anyway, use "
+        f"{percent:.1f} % error{seen}, and {worst_grade:g} % is the limit (worst_grade under [calibration]).{because}",
+        remedy=f"Check {of_view / PICTURE}, correct the cause and calibrate again. To publish it anyway, use "
         "--accept-grade.",
     )
 

@@ -37,7 +37,7 @@ from controller.stage.artefacts.geometry import known_geometry
 from controller.stage.artefacts.grade import ErrorMaps, in_rows, write_grade
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of, noise_of
-from controller.stage.artefacts.projectors import IndirectFigures, Light
+from controller.stage.artefacts.projectors import IndirectFigures, drawn_by
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.solving import random_pattern
@@ -143,7 +143,7 @@ def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: 
     again = VERIFICATION.index(folder).exists()
     if part.radiometry.segment == 0 and (part.indirect is None or again):
         return meant
-    response = part.radiometry.response if again else Light.read(folder, part.name).response
+    response = part.radiometry.response if again else drawn_by(folder, part.name)
     return to_light(device_frame(pattern, size_px, response), part.radiometry)
 
 

@@ -27,7 +27,7 @@ from controller.stage.artefacts.calibration import read_captures
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.pattern_plans import PlanUsed
 from controller.stage.artefacts.photographs import Developed, noise_of
-from controller.stage.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels
+from controller.stage.artefacts.projectors import Indirect, IndirectFigures, Light, Pixels, drawn_by
 from controller.stage.rig.rig import RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.troubles import tell
@@ -65,7 +65,7 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     phase_map = pixels.phase_map
     waves: tuple[Wave, ...] = ()
     if phase_map is not None:
-        waves = coarse_waves(captures, plan, light.white, phase_map, pixels.seen, light.response)
+        waves = coarse_waves(captures, plan, light.white, phase_map, pixels.seen, drawn_by(folder, name))
     sinusoids = SinusoidLight(seen, waves, pixels.projector_px, pixels.surface_spread)
     tiles = TilePhotographs(captures, plan, code)
     share, radiometry, report = tell_direct_light(tiles, sinusoids, white, light.radiometry, advance=context.advance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -219,7 +220,8 @@ def _measure_delay(rig: Rig, longest_s: float, context: Context) -> Sequence[Pat
         file.path.unlink()
         return image
 
-    found = measure_latency(look)
+    with contextlib.nullcontext() if rig.seat is None else rig.seat.only(context.deadline):
+        found = measure_latency(look)
     rig.check_light(deadline=context.deadline, stable=False)
     path = Delay(found.wait_s, found.delay_s, found.tries, exposure_s).write(context.folder)
     rig.acquirer.set_delay(found.wait_s)

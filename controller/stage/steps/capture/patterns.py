@@ -15,7 +15,7 @@ from controller.stage.artefacts.camera import Delay, Exposures
 from controller.stage.artefacts.kinds import StepKind, white_of
 from controller.stage.artefacts.pattern_plans import PhotographOptions
 from controller.stage.artefacts.photographs import BLACK, codes_of
-from controller.stage.artefacts.projectors import Light
+from controller.stage.artefacts.projectors import Light, write_drawn_by
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.capture.camera import delay_step, response_steps
@@ -160,10 +160,15 @@ def _photograph_black(rig: Rig, context: Context, longest_s: float) -> Sequence[
 
 
 def _photograph_codes(rig: Rig, projector: RigProjector, coded: Sequence[Pattern], context: Context) -> Sequence[Path]:
-    response = Light.read(context.folder, projector.name).response
+    paths: list[Path] = []
+    response = None if rig.drawn_by is None else rig.drawn_by(projector.name, context.deadline)
+    if response is None:
+        response = Light.read(context.folder, projector.name).response
+    else:
+        paths.append(write_drawn_by(context.folder, projector.name, response))
     base_s = Exposures.read(context.folder)[projector.name].base_s
     planned = [planned_pattern(projector, pattern, base_s, response) for pattern in coded]
-    return take_all(rig, context, planned, into=codes_of(projector.name))
+    return [*take_all(rig, context, planned, into=codes_of(projector.name)), *paths]
 
 
 def _patterns(plan: PatternPlan) -> str:

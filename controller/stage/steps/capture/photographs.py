@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from controller.core.arrays import ByteImage
 from controller.optics.capture.acquire import LastShown, Shot
@@ -29,6 +26,7 @@ from controller.stage.artefacts.photographs import (
     write_exposure,
 )
 from controller.stage.rig.rig import Rig
+from controller.stage.rig.shared_display import frames_digest
 from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceError
 from hal.interfaces import Camera, WatchedCamera
@@ -217,15 +215,6 @@ def _journalled(
     write_exposure(path, exposure_s)
     artefact = context.journal.record_shot(identity, settings, path)
     return replace(_taken(identity, artefact.path, exposure_s), fresh=True)
-
-
-def frames_digest(frames: Mapping[str, ByteImage]) -> str:
-    """Identifies 8-bit frames by output or projector name, for the journal; hexadecimal."""
-    digest = hashlib.sha256()
-    for output in sorted(frames):
-        digest.update(f"{output} {frames[output].shape} ".encode())
-        digest.update(np.ascontiguousarray(frames[output]).tobytes())
-    return digest.hexdigest()
 
 
 EVERY_S: Final = 60.0

@@ -229,7 +229,7 @@ def test_a_first_stage_is_written_from_what_is_plugged_in(hall: Hall) -> None:
     assert seen.written
     tables = load_stage(hall.folder).tables
     assert [one.output for one in tables.projectors] == ["DP-1"]
-    assert tables.camera.driver == "model"
+    assert tables.views[0][1].driver == "model"
     (hall.folder / "stage.toml").unlink()
     hall.others = []
     with pytest.raises(UsageError) as caught:
