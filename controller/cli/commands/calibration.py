@@ -68,6 +68,7 @@ def calibrate(
         from controller.stage.services.calibrate import calibrate
         from controller.stage.services.recalibrate import recalibrate
         from controller.stage.sessions.session import OwnSession
+        from controller.stage.steps.modes import dot_options
 
         session = OwnSession(stage)
         if view is not None and (quick or projector is not None):
@@ -81,7 +82,7 @@ def calibrate(
                 reporter=reporter, cancel=cancel,
             )  # fmt: skip
         return calibrate(
-            session=session, mode=patterns.mode, dot_spacing=patterns.dot_spacing, photographs=patterns.photographs,
+            session=session, dots=dot_options(patterns.mode, patterns.dot_spacing), photographs=patterns.photographs,
             accept_grade=accept_grade, view=view, reporter=reporter, cancel=cancel,
         )  # fmt: skip
 

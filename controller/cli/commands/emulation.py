@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,15 +23,22 @@ if TYPE_CHECKING:
     from controller.run.progress import Reporter
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceChoice:
+    """How many devices an emulated stage has."""
+
+    projectors: Annotated[int | None, typer.Option(help="How many projectors (default: 3, painting 2).", min=1)] = None
+    cameras: Annotated[int, typer.Option(help="How many cameras; from 4, all around the object.", min=1, max=8)] = 1
+
+
 def demo(
+    devices: DeviceChoice,
     size: Annotated[
         Literal["small", "medium", "paper", "uhd"], typer.Option(help="Size of projectors and camera.")
     ] = "small",
     object: Annotated[  # noqa: A002 - the option's name is fixed
         str | None, typer.Option(help="painting, relief, statue, or a mesh, .obj or .ply (default: a vase and a bust).")
     ] = None,
-    projectors: Annotated[int | None, typer.Option(help="How many projectors (default: 3, painting 2).", min=1)] = None,
-    cameras: Annotated[int, typer.Option(help="How many cameras; from 4 on, all around the object.", min=1, max=8)] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the stage and the report.")] = Path("demo"),
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
     room: Annotated[
@@ -44,7 +52,7 @@ def demo(
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.demo import DemoStage, prepare
 
-        stage = prepare(out.resolve(), DemoStage(size, seed, object, room, projectors, cameras))
+        stage = prepare(out.resolve(), DemoStage(size, seed, object, room, devices.projectors, devices.cameras))
         if prepare_only:
             from controller.stage.sessions.check import check_stage
 

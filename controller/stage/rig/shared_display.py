@@ -19,7 +19,7 @@ from hal.values import Presented
 SHOW_S: Final = 10.0
 """Longest time in which the display presents a picture."""
 PATIENCE_S: Final = 30.0
-"""So long the others wait for a view that calculates. Later, they go on, and the pictures are shown again for it."""
+"""So long the others wait for a view that calculates. Later, they continue, and the pictures are shown again for it."""
 _JOINED: Final = -(10**9)
 """Numbers of pictures that several views share begin here, so that they never follow one of the display's own."""
 

@@ -49,7 +49,7 @@ from controller.stage.steps.calibrate.full import calibration_steps, join_geomet
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
 from controller.stage.steps.calibrate.grade import verify_step
 from controller.stage.steps.capture.camera import device_checks
-from controller.stage.steps.modes import DotOptions, dot_options
+from controller.stage.steps.modes import DotOptions
 from hal.deadline import Cancelled, in_seconds
 from hal.errors import DeviceError
 from hal.notices import Level
@@ -60,8 +60,7 @@ def calibrate(
     session: StageSession,
     reporter: Reporter,
     cancel: threading.Event,
-    mode: str = "fast",
-    dot_spacing: str | None = None,
+    dots: DotOptions | None = None,
     photographs: str | None = None,
     accept_grade: bool = False,
     view: str | None = None,
@@ -71,10 +70,8 @@ def calibrate(
     ``view``: photograph only from this place, for the newest calibration; a view of this name is replaced once the new
     one is whole, or completed if it was not. Raises UsageError("view-unknown", "view-is-first", "not-calibrated").
 
-    ``mode``, ``dot_spacing`` and their errors: see ``steps.modes.dot_options``. ``photographs``: which set, instead
-    of stage.toml's; its error: see ``photographs_named``.
+    ``photographs``: which set, instead of stage.toml's; its error: see ``photographs_named``.
     """
-    options = dot_options(mode, dot_spacing)
     chosen = None if photographs is None else photographs_named(photographs)
     checked = check_stage(session.stage)
     place = None if view is None else _Place.of(checked, view)
@@ -86,7 +83,7 @@ def calibrate(
     def steps(rig: Rig, folder: Path) -> Sequence[Step]:
         of = chosen or checked.stage.tables.calibration.photographs
         taking = PhotographOptions(of, before.get(rig.view))
-        return calibrating(rig, folder, checked=checked, options=options, photographs=taking)
+        return calibrating(rig, folder, checked=checked, options=dots, photographs=taking)
 
     work = StageWork("calibrate", steps, dark=True, before=partial(_all_checks, checked), views=place is None,
                      place=None if place is None else (place.view, place.working))  # fmt: skip

@@ -121,7 +121,7 @@ class OtherViews:
         return ()
 
     def _measure_early(self, view: _View, context: Context) -> Sequence[Path]:
-        """A fault is told when the view itself begins: it meets it again, or not."""
+        """A fault is reported by the view itself, which meets it again or not."""
         with contextlib.suppress(DeviceError, WorkError, CalibrationError):
             view.run(self._name, view.unsteady, context.deadline, Silent())
         context.check()
@@ -137,7 +137,7 @@ class OtherViews:
             pass
         except CodedError as error:
             self._lose(name, error)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the other views go on
+        except Exception as error:  # noqa: BLE001 - whatever it is, the other views continue
             self._lose(name, WorkError("view-failed", what=f"{type(error).__name__}: {error}.",
                                        remedy="Report this fault."))  # fmt: skip
         finally:
@@ -145,7 +145,7 @@ class OtherViews:
 
     def _lose(self, name: str, error: CodedError) -> None:
         text = (
-            f"View {name} is not whole: {error.what} {error.remedy} The other views go on. Then run "
+            f"View {name} is not whole: {error.what} {error.remedy} The other views continue. Then run "
             f"`velatura calibrate STAGE --view {name}` to complete it."
         )
         self._reporter.say(text, Level.WARNING)

@@ -28,6 +28,7 @@ from controller.stage.sessions.bench import BenchProcess
 from controller.stage.sessions.check import check_stage
 from controller.stage.sessions.session import OwnSession
 from controller.stage.steps.appearance.solving import random_pattern
+from controller.stage.steps.modes import dot_options
 from lab.timings import Row, at_most, peak_bytes
 from lab.timings.tools.judge import metapixel_errors, relative, rms
 from lab.timings.tools.stage import FIRST_SEED, over, prepared_stage
@@ -74,8 +75,7 @@ def _calibrated(stage: Path, mode: str, spacing: str | None) -> Path:
             session=OwnSession(stage),
             reporter=Silent(),
             cancel=cancel,
-            mode=mode,
-            dot_spacing=spacing,
+            dots=dot_options(mode, spacing),
             accept_grade=True,
         )
     return Path(str(done["run"]))
