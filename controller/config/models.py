@@ -158,6 +158,28 @@ class OutputTable(ConfigTable):
         description='the connector ("HDMI-1") or the serial number of its display; if omitted: the name is one of '
         "these",
     )
+    left_top_px: Annotated[tuple[int, int], Field(strict=False)] | None = Field(
+        default=None,
+        description="[x, y] of its upper left corner in the picture of its connector, where a splitter divides that "
+        "among several projectors; if omitted: the output is the whole connector",
+    )
+    host: str = Field(
+        default="",
+        pattern=r"^([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.local)?)?$",
+        description='the computer that it is on, by the name with which that joined ("left" or "left.local"); if '
+        "omitted: this one",
+    )
+    screen: str = Field(
+        default="",
+        pattern=r"^(:[0-9]{1,5}(\.[0-9]{1,5})?)?$",
+        description='the X screen that it is on (":0.1"); if omitted: the first one',
+    )
+
+    @property
+    def elsewhere(self) -> str:
+        """Its computer and X screen as a player's option names them, "" for this computer's first screen."""
+        host = self.host.removesuffix(".local")
+        return f"{host}/{self.screen}" if self.screen else host
 
 
 class DisplayTable(OpenConfigTable):
@@ -167,6 +189,14 @@ class DisplayTable(OpenConfigTable):
     )
     outputs: Annotated[tuple[OutputTable, ...], Field(strict=False)] = Field(
         default=(), description="a list of [[display.outputs]] tables with name, width_px and height_px"
+    )
+    alone_s: float = Field(
+        default=3600.0, gt=0, le=604_800,
+        description="seconds for which the players of several computers or screens continue while they hear nothing of "
+        "this one, above 0, at most 604800",
+    )  # fmt: skip
+    alone: Literal["on", "black", "still"] = Field(
+        default="on", description='what they do then: "on" (they play on), "black" or "still"'
     )
 
 

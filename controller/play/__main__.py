@@ -25,7 +25,11 @@ from controller.play.loop import Player
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the player until it gets a quit request; the exit code is 0, 1 (failed) or 2 (wrong use)."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
+    if options.host:
+        # Of several screens or computers. It has its own players, and so this process becomes it.
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        os.execv(sys.executable, [sys.executable, "-m", "controller.stage.hosts.conductor", *given])  # noqa: S606
     try:
         return _run(options)
     except VelaturaError as error:
@@ -33,35 +37,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(
         prog="python -m controller.play",
         description="Velatura's player. @FILE stands for the arguments in a file, one a line.",
         fromfile_prefix_chars="@",
     )
-    parser.add_argument("--socket", type=Path, required=True, help="unix socket to serve; made with mode 0600")
-    parser.add_argument("--outputs", required=True, help="NAME:WIDTHxHEIGHT of each output, with commas between")
-    where = parser.add_mutually_exclusive_group(required=True)
+    made.add_argument("--socket", type=Path, required=True, help="unix socket to serve; made with mode 0600")
+    made.add_argument("--outputs", required=True, help="NAME:WIDTHxHEIGHT of each output, with commas between")
+    where = made.add_mutually_exclusive_group(required=True)
     where.add_argument("--frames", type=Path, help="file for the shown frames (machines without projectors)")
     where.add_argument("--windows", action="store_true", help="show in one window over all outputs")
-    parser.add_argument("--where", action="append", default=[], metavar="NAME=OUTPUT",
+    made.add_argument("--where", action="append", default=[], metavar="NAME=OUTPUT",
                         help="connector or display serial number of an output, if that is not its name")  # fmt: skip
-    parser.add_argument("--bundle", type=Path, help="bundle to load; in a stage, bundles/current is the fallback")
-    parser.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
-    parser.add_argument(
+    made.add_argument("--bundle", type=Path, help="bundle to load; in a stage, bundles/current is the fallback")
+    made.add_argument("--trusted", type=Path, action="append", default=[], help="public key file; may be repeated")
+    made.add_argument(
         "--revoked", type=Path, action="append", default=[], help="public key that must not be trusted any more"
     )
-    parser.add_argument("--allow-unsigned", action="store_true", help="also play bundles without a signature")
-    parser.add_argument(
+    made.add_argument("--allow-unsigned", action="store_true", help="also play bundles without a signature")
+    made.add_argument(
         "--resume",
         action="store_true",
         help="file with the last request; the player resumes it after a crash or restart",
     )
-    parser.add_argument(
-        "--suggested", action="store_true", help="start with the bundle's playlist, or as --resume says"
+    made.add_argument("--suggested", action="store_true", help="start with the bundle's playlist, or as --resume says")
+    made.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
+    made.add_argument("--part", action="store_true", help="also play bundles that have more outputs than these")
+    made.add_argument(
+        "--host",
+        action="append",
+        default=[],
+        metavar="NAME=COMPUTER/SCREEN",
+        help="where an output is, if not on this computer's screen",
     )
-    parser.add_argument("--rate", type=float, default=60.0, help="pictures change at multiples of 1/RATE seconds")
-    return parser
+    made.add_argument("--keys", type=Path, help="folder of the authority that other computers belong to")
+    made.add_argument("--port", type=int, default=7449, help="TCP port for them")
+    made.add_argument(
+        "--alone",
+        default="3600,on",
+        metavar="SECONDS,RULE",
+        help="how long players continue without the conductor; then on, black or still",
+    )
+    return made
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -85,7 +103,7 @@ def _run(options: argparse.Namespace) -> int:
             options.bundle = None  # Nothing is installed yet, for this version: a kiosk starts all the same.
         start = _counted_start(options.bundle)
         count: dict[str, Any] = {} if start is None else {"on_appearance": start.shown, "on_asked": start.asked}
-        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, **count)
+        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, part=options.part, **count)
         if options.bundle is not None:
             player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)

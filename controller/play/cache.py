@@ -25,11 +25,13 @@ def decode_threads() -> int:
     return min(_MOST_THREADS, max(2, len(os.sched_getaffinity(0))))
 
 
-def check_fits(bundle: Bundle, outputs: Sequence[OutputSize]) -> None:
-    """Raise BundleError("bundle-outputs-differ") unless the bundle was made for exactly these outputs."""
-    made_for = ", ".join(f"{o.name} {o.width_px}x{o.height_px}" for o in bundle.index.outputs)
-    ours = ", ".join(f"{o.name} {o.width_px}x{o.height_px}" for o in outputs)
-    if made_for != ours:
+def check_fits(bundle: Bundle, outputs: Sequence[OutputSize], *, part: bool = False) -> None:
+    """Raise BundleError("bundle-outputs-differ") unless the bundle was made for exactly these outputs, or these are a
+    ``part`` of them.
+    """
+    theirs, own = ([f"{o.name} {o.width_px}x{o.height_px}" for o in sizes] for sizes in (bundle.index.outputs, outputs))
+    made_for, ours = ", ".join(theirs), ", ".join(own)
+    if made_for != ours and not (part and set(own) <= set(theirs)):
         raise BundleError(
             "bundle-outputs-differ",
             what=f"The bundle was made for the outputs {made_for}, but this player has {ours}.",

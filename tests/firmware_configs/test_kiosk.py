@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from controller.core.kiosk_places import PLAYER_OPTIONS, PLAYER_SOCKET, STAGE
-from controller.play.__main__ import _parser
+from controller.play.__main__ import parser
 from controller.play.control.launch import PlayerSettings, start_player
 from tests.controller.play.display.xorg import HEIGHT, WIDTH, running_server
 from tests.controller.play.wire import Wire
@@ -60,7 +60,7 @@ def test_the_players_command_is_one_that_it_understands(tmp_path: Path) -> None:
     text = setting("velatura-player.service", "ExecStart")
     program, *arguments = shlex.split(text.replace(f"@{PLAYER_OPTIONS}", f"@{options}"))
     assert (program, *arguments[:2]) == ("/opt/velatura/bin/python", "-m", "controller.play")
-    read = _parser().parse_args(arguments[2:])
+    read = parser().parse_args(arguments[2:])
     assert read.windows
     assert read.resume
     assert (read.outputs, read.where, read.trusted) == ("P1:1400x1050", ["P1=HDMI-1"], [Path("/k.pub")])

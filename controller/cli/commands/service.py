@@ -113,6 +113,25 @@ def serve(
     work(do)
 
 
+def agent(
+    keys: Annotated[Path, typer.Option(help="Folder of this computer's certificate.")] = Path("keys"),
+    name: Annotated[str | None, typer.Option(help="Name of this computer (default: its host name).")] = None,
+    admit: Annotated[str, typer.Option(help="At the stage instead: admit the computer at this address.")] = "",
+    code: Annotated[str, typer.Option(help="The code that the computer to admit shows.")] = "",
+    stage: Annotated[Path, typer.Option(help="The stage's folder, with --admit.")] = Path(),
+) -> None:
+    """Keep players of this computer in step with a stage on another computer. It joins by a code that it shows."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.stage.hosts.agent import admitted, keep
+
+        if admit:
+            return admitted(stage, admit, code)
+        return keep(keys, name, reporter.say, cancel)
+
+    work(do)
+
+
 def install(
     backup: Annotated[
         Path | None,

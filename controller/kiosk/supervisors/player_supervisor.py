@@ -389,7 +389,14 @@ class PlayerSupervisor:
 
 
 def _outputs_problem(status: dict[str, Any]) -> Notice | None:
-    """That outputs get no picture, although the player shows one."""
+    """That outputs get no picture, although the player shows one, or that computers with outputs are lost."""
+    if lost := status.get("lost_hosts"):
+        return Notice(
+            OUTPUT_GONE,
+            f"The computer {', '.join(lost)} does not answer.",
+            "Check that it is on, and its network. Its outputs follow what was agreed on; the others play on.",
+            Level.ERROR,
+        )
     if not (names := status.get("missing_outputs")):
         return None
     if len(names) == 1:

@@ -40,7 +40,12 @@ class PlayerSettings:
     ``outputs``: (name, width_px, height_px) in stage order; ``frames``: the memory output's file, None for windows;
     ``where``: connector or display serial number by output name, where that is another; ``trusted``, ``revoked``:
     public key files; ``resume``: it shows again what was playing when it was killed; ``suggested``: it begins with the
-    bundle's own playlist otherwise; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds.
+    bundle's own playlist otherwise; ``rate_hz``: pictures change at multiples of 1 / rate_hz seconds; ``part``: the
+    outputs are a part of what bundles are made for; ``display``: the X screen, "" for that of the environment.
+
+    ``hosts``: where outputs are that are not on this computer's first screen, as "COMPUTER" or "COMPUTER/:0.1" or
+    "/:0.1" by output name; then a conductor of several players serves instead of one player (``stage.hosts``).
+    ``keys``: the folder of its authority; ``alone``: how long its players continue without it, and what they do then.
     """
 
     outputs: Sequence[tuple[str, int, int]]
@@ -53,6 +58,11 @@ class PlayerSettings:
     where: Mapping[str, str] = field(default_factory=dict)
     resume: bool = False
     suggested: bool = False
+    part: bool = False
+    display: str = ""
+    hosts: Mapping[str, str] = field(default_factory=dict)
+    keys: Path | None = None
+    alone: tuple[float, str] = (3600.0, "on")
 
     def arguments(self) -> list[str]:
         """Them as the player's command line has them."""
@@ -65,6 +75,11 @@ class PlayerSettings:
         words += ["--allow-unsigned"] if self.allow_unsigned else []
         words += ["--resume"] if self.resume else []
         words += ["--suggested"] if self.suggested else []
+        words += ["--part"] if self.part else []
+        words += [word for name, place in self.hosts.items() for word in ("--host", f"{name}={place}")]
+        if self.hosts:
+            words += ["--alone", f"{self.alone[0]:g},{self.alone[1]}"]
+            words += [] if self.keys is None else ["--keys", str(self.keys)]
         return [*words, "--rate", f"{self.rate_hz:g}"]
 
 
@@ -86,7 +101,12 @@ class PlayerProcess:
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C is for the controller, which ends the player when the lamps are safe.
             return subprocess.Popen(  # noqa: S603
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env=_environment()
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env=_environment(self._settings.display),
             )
 
     @property
@@ -165,9 +185,9 @@ def hello(path: Path, timeout_s: float) -> dict[str, Any]:
     return parse_answer(line) if line.endswith(b"\n") else {}
 
 
-def _environment() -> dict[str, str]:
+def _environment(display: str) -> dict[str, str]:
     # The player does no linear algebra; its threads would cost a fifth of the time that its imports take.
-    return {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", **({"DISPLAY": display} if display else {})}
 
 
 def end_leftover(runtime: Path, timeout_s: float = _END_S) -> bool:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,12 +28,13 @@ def find_connectors(
 ) -> dict[str, Connector]:
     """The X server's output of each of ours that is there, by our name, whatever its size.
 
-    ``where`` gives a connector's name or a display's serial number for ours; without it, our name is taken for that.
+    ``where`` gives a connector's name or a display's serial number for ours, with "@x,y" for a rectangle of its
+    picture; without it, our name is taken for that.
     Raises UsageError("output-ambiguous") if two displays have the serial number.
     """
     found = {}
     for size in sizes:
-        wanted = where.get(size.name, size.name)
+        wanted, _, corner = where.get(size.name, size.name).partition("@")
         named = [c for c in connectors if c.name == wanted] or [c for c in connectors if wanted in c.serials]
         if len(named) > 1:
             raise UsageError(
@@ -40,8 +42,19 @@ def find_connectors(
                 what=f"The displays at {' and '.join(c.name for c in named)} have the same serial number {wanted}.",
                 remedy=f"Give the connector's name for output {size.name} instead.",
             )
-        found.update({size.name: named[0]} if named else {})
+        found.update({size.name: _part(named[0], corner, size)} if named else {})
     return found
+
+
+def _part(connector: Connector, corner: str, size: OutputSize) -> Connector:
+    """The rectangle of ours in the connector's picture, if ``corner`` ("x,y") says where it is and it fits in."""
+    if not corner:
+        return connector
+    x, y = map(int, corner.split(","))
+    if x + size.width_px > connector.width_px or y + size.height_px > connector.height_px:
+        return connector
+    left, top = connector.x + x, connector.y + y
+    return replace(connector, x=left, y=top, width_px=size.width_px, height_px=size.height_px)
 
 
 def unfit(

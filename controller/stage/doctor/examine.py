@@ -295,7 +295,8 @@ def _compared(checked: Checked | None, found: Sequence[Found], problems: list[No
     known = [] if checked is None else list(devices_of(checked))
     own = {(device.driver.name, device.place) for device in known}
     kinds = {device.kind for device in known}
-    outputs = {output.name for output in checked.stage.tables.display.outputs} if checked is not None else set()
+    tables = () if checked is None else checked.stage.tables.display.outputs
+    outputs = {output.name for output in tables if not output.elsewhere}
     new = []
     for one in found:
         problems += [replace(problem, about=one.address) for problem in one.problems]

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from controller.bundle.install import CURRENT
 from controller.bundle.signing import write_public_key
 from controller.config import Stage
-from controller.config.models import OpenConfigTable
+from controller.config.models import OpenConfigTable, OutputTable
 from controller.core import kiosk_places
 from controller.optics.capture.acquire import Acquirer
 from controller.play.control.launch import PlayerProcess, PlayerSettings, replace_player
@@ -31,6 +31,8 @@ from hal.errors import CodedError, DeviceError, PluginError
 from hal.interfaces import ButtonPanel, Camera, Device, Display, Douser, LightSensor, PowerSwitch, Projector
 from hal.registry import Driver, OpenContext
 
+PLAYERS_KEYS: Final = Path("keys") / "players"
+"""In the stage's folder: the authority of the computers that have outputs of it."""
 OPEN_S = 20.0
 """Longest that opening one device may take."""
 
@@ -202,12 +204,22 @@ def player_settings(stage: Stage, runtime: Path, *, plays: bool) -> PlayerSettin
     return PlayerSettings(
         outputs=[(output.name, output.width_px, output.height_px) for output in table.outputs],
         frames=frames,
-        where={output.name: output.where for output in table.outputs if output.where is not None},
+        where={output.name: place for output in table.outputs if (place := _where(output))},
+        hosts={output.name: output.elsewhere for output in table.outputs if output.elsewhere},
+        keys=stage.folder / PLAYERS_KEYS if any(output.host for output in table.outputs) else None,
+        alone=(table.alone_s, table.alone),
         bundle=bundle if plays and (installed or bundle.is_symlink()) else None,
         trusted=_key_files(stage.tables.bundle.trusted_keys, keys, "trusted"),
         revoked=_key_files(stage.tables.bundle.revoked_keys, keys, "revoked"),
         allow_unsigned=stage.tables.bundle.allow_unsigned,
     )
+
+
+def _where(output: OutputTable) -> str:
+    """Connector or serial number, and the output's place in its picture, as the player's options name them."""
+    if output.left_top_px is None:
+        return output.where or ""
+    return "{}@{},{}".format(output.where or output.name, *output.left_top_px)
 
 
 def _key_files(keys: Sequence[str], folder: Path, name: str) -> list[Path]:

@@ -14,7 +14,7 @@ from controller.core.kiosk_places import RUNTIME
 from controller.kiosk import panel_address
 from controller.kiosk.install import steps
 from controller.kiosk.install.system import System
-from controller.play.__main__ import _parser
+from controller.play.__main__ import parser
 from tests.controller.kiosk.install.test_outputs import LEFT
 
 PREFIX = Path("/opt/velatura")
@@ -74,7 +74,7 @@ def test_it_makes_user_packages_units_and_the_outputs_that_are_there(
     assert '"1400x1050_59.98"' in (debian / "etc/X11/xorg.conf.d/20-velatura-outputs.conf").read_text()
     assert "--name vase.local" in (debian / "etc/velatura/controller.env").read_text()
     options = (debian / "var/lib/velatura/player.options").read_text().split("\n")[:-1]
-    read = _parser().parse_args(["--socket", "/run/velatura/player.sock", "--resume", *options])
+    read = parser().parse_args(["--socket", "/run/velatura/player.sock", "--resume", *options])
     assert (read.outputs, read.windows, read.trusted) == ("HDMI-1:1400x1050", True, [])
 
 

@@ -1,0 +1,157 @@
+"""The other computer's side: keeps its players running and on time, with the conductor or without it.
+
+What is to be shown when is in each player. So a network that is cut, or a conductor that ends, changes nothing until
+the time that the stage allows is over; then each player does what its rule says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import UsageError, WorkError
+from controller.core.storage import runtime_folder
+from controller.stage.hosts.bundles import Arrivals, Offer
+from controller.stage.hosts.clock import HostClock
+from controller.stage.hosts.remote import BEAT, BEAT_S, Asked, Beat, Report, Wanted, key, placed_rows
+from controller.stage.hosts.screen import Screen
+from controller.stage.link.joining import Joining, admit
+from controller.stage.link.membership import Authority, membership
+from controller.stage.link.session import Link, member_link
+
+PORT: Final = 7449
+"""Of the conductor, for the agents."""
+_NEVER_S: Final = -1e9
+
+
+def keep(keys: Path, name: str | None, say: Callable[[str], object], cancel: threading.Event) -> dict[str, Any]:
+    """An agent on this computer until ``cancel``; without a membership in ``keys`` it first shows a code and joins.
+
+    Raises as ``Joining`` and ``member_link``.
+    """
+    own = membership(keys)
+    while own is None and not cancel.is_set():
+        with Joining(keys, name or socket.gethostname().split(".")[0].lower()) as joining:
+            say(f"Code of this computer: {joining.code}")
+            with contextlib.suppress(WorkError):
+                own = joining.wait()
+    if own is None:
+        return {}
+    clock = HostClock()
+    runtime = runtime_folder(keys.resolve())
+
+    def screen(display: str) -> Screen:
+        return Screen(runtime / (display.strip(":") or "first"), clock, display=display)
+
+    with member_link(own) as link:
+        agent = Agent(link, own.name, keys.with_name("bundles"), clock, screen)
+        say(f"This computer is {own.name} of {own.house}.")
+        agent.run(cancel)
+    return {"name": own.name}
+
+
+def admitted(stage: Path, address: str, code: str) -> dict[str, Any]:
+    """At the stage: the computer at ``address`` may have outputs of it from now on. Raises as ``admit``."""
+    own = f"tls/{socket.gethostname()}.local:{PORT}", f"tls/{_address_towards(address)}:{PORT}"
+    member = admit(Authority(stage / "keys" / "players", "players"), address, code, own)
+    return {"name": member.name}
+
+
+def _address_towards(address: str) -> str:
+    """The address of this computer that another one reaches."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect((address.rsplit(":", 1)[0], PORT))
+        return str(probe.getsockname()[0])
+
+
+class Agent:
+    """The players of this computer, for the conductor at the other end of ``link``; ``run`` it in the main thread.
+
+    ``folder``: for the bundles; ``screen``: makes the player of an X screen.
+    """
+
+    def __init__(self, link: Link, name: str, folder: Path, clock: HostClock, screen: Callable[[str], Screen]) -> None:
+        self._link, self._name, self._clock, self._make = link, name, clock, screen
+        self._screens: dict[str, Screen] = {}
+        self._bundles = Arrivals(folder, self._check)
+        self._pictures: dict[tuple[str, str], Any] = {}
+        self._heard_s = _NEVER_S
+        self._lock = threading.Lock()
+        answer = partial(self._answer, link)
+        answer("prepare", Wanted, self._prepare)
+        answer("ask", Asked, self._ask)
+        answer("rows", bytes, self._rows)
+        answer("offer", Offer, self._offered)
+        answer("part", bytes, self._part)
+        link.subscribe(BEAT, Beat, self._beat)
+        link.appear(key(name, "there"))
+
+    def _answer(self, link: Link, word: str, kind: type[Any], answers: Callable[[Any], Any]) -> None:
+        link.answer(key(self._name, word), kind, answers)
+
+    def run(self, ended: threading.Event) -> None:
+        """Until ``ended``; then the players show black and end."""
+        while not ended.wait(BEAT_S):
+            self.step()
+        for screen in self._screens.values():
+            screen.end()
+
+    def step(self) -> None:
+        """Look at the clock and at each player once, and report."""
+        self._clock.look()
+        silent_s = time.monotonic() - self._heard_s
+        states = {name: screen.step(screen.setup.keep_s - silent_s) for name, screen in list(self._screens.items())}
+        self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states))
+
+    def _beat(self, _: Beat) -> None:
+        self._heard_s = time.monotonic()
+
+    def _prepare(self, wanted: Wanted) -> None:
+        self._heard_s = time.monotonic()
+        with self._lock:
+            for name in self._screens.keys() - wanted.setups.keys():
+                self._screens.pop(name).end()
+            for name, setup in wanted.setups.items():
+                screen = self._screens.get(name) or self._make(name)
+                screen.prepare(setup)
+                screen.step(setup.keep_s)
+                self._screens[name] = screen
+
+    def _ask(self, asked: Asked) -> dict[str, Any]:
+        request = dict(asked.request)
+        if isinstance(request.get("bundle"), str):
+            request["bundle"] = str(self._bundles.path(request["bundle"]))
+        return self._screen(asked.screen).ask(request, within_s=asked.within_s)
+
+    def _rows(self, message: bytes) -> None:
+        try:
+            screen, output = placed_rows(message, self._pictures)
+        except ValueError as error:
+            raise WorkError("link-message-wrong", what="A picture came damaged.", remedy="It is sent again.") from error
+        self._screen(screen).put({output: self._pictures[screen, output]})
+
+    def _offered(self, offer: Offer) -> tuple[int, ...]:
+        with self._lock:
+            return self._bundles.offered(offer)
+
+    def _part(self, data: bytes) -> None:
+        with self._lock:
+            self._bundles.part(data)
+
+    def _check(self, bundle: Path) -> None:
+        for screen in self._screens.values():
+            screen.check(bundle)
+
+    def _screen(self, name: str) -> Screen:
+        if (screen := self._screens.get(name)) is None:
+            raise UsageError(
+                "host-not-prepared", what=f"{self._name} has no player for the screen {name!r}.",
+                remedy="Wait a moment: the conductor starts it.",
+            )  # fmt: skip
+        return screen

@@ -1,0 +1,234 @@
+"""A player on another computer, as the conductor sees it, and what it and the agent there send each other."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.core.errors import UsageError
+from controller.stage.hosts.bundles import PART_BYTES, Offer, message
+from controller.stage.hosts.clock import HostClock
+from controller.stage.hosts.screen import Pictures, Setup, State
+from controller.stage.link.membership import Authority
+from controller.stage.link.session import Link, house_link
+from hal.errors import CodedError
+
+BEAT: Final = "all/beat"
+BEAT_S: Final = 0.5
+_ROWS_BYTES: Final = 4 << 20
+"""Of pixels in one message, before they are packed."""
+
+
+def key(host: str, word: str) -> str:
+    """What is asked or reported under ``word``, of the computer ``host``."""
+    return f"member/{host}/{word}"
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """That the conductor is there, and its common clock."""
+
+    common_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The setups of a computer's players, by X screen."""
+
+    setups: dict[str, Setup]
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request to the player of an X screen; ``bundle`` in it is a bundle's name."""
+
+    screen: str
+    request: dict[str, Any]
+    within_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The state of a computer twice a second. ``trouble``: of its clock, "" if it has none."""
+
+    common_s: float
+    trouble: str
+    states: dict[str, State] = field(default_factory=dict)
+
+
+def rows_of(screen: str, output: str, pixels: npt.NDArray[np.uint8]) -> Iterator[bytes]:
+    """A picture in messages."""
+    height, width, _ = pixels.shape
+    step = max(1, _ROWS_BYTES // (3 * width))
+    for first in range(0, height, step):
+        head = f"{screen}\t{output}\t{width}\t{height}\t{first}\n".encode()
+        yield head + zlib.compress(pixels[first : first + step].tobytes(), 1)
+
+
+def placed_rows(message: bytes, pictures: dict[tuple[str, str], npt.NDArray[np.uint8]]) -> tuple[str, str]:
+    """Put rows where they belong; which screen and output these are. Raises ValueError for anything else."""
+    head, packed = message.split(b"\n", 1)
+    screen, output, *numbers = head.decode().split("\t")
+    width, height, first = map(int, numbers)
+    if not (0 < width <= 16384 and 0 <= first < height <= 16384):
+        raise ValueError("rows outside of a picture")
+    rows = np.frombuffer(zlib.decompressobj().decompress(packed, 2 * _ROWS_BYTES), np.uint8).reshape(-1, width, 3)
+    picture = pictures.get((screen, output))
+    if picture is None or picture.shape != (height, width, 3) or first == 0:
+        picture = pictures[screen, output] = np.zeros((height, width, 3), np.uint8)
+    picture[first : first + len(rows)] = rows
+    return screen, output
+
+
+SILENT_S: Final = 3.0
+_START_S: Final = 25.0
+_PART_S: Final = 10.0
+_AGAIN_S: Final = 1.0
+
+
+@contextlib.contextmanager
+def opened_link(keys: Path | None, clock: HostClock, port: int) -> Iterator[Link]:
+    """The link to the other computers, with the conductor's beat. Raises UsageError("hosts-without-keys")."""
+    if keys is None:
+        raise UsageError(
+            "hosts-without-keys", what="An output is on another computer, but the stage has no keys for a link.",
+            remedy="Let that computer join first.",
+        )  # fmt: skip
+    ended = threading.Event()
+    with house_link(Authority(keys, "players"), port=port) as link:
+
+        def beat() -> None:
+            while not ended.wait(BEAT_S):
+                link.publish(BEAT, Beat(clock.now_s()), urgent=True)
+
+        threading.Thread(target=beat, daemon=True).start()
+        try:
+            yield link
+        finally:
+            ended.set()
+
+
+class Remote:
+    """As ``screen.Player``. It counts as there once it has its setup, until nothing is heard of it for ``SILENT_S``."""
+
+    def __init__(self, link: Link, host: str, screen: str, setups: dict[str, Setup]) -> None:
+        """``setups``: of all screens of that computer."""
+        self._link, self.host, self._screen, self._setups = link, host, screen, setups
+        self.state, self.trouble = State(), ""
+        self._reports: list[tuple[float, float, str | None]] = []
+        self._heard_s = 0.0
+        self._prepared = self._returned = False
+        self._asked_at: float | None = None
+        self._offer: tuple[Path, Offer] | None = None
+        self._bringing, self._has = threading.Lock(), ""
+        self._sent = 0
+        link.subscribe(key(host, "state"), Report, self._heard)
+
+    # -- what is heard
+
+    def _heard(self, report: Report) -> None:
+        fresh = time.monotonic() - self._heard_s > SILENT_S
+        self._heard_s = time.monotonic()
+        self.trouble = report.trouble
+        self.state = report.states.get(self._screen, State())
+        self._reports += self.state.reports
+        if (fresh or not report.states) and not self._bringing.locked():
+            self._prepared = False
+            threading.Thread(target=self._prepare, daemon=True).start()
+
+    def _prepare(self) -> None:
+        with self._bringing, contextlib.suppress(CodedError):
+            self._link.ask(key(self.host, "prepare"), Wanted(self._setups), type(None), within_s=_START_S)
+            self._asked_at, self._has = None, ""
+            self._prepared = self._returned = True
+
+    @property
+    def setup(self) -> Setup:
+        return self._setups[self._screen]
+
+    @property
+    def there(self) -> bool:
+        return self._prepared and time.monotonic() - self._heard_s < SILENT_S
+
+    def returned(self) -> bool:
+        """Whether it has come, or come back, since the last question."""
+        returned, self._returned = self._returned, False
+        return returned
+
+    def take_reports(self) -> list[tuple[float, float, str | None]]:
+        reports, self._reports = self._reports, []
+        return reports
+
+    def needs(self, request: Mapping[str, Any]) -> bool:
+        """Whether it has come after this was agreed on, and can be asked for it now."""
+        return self.there and not self.behind and self._asked_at != request["at"]
+
+    # -- what is sent
+
+    def ask(self, request: Mapping[str, Any], *, within_s: float) -> dict[str, Any]:
+        request = dict(request)
+        if "bundle" in request and self._offer is not None:
+            request["bundle"] = self._offer[1].name
+        self._asked_at = request.get("at", self._asked_at)
+        try:
+            asked = Asked(self._screen, request, within_s)
+            return self._link.ask(key(self.host, "ask"), asked, dict, within_s=within_s + 1)
+        except CodedError as error:
+            if error.code != "superseded":
+                self._asked_at = None
+            raise
+
+    def put(self, pictures: Pictures) -> None:
+        for output, pixels in pictures.items():
+            for rows in rows_of(self._screen, output, pixels):
+                self._link.ask(key(self.host, "rows"), rows, type(None), within_s=_PART_S)
+
+    def bring(self, bundle: Path) -> None:
+        """Bring a bundle there, in a thread, however often the link is cut."""
+        if self._offer is None or self._offer[0] != bundle:
+            self._offer = bundle, Offer.of(bundle)
+        if self.behind and not self._bringing.locked():
+            threading.Thread(target=self._bring, daemon=True).start()
+
+    @property
+    def behind(self) -> bool:
+        """Whether the newest bundle is not there yet."""
+        return self._offer is not None and self._has != self._offer[1].name
+
+    @property
+    def progress(self) -> str:
+        share = self._sent / max(1, len(self._offer[1].parts)) if self._offer is not None else 1.0
+        return f"{self.host} has {share:.0%}"
+
+    def _bring(self) -> None:
+        with self._bringing:
+            while self.behind and self._prepared:
+                assert self._offer is not None
+                path, offer = self._offer
+                try:
+                    missing = self._link.ask(key(self.host, "offer"), offer, tuple[int, ...], within_s=60)
+                    if not missing:
+                        self._has = offer.name
+                    self._send(path, offer, missing)
+                except (CodedError, OSError):
+                    time.sleep(_AGAIN_S)
+
+    def _send(self, path: Path, offer: Offer, missing: tuple[int, ...]) -> None:
+        self._sent = len(offer.parts) - len(missing)
+        with path.open("rb") as file:
+            for number in missing:
+                if self._offer is None or self._offer[1] is not offer:
+                    return
+                file.seek(number * PART_BYTES)
+                part = message(offer.name, number, file.read(PART_BYTES))
+                self._link.ask(key(self.host, "part"), part, type(None), within_s=_PART_S)
+                self._sent += 1

@@ -1,0 +1,212 @@
+"""A conductor, two agents and their players, linked by Zenoh on loopback: one display."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.stage.hosts.bundles import PART_BYTES, Arrivals, Offer, message
+from controller.stage.hosts.clock import HostClock, Tracking, tracking
+from controller.stage.hosts.conductor import Skew
+from hal.deadline import in_seconds
+from hal.errors import CodedError, DeviceError
+from plugins.display.player import PlayerDisplay
+from tests.controller.play.conftest import write_noise
+from tests.controller.play.wire import Frames, Wire, noise, same
+from tests.controller.stage.hosts.computers import Computers, running
+from tests.waiting import eventually
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Computers]:
+    computers = Computers(tmp_path_factory.mktemp("three"), ["left", "right"], None)
+    computers.bundle = write_noise(computers.folder / "b.vel", outputs=computers.outputs)
+    with running(computers):
+        yield computers
+
+
+def test_one_display_of_three_computers(three: Computers) -> None:
+    display = PlayerDisplay(three.socket, None)
+    try:
+        assert [output.name for output in display.outputs(deadline=in_seconds(5))] == ["here", "left", "right"]
+        # A pattern comes whole to every output.
+        pictures = noise(three.outputs, 11)
+        display.show(pictures, deadline=in_seconds(10))
+        for name, socket in three.players().items():
+            assert same(Frames(socket.with_name("out.frame")).read(), {name: pictures[name]})
+        # A list is in step, and its skew is a number.
+        eventually(lambda: _played(display))
+        eventually(lambda: display.status(deadline=in_seconds(5))["compared"] > 5)
+        status = display.status(deadline=in_seconds(5))
+        assert status["mixed"] == 0
+        assert 0 < status["skew_p50_s"] < 0.5
+        assert status["lost_hosts"] == status["missing_outputs"] == []
+        # A computer that is lost is named, and the others show no pattern without it. It plays on.
+        three.kill("left")
+        eventually(lambda: display.status(deadline=in_seconds(5))["lost_hosts"] == ["left"])
+        with pytest.raises(DeviceError, match="left"):
+            display.show(pictures, deadline=in_seconds(10))
+        with Wire(three.players()["left"]) as wire:
+            assert wire.ask("status")["sequence_running"]
+        three.follow("left")
+        eventually(lambda: display.status(deadline=in_seconds(5))["lost_hosts"] == [])
+        # One that is set by 5 s is named, and the show is not moved.
+        (three.place("right") / "clock").write_text("5")
+        eventually(lambda: "set by +5.0" in display.status(deadline=in_seconds(5))["clock_troubles"]["right"])
+        display.stop(deadline=in_seconds(10))
+        assert not Frames(three.players()["right"].with_name("out.frame")).read()["right"].any()
+    finally:
+        display.close()
+
+
+def _played(display: PlayerDisplay) -> bool:
+    try:
+        display.play_sequence([("0", 0.1), ("1", 0.1, 0.05), ("2", 0.1)], deadline=in_seconds(10))
+    except DeviceError as error:
+        assert error.code == "hosts-behind"
+        return False
+    return True
+
+
+# Bundles on their way
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "large.vel"
+    path.write_bytes(np.random.default_rng(1).bytes(3 * PART_BYTES + 17))
+    return path
+
+
+def parts(path: Path, offer: Offer) -> list[bytes]:
+    data = path.read_bytes()
+    return [message(offer.name, n, data[n * PART_BYTES : (n + 1) * PART_BYTES]) for n in range(len(offer.parts))]
+
+
+def test_a_bundle_comes_in_parts_and_after_a_cut_only_the_rest(tmp_path: Path, file: Path) -> None:
+    checked: list[bytes] = []
+    offer = Offer.of(file)
+    sent = parts(file, offer)
+    arrivals = Arrivals(tmp_path / "there", lambda path: checked.append(path.read_bytes()))
+    assert arrivals.offered(offer) == (0, 1, 2, 3)
+    arrivals.part(sent[2])
+    arrivals.part(sent[0])
+    # Another process, as after a power cut.
+    arrivals = Arrivals(tmp_path / "there", lambda path: checked.append(path.read_bytes()))
+    assert arrivals.offered(offer) == (1, 3)
+    with pytest.raises(CodedError) as caught:
+        arrivals.path(offer.name)
+    assert caught.value.code == "bundle-not-here"
+    arrivals.part(sent[3])
+    arrivals.part(sent[1])
+    assert checked == []
+    assert arrivals.offered(offer) == ()
+    assert checked == [file.read_bytes()]
+    assert arrivals.path(offer.name).read_bytes() == file.read_bytes()
+
+
+def test_a_part_that_is_damaged_or_of_another_bundle_is_refused(tmp_path: Path, file: Path) -> None:
+    offer = Offer.of(file)
+    sent = parts(file, offer)
+    arrivals = Arrivals(tmp_path / "there", lambda path: None)
+    with pytest.raises(CodedError, match="damaged"):
+        arrivals.part(sent[0])
+    arrivals.offered(offer)
+    for wrong in (sent[0][:-1] + b"\0", b"\1" + sent[0][1:], message(offer.name, 9, b""), sent[0][:20]):
+        with pytest.raises(CodedError, match="damaged"):
+            arrivals.part(wrong)
+    assert arrivals.offered(offer) == (0, 1, 2, 3)
+
+
+def test_a_bundle_that_is_not_trusted_there_never_counts(tmp_path: Path, file: Path) -> None:
+    def check(path: Path) -> None:
+        raise CodedError("bundle-unsigned", what="It is not signed.", remedy="Sign it.")
+
+    offer = Offer.of(file)
+    arrivals = Arrivals(tmp_path / "there", check)
+    arrivals.offered(offer)
+    for part in parts(file, offer):
+        arrivals.part(part)
+    with pytest.raises(CodedError, match="not signed"):
+        arrivals.offered(offer)
+    assert list((tmp_path / "there").iterdir()) == []
+
+
+# Clocks
+
+
+class Clocks:
+    def __init__(self) -> None:
+        self.wall_s, self.monotonic_s = 1.7e9, 50.0
+        self.tracking: Tracking | None = Tracking(True, 0.0002)
+        self.clock = HostClock(lambda: self.wall_s, lambda: self.monotonic_s, lambda: self.tracking)
+
+    def later(self, seconds: float, *, step_s: float = 0.0) -> None:
+        self.wall_s += seconds + step_s
+        self.monotonic_s += seconds
+        self.clock.look()
+
+
+def test_a_clock_that_somebody_sets_is_not_followed_until_chrony_vouches_for_it() -> None:
+    clocks = Clocks()
+    clocks.tracking = Tracking(False, 0.5)
+    clocks.later(10, step_s=5)
+    assert clocks.clock.now_s() == pytest.approx(1.7e9 + 10)
+    assert "set by +5.000 s" in clocks.clock.trouble
+    clocks.tracking = Tracking(True, 0.0002)
+    clocks.later(10)
+    assert clocks.clock.now_s() == pytest.approx(1.7e9 + 25)
+    assert clocks.clock.trouble == ""
+
+
+def test_a_clock_that_is_set_and_set_back_moves_nothing() -> None:
+    clocks = Clocks()
+    clocks.tracking = None
+    clocks.later(10, step_s=-5)
+    assert clocks.clock.stepped_s == pytest.approx(-5)
+    clocks.later(10, step_s=5)
+    assert clocks.clock.stepped_s == 0
+    assert clocks.clock.now_s() == pytest.approx(1.7e9 + 20)
+    assert "chrony does not run" in clocks.clock.trouble
+
+
+CHRONY = (
+    "A29FC87B,ntp.example,3,1795985062.123,0.000012345,-0.000020000,0.000030000,-12.3,0.001,0.05,0.0124,0.0006,64.2,"
+)
+
+
+@pytest.mark.parametrize(
+    ("printed", "expected"),
+    [
+        (CHRONY + "Normal\n", Tracking(True, 0.000012345 + 0.0062 + 0.0006)),
+        (CHRONY + "Not synchronised\n", Tracking(False, 0.000012345 + 0.0062 + 0.0006)),
+        ("", None),
+        ("506 Cannot talk to daemon\n", None),
+    ],
+)
+def test_what_chronyc_prints(printed: str, expected: Tracking | None) -> None:
+    found = tracking(lambda command: printed)
+    assert (found is None) == (expected is None)
+    if found is not None and expected is not None:
+        assert found.synchronised == expected.synchronised
+        assert found.error_s == pytest.approx(expected.error_s)
+
+
+def test_without_chrony_there_is_no_tracking() -> None:
+    def missing(command: object) -> str:
+        raise FileNotFoundError
+
+    assert tracking(missing) is None
+
+
+def test_skew_is_from_the_first_to_the_last_player_and_other_pictures_are_mixed() -> None:
+    skew = Skew(2)
+    skew.add(0, [(10.0, 10.001, "a"), (11.0, 11.0, "b")])
+    assert skew.figures()["compared"] == 0
+    skew.add(1, [(10.0, 10.003, "a"), (11.0, 11.0, "c"), (12.0, 12.0, "a")])
+    figures = skew.figures()
+    assert (figures["compared"], figures["mixed"]) == (2, 1)
+    assert figures["skew_most_s"] == pytest.approx(0.002, rel=1e-3)
