@@ -103,7 +103,8 @@ def _run(options: argparse.Namespace) -> int:
             options.bundle = None  # Nothing is installed yet, for this version: a kiosk starts all the same.
         start = _counted_start(options.bundle)
         count: dict[str, Any] = {} if start is None else {"on_appearance": start.shown, "on_asked": start.asked}
-        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, part=options.part, **count)
+        player = Player(output, sizes, rate_hz=options.rate, trust=trust, wake=server.wake, **count)
+        player.part = options.part
         if options.bundle is not None:
             player.load_bundle(options.bundle if start is None else start.file)
         broken = _end_on_signals(player)

@@ -41,7 +41,7 @@ class Player:
     ``serve`` waits at most so many seconds for requests and carries them out by calling the methods below, in the
     loop's own thread; ``wake`` ends its waiting and is called from the decoding thread. ``on_appearance`` is called
     once, when the first appearance is on the outputs; it must return at once. ``on_asked`` is called whenever
-    appearances are asked for, before the bundle is read for them. ``part``: bundles may have other outputs, too.
+    appearances are asked for, before the bundle is read for them.
     """
 
     def __init__(
@@ -54,13 +54,13 @@ class Player:
         wake: Callable[[], None],
         on_appearance: Callable[[], None] | None = None,
         on_asked: Callable[[], None] = lambda: None,
-        part: bool = False,
     ) -> None:
         self.sizes = tuple(sizes)
         self.rate_hz = rate_hz
         self._output, self._trust, self._wake = output, trust, wake
         self._on_appearance, self._on_asked = on_appearance, on_asked
-        self._part = part
+        self.part = False
+        """Whether bundles may have other outputs, too."""
         self._notifier = Notifier()
         self._presenter = Presenter(output, sizes, rate_hz)
         self._black = self._presenter.shown
@@ -266,7 +266,7 @@ class Player:
         """The bundle of a file; of the loaded one, as it is. Raises BundleError."""
         bundle = Bundle.open_trusted(path, self._trust)
         try:
-            check_fits(bundle, self.sizes, part=self._part)
+            check_fits(bundle, self.sizes, part=self.part)
         except BundleError:
             bundle.close()
             raise

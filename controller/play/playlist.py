@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import accumulate, islice
-from typing import Self
+from typing import Any, Self
 
 from controller.bundle.format import PlaylistEntry
 from controller.core.errors import BundleError
@@ -42,6 +42,11 @@ class Playlist:
         """When each of its pictures is due, if the first is due at ``first_tick``."""
         lengths = [ticks(seconds) for _, seconds, _ in self._items]
         return Timetable(first_tick, lengths, self._rounds_left)
+
+    def request(self) -> dict[str, Any]:
+        """Its part of a ``sequence`` request; an item of no length is shown for good."""
+        items = [[name, seconds or 1 + fade_s, fade_s] for name, seconds, fade_s in self._items]
+        return {"items": items, "repeat": self._rounds_left or 0, "first_fade_s": self._first_fade_s}
 
     def seek(self, number: int) -> None:
         """Go to the picture of this number, counted from 0 over all rounds."""

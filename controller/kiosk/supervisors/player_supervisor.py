@@ -389,14 +389,7 @@ class PlayerSupervisor:
 
 
 def _outputs_problem(status: dict[str, Any]) -> Notice | None:
-    """That outputs get no picture, although the player shows one, or that computers with outputs are lost."""
-    if lost := status.get("lost_hosts"):
-        return Notice(
-            OUTPUT_GONE,
-            f"The computer {', '.join(lost)} does not answer.",
-            "Check that it is on, and its network. Its outputs follow what was agreed on; the others play on.",
-            Level.ERROR,
-        )
+    """That outputs get no picture, although the player shows one."""
     if not (names := status.get("missing_outputs")):
         return None
     if len(names) == 1:
@@ -407,6 +400,9 @@ def _outputs_problem(status: dict[str, Any]) -> Notice | None:
         "Check the video cable, and that the projector is on. `velatura doctor` says if the output is turned, scaled, "
         "of another size or over another one. The picture comes back by itself."
     )
+    if lost := status.get("lost_hosts"):
+        what = f"The computer {', '.join(lost)} does not answer."
+        remedy = "Check that it is on, and its network. Its outputs follow what was agreed on; the others play on."
     return Notice(OUTPUT_GONE, what, remedy, Level.ERROR)
 
 

@@ -225,7 +225,7 @@ class SavedRequest:
 
     def accepted(self, request: Request, line: bytes) -> None:
         """Keep the line of a request to play; when something else is to be shown, that the next start is black."""
-        kept = line if isinstance(request, Play | Sequence | Suggested) else _BLACK
+        kept = line if isinstance(_inner(request), Play | Sequence | Suggested) else _BLACK
         if self._path is None or kept == self._line:
             return
         try:
@@ -241,8 +241,13 @@ class SavedRequest:
             return None
         with contextlib.suppress(OSError, VelaturaError), self._path.open("rb") as file:
             _, request = parse_request(file.read(MAX_LINE_BYTES))
-            return request if isinstance(request, Play | Sequence | Suggested | Stop) else None
+            return request if isinstance(_inner(request), Play | Sequence | Suggested | Stop) else None
         return None
+
+
+def _inner(request: Request) -> Request:
+    """What is to be done, at whatever moment."""
+    return request.request if isinstance(request, protocol.Timed) else request
 
 
 class Commands:
@@ -303,27 +308,32 @@ class Commands:
             self._server.send(client, player_codec.answer_line(ticket, values))
 
     def _do(
-        self, request: protocol.Request, on_result: Callable[[PresentedSet | VelaturaError], None]
+        self,
+        request: protocol.Request,
+        on_result: Callable[[PresentedSet | VelaturaError], None],
+        at_s: float | None = None,
+        bundle: Path | None = None,
     ) -> dict[str, Any] | None:
         """Carry a request out; return its answer, or None where that comes once it is presented."""
+        player = self._player
         match request:
-            case protocol.Show(sequence, at_s):
-                self._player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
-                self._player.show(self._read_inbox(sequence), on_result, at_s=at_s)
-            case protocol.Play(appearance, fade_s, brightness, at_s, bundle):
+            case protocol.Timed(timed, moment_s, file):
+                return self._do(timed, on_result, moment_s, None if file is None else Path(file))
+            case protocol.Show(sequence):
+                player.withdraw()  # the frames of an earlier show, not yet presented, are overwritten here
+                player.show(self._read_inbox(sequence), on_result, at_s=at_s)
+            case protocol.Play(appearance, fade_s, brightness):
                 playlist = Playlist(((appearance, 0.0, fade_s),), repeat=1)
-                self._player.play(playlist, on_result, brightness=brightness, at_s=at_s, bundle=_path(bundle))
-            case protocol.Sequence(items, repeat, rate_hz, brightness, first_fade_s, at_s, bundle):
+                player.play(playlist, on_result, brightness=brightness, at_s=at_s, bundle=bundle)
+            case protocol.Sequence(items, repeat, rate_hz, brightness, first_fade_s):
                 playlist = Playlist(items, repeat, first_fade_s)
-                self._player.play(
-                    playlist, on_result, rate_hz=rate_hz, brightness=brightness, at_s=at_s, bundle=_path(bundle)
-                )
+                player.play(playlist, on_result, rate_hz=rate_hz, brightness=brightness, at_s=at_s, bundle=bundle)
             case protocol.Suggested(repeat):
-                self._player.play(self._player.suggested(repeat), on_result)
-            case protocol.Stop(fade_s, at_s):
-                self._player.stop(on_result, fade_s=fade_s, at_s=at_s)
+                player.play(player.suggested(repeat), on_result)
+            case protocol.Stop(fade_s):
+                player.stop(on_result, fade_s=fade_s, at_s=at_s)
             case protocol.Identify():
-                self._player.show(identification(self._player.sizes), on_result, showing="identification")
+                player.show(identification(player.sizes), on_result, showing="identification")
             case _:
                 return self._answered(request)
         return None
@@ -375,7 +385,3 @@ class Commands:
             "inbox": str(self._inbox.path.resolve()),
             "bundle": player.bundle_identity,
         }
-
-
-def _path(text: str | None) -> Path | None:
-    return None if text is None else Path(text)

@@ -31,25 +31,21 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Show:
-    """Present the frames in the inbox, which have this (even) sequence number; ``at_s``: when, on the common clock."""
+    """Present the frames in the inbox, which have this (even) sequence number."""
 
     sequence: int
-    at_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Play:
     """Present an appearance of the loaded bundle, ``fade_s`` seconds long over what is shown.
 
-    ``brightness``: the share of its light that is shown, 0..1. ``at_s``: when, on the common clock; ``bundle``: the
-    file that it is of from then on.
+    ``brightness``: the share of its light that is shown, 0..1.
     """
 
     appearance: str
     fade_s: float
     brightness: float = 1.0
-    at_s: float | None = None
-    bundle: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +55,7 @@ class Sequence:
     An item lasts ``seconds``, in the first ``fade_s`` of which it fades in over the previous one.
     ``rate_hz``: during it pictures change at multiples of 1 / rate_hz seconds; None: at the player's own.
     ``brightness``: the share of their light that is shown, 0..1; ``first_fade_s``: for how long the first item comes
-    in at the beginning, None: as it says. ``at_s`` and ``bundle`` as for ``Play``: each item is due by the same clock.
+    in at the beginning, None: as it says.
     """
 
     items: tuple[tuple[str, float, float], ...]
@@ -67,8 +63,6 @@ class Sequence:
     rate_hz: float | None
     brightness: float = 1.0
     first_fade_s: float | None = None
-    at_s: float | None = None
-    bundle: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,30 +74,9 @@ class Suggested:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Present black, ``fade_s`` seconds long over what is shown; ``at_s``: when, on the common clock."""
+    """Present black, ``fade_s`` seconds long over what is shown."""
 
     fade_s: float
-    at_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Clock:
-    """The common clock is ``ahead_s`` ahead of this computer's monotonic one.
-
-    If this is not said again within ``keep_s`` (None: for ever), the player ``then`` continues ("on"), shows "black"
-    or stays "still".
-    """
-
-    ahead_s: float
-    keep_s: float | None
-    then: str
-
-
-@dataclass(frozen=True, slots=True)
-class Reports:
-    """When the pictures of schedules were presented, of those that count more than ``after``."""
-
-    after: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +112,39 @@ class Quit:
     """Present black and end."""
 
 
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The common clock is ``ahead_s`` ahead of this computer's monotonic one.
+
+    If this is not said again within ``keep_s`` (None: for ever), the player ``then`` continues ("on"), shows "black"
+    or stays "still".
+    """
+
+    ahead_s: float
+    keep_s: float | None
+    then: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reports:
+    """When the pictures of schedules were presented, of those that count more than ``after``."""
+
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """A request that takes effect at a moment of the common clock. ``bundle``: the file it is of from then on."""
+
+    request: Show | Play | Sequence | Stop
+    at_s: float
+    bundle: str | None
+
+
 Request: TypeAlias = (
-    Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Clock | Reports | Quit
-)
+    Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Clock | Reports | Timed
+    | Quit
+)  # fmt: skip
 
 
 def parse_request(line: bytes) -> tuple[Any, Request]:
@@ -163,6 +166,9 @@ def parse_request(line: bytes) -> tuple[Any, Request]:
     if reader is None:
         raise InvalidRequest(ticket, f"its op is not one of {', '.join(_READERS)}")
     try:
+        if message.get("at") is not None and operation in _TIMED:
+            at_s, bundle = _number(message.pop("at"), "at", MAX_MOMENT_S), message.pop("bundle", None)
+            return ticket, Timed(reader(**message), at_s, None if bundle is None else _text(bundle, "bundle"))
         return ticket, reader(**message)
     except TypeError as error:
         raise InvalidRequest(ticket, f"op {operation} has missing or unknown keys") from error
@@ -204,17 +210,16 @@ def _text(value: Any, key: str) -> str:
     return value
 
 
-def _show(*, sequence: Any, at: Any = None) -> Show:
-    return Show(_integer(sequence, "sequence", 2**64 - 1), _moment(at))
+def _show(*, sequence: Any) -> Show:
+    return Show(_integer(sequence, "sequence", 2**64 - 1))
 
 
-def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0, at: Any = None, bundle: Any = None) -> Play:
-    name = _text(appearance, "appearance")
-    return Play(name, _fade(fade_s), _share(brightness), _moment(at), _file(bundle, at))
+def _play(*, appearance: Any, fade_s: Any = 0.0, brightness: Any = 1.0) -> Play:
+    return Play(_text(appearance, "appearance"), _fade(fade_s), _share(brightness))
 
 
-def _stop(*, fade_s: Any = 0.0, at: Any = None) -> Stop:
-    return Stop(_fade(fade_s), _moment(at))
+def _stop(*, fade_s: Any = 0.0) -> Stop:
+    return Stop(_fade(fade_s))
 
 
 def _clock(*, ahead_s: Any, keep_s: Any = None, then: Any = "on") -> Clock:
@@ -227,16 +232,6 @@ def _clock(*, ahead_s: Any, keep_s: Any = None, then: Any = "on") -> Clock:
 
 def _reports(*, after: Any = 0) -> Reports:
     return Reports(_integer(after, "after", 2**63 - 1))
-
-
-def _moment(value: Any) -> float | None:
-    return None if value is None else _number(value, "at", MAX_MOMENT_S)
-
-
-def _file(value: Any, at: Any) -> str | None:
-    if value is not None and at is None:
-        raise ValueError("bundle is only for a request with at; load-bundle is for the others")
-    return None if value is None else _text(value, "bundle")
 
 
 def _share(value: Any) -> float:
@@ -252,14 +247,7 @@ def _live(*, file: Any, white: Any = None) -> Live:
 
 
 def _sequence(
-    *,
-    items: Any,
-    repeat: Any = 0,
-    rate_hz: Any = None,
-    brightness: Any = 1.0,
-    first_fade_s: Any = None,
-    at: Any = None,
-    bundle: Any = None,
+    *, items: Any, repeat: Any = 0, rate_hz: Any = None, brightness: Any = 1.0, first_fade_s: Any = None
 ) -> Sequence:
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ITEMS:
         raise ValueError(f"items is not a list of 1 to {MAX_ITEMS}")
@@ -269,8 +257,6 @@ def _sequence(
         rate_hz=None if rate_hz is None else _number(rate_hz, "rate_hz", MAX_RATE_HZ),
         brightness=_share(brightness),
         first_fade_s=None if first_fade_s is None else _fade(first_fade_s),
-        at_s=_moment(at),
-        bundle=_file(bundle, at),
     )
 
 
@@ -307,3 +293,4 @@ _READERS: Final[dict[str, Any]] = {
     "reports": _reports,
     "quit": Quit,
 }
+_TIMED: Final = ("show", "play", "sequence", "stop")

@@ -8,33 +8,32 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import signal
 import sys
 import threading
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
+from controller.bundle.format import PlaylistEntry
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import load_public_key
 from controller.core.errors import BundleError, UsageError, VelaturaError, WorkError
 from controller.core.storage import write_atomically
 from controller.play.__main__ import parser
-from controller.play.control import protocol
-from controller.play.control.commands import SUFFIX, Client, Server
-from controller.play.control.notify import Notifier, log
-from controller.play.display.identification import identification
+from controller.play.control.commands import SUFFIX, Commands, SavedRequest, Server
+from controller.play.control.notify import Notifier
+from controller.play.control.protocol import Suggested
 from controller.play.frames import FrameFile, FrameSet, OutputSize, parse_outputs, parse_where
+from controller.play.loop import Player
 from controller.play.playlist import Playlist
-from controller.play.presenting import Intervals
+from controller.play.presenting import Intervals, PresentedSet, ResultCallback
 from controller.stage.hosts.clock import HostClock
-from controller.stage.hosts.remote import Remote
-from controller.stage.hosts.screen import BEHIND, Pictures, Screen, Setup, State
-from hal.codecs import player as codec
+from controller.stage.hosts.remote import Remote, opened_link
+from controller.stage.hosts.screen import Screen, Setup
 from hal.errors import CodedError
 
 _STEP_S: Final = 0.25
@@ -43,9 +42,7 @@ LEAD_S: Final = 1.0
 """From a request to its moment: long enough for a message that is lost and sent again."""
 LEAD_SHOW_S: Final = 0.2
 _ASKED_S: Final = 5.0
-_LIVE: Final = "live-not-on-hosts"
-
-
+_LOST: Final = ("link-no-answer", "player-gone", "player-silent", "player-not-running", "superseded")
 _WAITED: Final = 8192
 """So many moments are remembered while some player has not reported them."""
 
@@ -89,172 +86,208 @@ class Skew:
         }
 
 
-@dataclass(slots=True)
-class Part:
-    """One player: ``names`` of its outputs, and what it said last. ``host``: "" for this computer."""
-
-    host: str
-    player: Screen | Remote
-    names: tuple[str, ...]
-    state: State = field(default_factory=State)
-
-
 class Conductor:
-    """The players of a display as one. ``do`` carries out requests, one after the other, in threads of the caller."""
+    """Several players as one. To ``play.control.commands`` it is a player: it has what ``play.loop.Player`` has.
 
-    def __init__(self, sizes: Sequence[OutputSize], parts: Sequence[Part], clock: HostClock, saved: Path) -> None:
-        self.sizes, self._parts, self.clock, self._saved = tuple(sizes), tuple(parts), clock, saved
-        self.skew = Skew(len(self._parts))
-        self.bundle: Path | None = None
-        self.identity: str | None = None
-        self._request: dict[str, Any] | None = None
-        self._sequence, self._presented_at = 0, 0.0
-        self._pool = ThreadPoolExecutor(4 * len(self._parts) + 4, thread_name_prefix="part")
-        self._agreeing = threading.Lock()
-        self._remote = any(part.host for part in self._parts)
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            saved_request = json.loads(saved.read_bytes())
-            self.bundle = Path(saved_request["bundle"]) if "bundle" in saved_request else None
-            self._request = saved_request
+    ``saved``: the file of what was agreed on last, which the next conductor continues.
+    """
 
-    # -- what may be asked for
+    def __init__(
+        self, sizes: Sequence[OutputSize], players: Sequence[Screen | Remote], clock: HostClock, saved: Path,
+        wake: Callable[[], None],
+    ) -> None:  # fmt: skip
+        self.sizes, self.rate_hz = tuple(sizes), players[0].setup.rate_hz
+        self._players, self._clock, self._saved, self._wake = tuple(players), clock, saved, wake
+        self.shown = FrameSet.black(sizes)
+        self.bundle_identity: str | None = None
+        self._bundle: Path | None = None
+        self._suggests: Sequence[PlaylistEntry] = ()
+        self._skew = Skew(len(players))
+        self.request: dict[str, Any] | None = None
+        self._last = PresentedSet(0, 0.0)
+        self._pool = ThreadPoolExecutor(8 * len(players), thread_name_prefix="players")
+        self._jobs = ThreadPoolExecutor(4, thread_name_prefix="requests")
+        self._results: deque[Callable[[], None]] = deque()
+        self._agreeing, self._ended = threading.Lock(), threading.Event()
+        self._leaving = False
+        with contextlib.suppress(OSError, ValueError):
+            self.request = json.loads(saved.read_bytes())
 
-    def load(self, path: Path, trust: Any) -> None:
+    def run(self, serve: Callable[[float], None], *, first: Callable[[], None]) -> None:
+        """As ``Player.run``."""
+        threading.Thread(target=self._keep, daemon=True).start()
+        notifier = Notifier()
+        notifier.ready()
+        first()
+        while not self._ended.is_set():
+            serve(_STEP_S)
+            while self._results:
+                self._results.popleft()()
+            notifier.alive()
+        notifier.stopping()
+        if not self._leaving:
+            with contextlib.suppress(CodedError):
+                self._agree({"op": "stop"}, LEAD_S)
+            for player in self._players:
+                player.end()
+
+    def end(self, *, leaving: bool = False) -> None:
+        """As ``Player.end``; ``leaving``: the players play on."""
+        self._leaving = leaving
+        self._ended.set()
+
+    # -- what may be asked for, as of a player
+
+    def load_bundle(self, path: Path) -> None:
         """Use this bundle from now on; it is brought to all computers. Raises BundleError."""
-        with contextlib.closing(Bundle.open_trusted(path, trust)) as bundle:
-            self.identity = bundle.identity
-            self._playlist = bundle.index.schedule
-        self.bundle = path.resolve()
-        self._bring()
+        with contextlib.closing(Bundle.open_trusted(path, self._players[0].setup.trust())) as bundle:
+            self.bundle_identity, self._suggests = bundle.identity, bundle.index.schedule
+        self._bundle = path.resolve()
+        for player in self._players:
+            player.bring(self._bundle)
 
-    def _bring(self) -> None:
-        for part in self._parts:
-            if isinstance(part.player, Remote) and self.bundle is not None:
-                part.player.bring(self.bundle)
+    def suggested(self, repeat: int) -> Playlist:
+        return Playlist.suggested(self._suggests, repeat)
 
-    def play(self, request: dict[str, Any]) -> dict[str, Any]:
-        """``play`` or ``sequence`` at a moment, on all or on none of the players that are there.
+    def play(
+        self, playlist: Playlist, on_result: ResultCallback, *, rate_hz: float | None = None, brightness: float = 1.0,
+        at_s: None = None, bundle: None = None,
+    ) -> None:  # fmt: skip
+        """At one moment on all players that are there, or on none.
 
         Raises BundleError("bundle-none"), WorkError("hosts-behind") while the bundle is on its way.
         """
-        if self.bundle is None:
+        if self._bundle is None:
             raise BundleError("bundle-none", what="The players have no bundle to play.", remedy="Install one first.")
-        behind = [
-            part.player.progress for part in self._there() if isinstance(part.player, Remote) and part.player.behind
-        ]
-        if behind:
+        if behind := [player.progress for player in self._there() if player.behind]:
             raise WorkError(
-                BEHIND, what=f"The bundle is on its way: {', '.join(behind)}.", remedy="Wait until it is there."
+                "hosts-behind", what=f"The bundle is on its way: {', '.join(behind)}.", remedy="Wait until it is there."
             )
-        return self._agree({**request, "bundle": str(self.bundle)}, LEAD_S)
+        request = {"op": "sequence", **playlist.request(), "rate_hz": rate_hz, "brightness": brightness}
+        self._later(on_result, {**request, "bundle": str(self._bundle)}, LEAD_S)
 
-    def suggested(self, repeat: int) -> dict[str, Any]:
-        """The request for the bundle's playlist."""
-        if self.bundle is None or not self._playlist:
-            Playlist.suggested((), 0)
-        items = [[one.appearance, one.duration_ms / 1000, one.fade_ms / 1000] for one in self._playlist]
-        return {"op": "sequence", "items": items, "repeat": repeat}
+    def stop(self, on_result: ResultCallback, *, fade_s: float = 0.0, at_s: None = None) -> None:
+        self._later(on_result, {"op": "stop", "fade_s": fade_s}, LEAD_S)
 
-    def stop(self, fade_s: float) -> dict[str, Any]:
-        return self._agree({"op": "stop", "fade_s": fade_s}, LEAD_S)
+    def show(self, frames: FrameSet, on_result: ResultCallback, *, showing: str = "pattern", at_s: None = None) -> None:
+        """Pictures on all outputs, or on none if a player does not get its own."""
+        self.shown = frames
+        pictures = {size.name: image for size, image in zip(self.sizes, frames.pixels, strict=True)}
+        self._later(on_result, {"op": "show"}, LEAD_SHOW_S, pictures)
 
-    def show(self, pictures: Pictures) -> dict[str, Any]:
-        """Pictures on all outputs; nothing is shown unless every player has got its own. Raises CodedError."""
-        if lost := self.lost():
+    def live(self, path: Path, white: float | None) -> dict[str, Any]:
+        raise UsageError(
+            "live-not-on-hosts", what="A display of several screens or computers can't show live pictures.",
+            remedy="Use outputs of one screen for live pictures.",
+        )  # fmt: skip
+
+    def withdraw(self) -> None:
+        """What was agreed on stays agreed on until something else is."""
+
+    def clock(self, ahead_s: float, keep_s: float | None, then: str) -> None:
+        """Its players get this computer's."""
+
+    def reports(self, after: int) -> list[list[Any]]:
+        """Each player has its own."""
+        return []
+
+    def _later(
+        self,
+        on_result: ResultCallback,
+        request: dict[str, Any],
+        lead_s: float,
+        pictures: Mapping[str, Any] | None = None,
+    ) -> None:
+        def work() -> None:
+            try:
+                if pictures is not None:
+                    self._put(pictures)
+                outcome: PresentedSet | VelaturaError = self._agree(request, lead_s)
+            except CodedError as error:
+                outcome = WorkError(error.code, what=error.what, remedy=error.remedy)
+            self._results.append(partial(on_result, outcome))
+            self._wake()
+
+        self._jobs.submit(work)
+
+    def _put(self, pictures: Mapping[str, Any]) -> None:
+        if lost := self._lost():
             raise WorkError(
                 "host-lost", what=f"No answer from the computer {', '.join(lost)}.",
                 remedy="Check that it is on and its network; the others keep their picture.",
             )  # fmt: skip
-        jobs = [
-            self._pool.submit(part.player.put, {name: pictures[name] for name in part.names}) for part in self._parts
-        ]
-        for job in jobs:
-            job.result()
-        return self._agree({"op": "show"}, LEAD_SHOW_S, all_must=True)
+        own = [{name: pictures[name] for name in player.setup.names} for player in self._players]
+        list(self._pool.map(lambda player, its: player.put(its), self._players, own))
 
-    def _agree(self, request: dict[str, Any], lead_s: float, *, all_must: bool = False) -> dict[str, Any]:
+    def _agree(self, request: dict[str, Any], lead_s: float) -> PresentedSet:
+        """Let all do it at one moment; when all had it. A player that is lost is no error where it can catch up."""
+        far = any(player.host for player in self._players)
+        within_s = _ASKED_S + lead_s + float(request.get("fade_s") or 0)
         with self._agreeing:
-            moment = self.clock.now_s() + (lead_s if self._remote else LEAD_HERE_S)
-            request = {**request, "at": moment}
-            self._request = request
-            within_s = _ASKED_S + lead_s + float(request.get("fade_s") or 0)
-            jobs = [self._pool.submit(part.player.ask, request, within_s=within_s) for part in self._there()]
-        if request["op"] != "show":
-            with contextlib.suppress(VelaturaError, OSError):
-                write_atomically(self._saved, json.dumps(request).encode(), mode=0o600)
-        return self._presented(jobs, all_must=all_must)
-
-    def _presented(self, jobs: Sequence[Future[dict[str, Any]]], *, all_must: bool) -> dict[str, Any]:
-        """When all had it. A player that refuses is an error; one that is lost is not, unless ``all_must`` have it."""
-        moments, failed = [], []
+            self.request = {**request, "at": self._clock.now_s() + (lead_s if far else LEAD_HERE_S)}
+            jobs = [self._pool.submit(player.ask, self.request, within_s=within_s) for player in self._there()]
+            if request["op"] != "show":
+                with contextlib.suppress(VelaturaError, OSError):
+                    write_atomically(self._saved, json.dumps(self.request).encode(), mode=0o600)
+        moments = []
         for job in jobs:
             try:
                 moments.append(float(job.result()["common_s"]))
             except CodedError as error:
-                lost = error.code in ("link-no-answer", "player-gone", "player-silent", "player-not-running")
-                if all_must or not lost:
-                    failed.append(error)
-        if failed:
-            raise failed[0]
-        self._sequence += 1
-        self._presented_at = max(moments, default=self.clock.now_s()) - self.clock.ahead_s
-        return {"sequence": self._sequence, "presented_at": self._presented_at}
+                if request["op"] == "show" or error.code not in _LOST:
+                    raise
+        at_s = max(moments, default=self._clock.now_s()) - self._clock.ahead_s
+        self._last = PresentedSet(self._last.sequence + 1, at_s)
+        return self._last
 
     # -- what is seen of the players
 
-    def lost(self) -> list[str]:
+    def _lost(self) -> list[str]:
         """Computers that do not answer."""
-        return sorted({p.host for p in self._parts if isinstance(p.player, Remote) and not p.player.there})
+        return sorted({player.host for player in self._players if not player.there})
 
-    def _there(self) -> list[Part]:
-        return [part for part in self._parts if not isinstance(part.player, Remote) or part.player.there]
+    def _there(self) -> list[Screen | Remote]:
+        return [player for player in self._players if player.there]
+
+    def _keep(self) -> None:
+        while not self._ended.wait(_STEP_S):
+            self.step()
 
     def step(self) -> None:
         """A few times a second: look at the clock and every player, and give one that has come back what is due."""
-        self.clock.look()
-        for number, part in enumerate(self._parts):
-            player = part.player
-            if isinstance(player, Screen):
-                part.state = player.step(player.setup.keep_s)
-                self.skew.add(number, part.state.reports)
-                continue
-            part.state = player.state
-            self.skew.add(number, player.take_reports())
-            if player.returned():
-                log(f"The computer {part.host} is here.")
-                if self.bundle is not None:
-                    player.bring(self.bundle)
-            if self._request is not None and self._request["op"] != "show" and player.needs(self._request):
-                self._pool.submit(self._catch_up, player, self._request)
+        self._clock.look()
+        for number, player in enumerate(self._players):
+            self._skew.add(number, player.look())
+            if self._bundle is not None:
+                player.bring(self._bundle)
+            if self.request is not None and self.request["op"] != "show" and player.needs(self.request):
+                self._pool.submit(self._catch_up, player, self.request)
 
-    def _catch_up(self, player: Remote, request: dict[str, Any]) -> None:
+    def _catch_up(self, player: Screen | Remote, request: dict[str, Any]) -> None:
         with contextlib.suppress(CodedError):
             player.ask(request, within_s=_ASKED_S)
 
     def status(self) -> dict[str, Any]:
         """As a player's, of all of them; ``lost_hosts``, and how far they are apart."""
-        states = [part.state.status for part in self._parts]
-        known = [status for status in states if status is not None]
-        missing = [name for part in self._parts for name in _missing(part)]
-        base = dict(known[0]) if known else dict(_NOTHING)
-        troubles = {part.host: part.player.trouble for part in self._parts if isinstance(part.player, Remote)}
+        known = [player.state.status for player in self._players if player.state.status is not None]
+        missing = [
+            name
+            for player in self._players
+            for name in (player.setup.names if player.state.status is None else player.state.status["missing_outputs"])
+        ]
+        base = known[0] if known else _NOTHING
         return {
             **base,
-            "sequence": self._sequence,
-            "presented_at": self._presented_at,
+            "sequence": self._last.sequence,
+            "presented_at": self._last.at_s,
             "missing_outputs": missing,
             "late": sum(status["late"] for status in known),
             "skipped": sum(status["skipped"] for status in known),
-            "bundle": self.identity or base["bundle"],
-            "lost_hosts": self.lost(),
-            "clock_troubles": {"": self.clock.trouble, **troubles} if self._remote else {},
-            **self.skew.figures(),
+            "bundle": self.bundle_identity or base["bundle"],
+            "lost_hosts": self._lost(),
+            "clock_troubles": {"": self._clock.trouble, **{player.host: player.trouble for player in self._players}},
+            **self._skew.figures(),
         }
-
-
-def _missing(part: Part) -> Sequence[str]:
-    status = part.state.status
-    return part.names if status is None else status["missing_outputs"]
 
 
 _NOTHING: Final[Mapping[str, Any]] = {
@@ -265,173 +298,73 @@ _NOTHING: Final[Mapping[str, Any]] = {
 }  # fmt: skip
 
 
-class Service:
-    """The conductor behind the player's socket."""
-
-    def __init__(
-        self, conductor: Conductor, server: Server, inbox: FrameFile, hello: Mapping[str, Any], trust: Any
-    ) -> None:
-        self._conductor, self._server, self._inbox, self._trust = conductor, server, inbox, trust
-        self._hello, self._notifier = dict(hello), Notifier()
-        self._frames = FrameSet.black(conductor.sizes)
-        self._jobs = ThreadPoolExecutor(4, thread_name_prefix="request")
-        self._answers: list[tuple[Client, bytes]] = []
-        self.ended = threading.Event()
-
-    def run(self) -> None:
-        threading.Thread(target=self._keep, daemon=True).start()
-        self._notifier.ready()
-        while not self.ended.is_set():
-            for client, line in self._server.poll(_STEP_S):
-                self._handle(client, line)
-            while self._answers:
-                self._server.send(*self._answers.pop(0))
-            self._notifier.alive()
-        self._notifier.stopping()
-
-    def _keep(self) -> None:
-        while not self.ended.wait(_STEP_S):
-            self._conductor.step()
-
-    def _handle(self, client: Client, line: bytes) -> None:
-        ticket = None
-        try:
-            ticket, request = protocol.parse_request(line)
-            values = self._at_once(request)
-        except protocol.InvalidRequest as error:
-            self._server.send(client, codec.error_line(error.ticket, error))
-        except VelaturaError as error:
-            self._server.send(client, codec.error_line(ticket, error))
-        else:
-            if values is not None:
-                self._server.send(client, codec.answer_line(ticket, values))
-            else:
-                self._jobs.submit(self._later, client, ticket, request, line)
-
-    def _at_once(self, request: protocol.Request) -> dict[str, Any] | None:
-        """The answer of what needs no player, else None. A picture is copied out before the next is written."""
-        match request:
-            case protocol.Hello():
-                return {**self._hello, "bundle": self._conductor.identity}
-            case protocol.Status():
-                return self._conductor.status()
-            case protocol.LoadBundle(path):
-                self._conductor.load(Path(path), self._trust)
-                return {"bundle": self._conductor.identity}
-            case protocol.Quit():
-                self.ended.set()
-                return {}
-            case protocol.Live() | protocol.Clock() | protocol.Reports():
-                raise UsageError(
-                    _LIVE, what="A display of several screens or computers can't show live pictures.",
-                    remedy="Use outputs of one screen for live pictures.",
-                )  # fmt: skip
-        return None
-
-    def _later(self, client: Client, ticket: Any, request: protocol.Request, line: bytes) -> None:
-        try:
-            answer = codec.answer_line(ticket, self._do(request, line))
-        except CodedError as error:
-            answer = codec.error_line(ticket, error)
-        self._answers.append((client, answer))
-        self._server.wake()
-
-    def _do(self, request: protocol.Request, line: bytes) -> dict[str, Any]:
-        conductor = self._conductor
-        match request:
-            case protocol.Show():
-                self._inbox.read(self._frames)
-                return conductor.show(self._named(self._frames))
-            case protocol.Identify():
-                return conductor.show(self._named(identification(conductor.sizes)))
-            case protocol.Stop(fade_s):
-                return conductor.stop(fade_s)
-            case protocol.Suggested(repeat):
-                return conductor.play(conductor.suggested(repeat))
-        plain = {name: value for name, value in json.loads(line).items() if name not in ("id", "at", "bundle")}
-        return conductor.play(plain)
-
-    def _named(self, frames: FrameSet) -> dict[str, Any]:
-        return {size.name: image for size, image in zip(self._conductor.sizes, frames.pixels, strict=True)}
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Conduct until a quit request or a signal; the exit code is as the player's."""
     options = parser().parse_args(arguments)
     try:
-        return _run(options)
+        with contextlib.ExitStack() as stack:
+            return _run(options, stack)
     except VelaturaError as error:
         print(f"{error.what}\n{error.remedy}", file=sys.stderr)  # noqa: T201
         return error.exit_code
 
 
-def _run(options: Any) -> int:
+def _run(options: Any, stack: contextlib.ExitStack) -> int:
     sizes = parse_outputs(options.outputs)
+    server = stack.enter_context(Server(options.socket))
+    inbox = FrameFile(options.socket.with_name(options.socket.name + ".inbox"), sizes)
+    stack.callback(inbox.path.unlink, missing_ok=True)
+    clock = HostClock()
+    players = _players(options, _setups(options, sizes), clock, stack)
+    saved = options.socket.with_name(options.socket.name + SUFFIX)
+    conductor = Conductor(sizes, players, clock, saved, server.wake)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
+        signal.signal(number, lambda came, _: conductor.end(leaving=came == signal.SIGUSR1))
+    first = Suggested(repeat=0) if options.suggested and conductor.request is None else None
+    commands = Commands(cast("Player", conductor), server, inbox, SavedRequest(None), first=first)
+    if options.bundle is not None and options.bundle.exists():
+        conductor.load_bundle(options.bundle)
+    conductor.run(commands.serve, first=commands.resume)
+    return 0
+
+
+def _setups(options: Any, sizes: Sequence[OutputSize]) -> dict[tuple[str, str], Setup]:
+    """By computer ("": this one) and X screen."""
     hosts, where = parse_where(options.host, sizes), parse_where(options.where, sizes)
     places: dict[tuple[str, str], list[OutputSize]] = {}
     for size in sizes:
         host, _, screen = hosts.get(size.name, "").partition("/")
         places.setdefault((host, screen), []).append(size)
-    keys, revoked = ([load_public_key(path).hex() for path in paths] for paths in (options.trusted, options.revoked))
+    trusted, revoked = (
+        tuple(load_public_key(path).hex() for path in paths) for paths in (options.trusted, options.revoked)
+    )
     seconds, then = options.alone.split(",")
-    clock = HostClock()
-    with contextlib.ExitStack() as stack:
-        server = stack.enter_context(Server(options.socket))
-        inbox = FrameFile(options.socket.with_name(options.socket.name + ".inbox"), sizes)
-        stack.callback(inbox.path.unlink, missing_ok=True)
-        link = None
-        if any(host for host, _ in places):
-            from controller.stage.hosts.remote import opened_link
+    return {
+        place: Setup(
+            tuple((size.name, size.width_px, size.height_px) for size in its), options.rate,
+            {size.name: where[size.name] for size in its if size.name in where}, options.frames is not None,
+            trusted, revoked, options.allow_unsigned, float(seconds), then,
+        )
+        for place, its in places.items()
+    }  # fmt: skip
 
-            link = stack.enter_context(opened_link(options.keys, clock, options.port))
-        setups = {
-            place: Setup(
-                tuple((size.name, size.width_px, size.height_px) for size in its), options.rate,
-                {size.name: where[size.name] for size in its if size.name in where}, options.frames is not None,
-                tuple(keys), tuple(revoked), options.allow_unsigned, float(seconds), then,
-            )
-            for place, its in places.items()
-        }  # fmt: skip
-        parts = []
-        for number, ((host, screen), setup) in enumerate(setups.items()):
-            names = tuple(name for name, _, _ in setup.outputs)
-            if link is not None and host:
-                all_of_it = {place[1]: its for place, its in setups.items() if place[0] == host}
-                parts.append(Part(host, Remote(link, host, screen, all_of_it), names))
-                continue
+
+def _players(
+    options: Any, setups: Mapping[tuple[str, str], Setup], clock: HostClock, stack: contextlib.ExitStack
+) -> list[Screen | Remote]:
+    link = None
+    if any(host for host, _ in setups):
+        link = stack.enter_context(opened_link(options.keys, clock, options.port))
+    players: list[Screen | Remote] = []
+    for number, ((host, screen), setup) in enumerate(setups.items()):
+        if link is not None and host:
+            its = {place[1]: one for place, one in setups.items() if place[0] == host}
+            players.append(Remote(link, host, screen, its))
+        else:
             here = Screen(options.socket.parent / f"screen-{number}", clock, display=screen)
             here.prepare(setup)
-            parts.append(Part("", here, names))
-        conductor = Conductor(sizes, parts, clock, options.socket.with_name(options.socket.name + SUFFIX))
-        trust = parts[0].player.setup.trust()
-        outputs = [{"name": s.name, "width_px": s.width_px, "height_px": s.height_px} for s in sizes]
-        hello = {"player": "velatura", "protocol": codec.PROTOCOL, "minor": protocol.MINOR, "pid": os.getpid(),
-                 "rate_hz": options.rate, "outputs": outputs, "inbox": str(inbox.path.resolve())}  # fmt: skip
-        service = Service(conductor, server, inbox, hello, trust)
-        leaving = _end_on_signals(service)
-        if options.bundle is not None and options.bundle.exists():
-            conductor.load(options.bundle, trust)
-        service.run()
-        if not leaving.is_set():
-            with contextlib.suppress(CodedError):
-                conductor.stop(0.0)
-            for part in parts:
-                if isinstance(part.player, Screen):
-                    part.player.end()
-    return 0
-
-
-def _end_on_signals(service: Service) -> threading.Event:
-    leaving = threading.Event()
-
-    def end(number: int, _: object) -> None:
-        if number == signal.SIGUSR1:
-            leaving.set()
-        service.ended.set()
-
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
-        signal.signal(number, end)
-    return leaving
+            players.append(here)
+    return players
 
 
 if __name__ == "__main__":

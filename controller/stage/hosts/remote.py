@@ -8,6 +8,7 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError
+from controller.play.control.notify import log
 from controller.stage.hosts.bundles import PART_BYTES, Offer, message
 from controller.stage.hosts.clock import HostClock
 from controller.stage.hosts.screen import Pictures, Setup, State
@@ -92,6 +94,7 @@ def placed_rows(message: bytes, pictures: dict[tuple[str, str], npt.NDArray[np.u
 SILENT_S: Final = 3.0
 _START_S: Final = 25.0
 _PART_S: Final = 10.0
+_OFFER_S: Final = 60.0
 _AGAIN_S: Final = 1.0
 
 
@@ -123,14 +126,15 @@ class Remote:
     def __init__(self, link: Link, host: str, screen: str, setups: dict[str, Setup]) -> None:
         """``setups``: of all screens of that computer."""
         self._link, self.host, self._screen, self._setups = link, host, screen, setups
-        self.state, self.trouble = State(), ""
+        self._state, self.trouble = State(), ""
         self._reports: list[tuple[float, float, str | None]] = []
         self._heard_s = 0.0
-        self._prepared = self._returned = False
+        self._prepared = False
         self._asked_at: float | None = None
-        self._offer: tuple[Path, Offer] | None = None
-        self._bringing, self._has = threading.Lock(), ""
-        self._sent = 0
+        self._busy = threading.Lock()
+        self._wanted: Path | None = None
+        self._has: str | None = None
+        self._share = 0.0
         link.subscribe(key(host, "state"), Report, self._heard)
 
     # -- what is heard
@@ -139,32 +143,34 @@ class Remote:
         fresh = time.monotonic() - self._heard_s > SILENT_S
         self._heard_s = time.monotonic()
         self.trouble = report.trouble
-        self.state = report.states.get(self._screen, State())
-        self._reports += self.state.reports
-        if (fresh or not report.states) and not self._bringing.locked():
+        self._state = report.states.get(self._screen, State())
+        self._reports += self._state.reports
+        if (fresh or not report.states) and not self._busy.locked():
             self._prepared = False
             threading.Thread(target=self._prepare, daemon=True).start()
 
     def _prepare(self) -> None:
-        with self._bringing, contextlib.suppress(CodedError):
+        with self._busy, contextlib.suppress(CodedError):
             self._link.ask(key(self.host, "prepare"), Wanted(self._setups), type(None), within_s=_START_S)
-            self._asked_at, self._has = None, ""
-            self._prepared = self._returned = True
+            self._asked_at, self._has = None, None
+            self._prepared = True
+            log(f"The computer {self.host} is here.")
 
     @property
     def setup(self) -> Setup:
         return self._setups[self._screen]
 
     @property
+    def state(self) -> State:
+        """Nothing is known of one that is lost."""
+        return self._state if self.there else State()
+
+    @property
     def there(self) -> bool:
         return self._prepared and time.monotonic() - self._heard_s < SILENT_S
 
-    def returned(self) -> bool:
-        """Whether it has come, or come back, since the last question."""
-        returned, self._returned = self._returned, False
-        return returned
-
-    def take_reports(self) -> list[tuple[float, float, str | None]]:
+    def look(self) -> list[tuple[float, float, str | None]]:
+        """New reports."""
         reports, self._reports = self._reports, []
         return reports
 
@@ -176,8 +182,8 @@ class Remote:
 
     def ask(self, request: Mapping[str, Any], *, within_s: float) -> dict[str, Any]:
         request = dict(request)
-        if "bundle" in request and self._offer is not None:
-            request["bundle"] = self._offer[1].name
+        if "bundle" in request:
+            request["bundle"] = self._has
         self._asked_at = request.get("at", self._asked_at)
         try:
             asked = Asked(self._screen, request, within_s)
@@ -187,6 +193,9 @@ class Remote:
                 self._asked_at = None
             raise
 
+    def end(self) -> None:
+        """Its agent and its player stay, and show black."""
+
     def put(self, pictures: Pictures) -> None:
         for output, pixels in pictures.items():
             for rows in rows_of(self._screen, output, pixels):
@@ -194,41 +203,45 @@ class Remote:
 
     def bring(self, bundle: Path) -> None:
         """Bring a bundle there, in a thread, however often the link is cut."""
-        if self._offer is None or self._offer[0] != bundle:
-            self._offer = bundle, Offer.of(bundle)
-        if self.behind and not self._bringing.locked():
+        if self._wanted != bundle:
+            self._wanted, self._has = bundle, None
+        if self.behind and self.there and not self._busy.locked():
             threading.Thread(target=self._bring, daemon=True).start()
 
     @property
     def behind(self) -> bool:
         """Whether the newest bundle is not there yet."""
-        return self._offer is not None and self._has != self._offer[1].name
+        return self._wanted is not None and self._has is None
 
     @property
     def progress(self) -> str:
-        share = self._sent / max(1, len(self._offer[1].parts)) if self._offer is not None else 1.0
-        return f"{self.host} has {share:.0%}"
+        return f"{self.host} has {self._share:.0%}"
 
     def _bring(self) -> None:
-        with self._bringing:
-            while self.behind and self._prepared:
-                assert self._offer is not None
-                path, offer = self._offer
+        with self._busy:
+            while self.behind and self.there:
+                assert self._wanted is not None
+                path = self._wanted
                 try:
-                    missing = self._link.ask(key(self.host, "offer"), offer, tuple[int, ...], within_s=60)
-                    if not missing:
+                    offer = _offer_of(path, path.stat().st_mtime_ns)
+                    missing = self._link.ask(key(self.host, "offer"), offer, tuple[int, ...], within_s=_OFFER_S)
+                    if not missing and path == self._wanted:
                         self._has = offer.name
                     self._send(path, offer, missing)
                 except (CodedError, OSError):
                     time.sleep(_AGAIN_S)
 
     def _send(self, path: Path, offer: Offer, missing: tuple[int, ...]) -> None:
-        self._sent = len(offer.parts) - len(missing)
         with path.open("rb") as file:
-            for number in missing:
-                if self._offer is None or self._offer[1] is not offer:
+            for done, number in enumerate(missing, len(offer.parts) - len(missing)):
+                if path != self._wanted:
                     return
+                self._share = done / len(offer.parts)
                 file.seek(number * PART_BYTES)
                 part = message(offer.name, number, file.read(PART_BYTES))
                 self._link.ask(key(self.host, "part"), part, type(None), within_s=_PART_S)
-                self._sent += 1
+
+
+@lru_cache(maxsize=2)
+def _offer_of(path: Path, changed_ns: int) -> Offer:
+    return Offer.of(path)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,6 @@ from hal.player import Inbox, connected
 from hal.values import OutputInfo
 
 ANSWER_S: Final = 2.0
-BEHIND: Final = "hosts-behind"
 _SHOWS: Final = ("show", "play", "sequence", "stop")
 Pictures = Mapping[str, npt.NDArray[np.uint8]]
 
@@ -54,6 +53,10 @@ class Setup:
     keep_s: float = 3600.0
     then: str = "on"
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _, _ in self.outputs)
+
     def trust(self) -> Trust:
         trusted, revoked = (tuple(map(bytes.fromhex, keys)) for keys in (self.trusted, self.revoked))
         return Trust(trusted, self.allow_unsigned, revoked)
@@ -61,32 +64,21 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a screen says of itself. ``reports``: presentations by the common clock, newest last."""
+    """What a screen reports. ``reports``: presentations by the common clock, newest last."""
 
     status: dict[str, Any] | None = None
     reports: tuple[tuple[float, float, str | None], ...] = ()
 
 
-class Player(Protocol):
-    """One player of several, here or on another computer."""
-
-    setup: Setup
-
-    def ask(self, request: Mapping[str, Any], *, within_s: float) -> dict[str, Any]:
-        """The answer, with ``common_s``: when it was presented on the common clock. Raises CodedError."""
-
-    def put(self, pictures: Pictures) -> None:
-        """Make the pictures of the next ``show`` ready there."""
-
-
 class Screen:
-    """A player of this computer. ``display``: its X screen, "" for the environment's.
+    """A player of this computer. ``display``: its X screen, "" for the environment's."""
 
-    ``attached``: systemd starts it, and ``options`` is the file of its arguments.
-    """
+    host = progress = trouble = ""
+    there, behind = True, False
 
-    def __init__(self, folder: Path, clock: HostClock, *, display: str = "", options: Path | None = None) -> None:
-        self.folder, self._clock, self._display, self._options = folder, clock, display, options
+    def __init__(self, folder: Path, clock: HostClock, *, display: str = "") -> None:
+        self.folder, self._clock, self._display = folder, clock, display
+        self.state = State()
         self.setup = Setup((), 60.0)
         self._player: PlayerProcess | AttachedPlayer | None = None
         self._staged: dict[str, npt.NDArray[np.uint8]] = {}
@@ -108,14 +100,13 @@ class Screen:
         self.setup = setup
         if same and self._player is not None and self._player.alive:
             return
-        if self._options is not None:
-            self._player = AttachedPlayer(self.socket, self._options, settings)
+        left = _Left(self.socket)
+        if same and left.alive:
+            self._player = left
         else:
-            if not same:
-                end_leftover(self.folder)
-            self._player = _Left(self.socket) if same and _Left(self.socket).alive else None
-            self._player = self._player or PlayerProcess(self.folder, settings)
-        self._player.wait_until_ready()
+            end_leftover(self.folder)
+            self._player = PlayerProcess(self.folder, settings)
+            self._player.wait_until_ready()
         noted.write_text(text)
 
     def _settings(self, setup: Setup) -> PlayerSettings:
@@ -136,11 +127,14 @@ class Screen:
         Bundle.open_trusted(bundle, self.setup.trust()).close()
 
     def put(self, pictures: Pictures) -> None:
-        """As ``Player.put``; one output after the other may come."""
+        """Make the pictures of the next ``show`` ready; one output after the other may come."""
         self._staged.update(pictures)
 
     def ask(self, request: Mapping[str, Any], *, within_s: float = ANSWER_S) -> dict[str, Any]:
-        """As ``Player.ask``. Of what has a moment, nothing older is asked after something newer."""
+        """The answer, with ``common_s``: when it was presented on the common clock. Raises CodedError.
+
+        Of what has a moment, nothing older is asked after something newer.
+        """
         request = dict(request)
         with contextlib.ExitStack() as stack:
             with self._order:
@@ -204,19 +198,29 @@ class Screen:
         except (CodedError, OSError, KeyError):
             return State()
 
+    def look(self) -> tuple[tuple[float, float, str | None], ...]:
+        """A step, with the clock for as long as the setup says; new reports."""
+        self.state = self.step(self.setup.keep_s)
+        return self.state.reports
+
+    def needs(self, request: Mapping[str, Any]) -> bool:
+        """Whether it was not asked for this; one that an earlier conductor has left may play it all the same."""
+        return self._last is None or self._last["at"] < request["at"]
+
+    def bring(self, bundle: Path) -> None:
+        """It is here."""
+
     def _again(self, request: dict[str, Any]) -> None:
         with contextlib.suppress(CodedError, OSError):
             self.ask(request)
 
     def end(self) -> None:
-        """Black, and the player's end; one that systemd starts stays."""
+        """Black, and the player's end."""
         if self._player is not None:
             with contextlib.suppress(CodedError, OSError):
                 self.ask({"op": "stop"})
-            if isinstance(self._player, PlayerProcess):
-                self._player.terminate()
-            elif self._options is None:
-                end_leftover(self.folder)
+            end_leftover(self.folder)
+            self._player.terminate()
 
 
 class _Left(AttachedPlayer):

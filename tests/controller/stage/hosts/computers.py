@@ -94,10 +94,10 @@ class Computers:
         return []
 
     def _start(self, name: str, words: Sequence[str]) -> None:
-        log = (self.folder / f"{name}.log").open("ab")
-        self.processes[name] = subprocess.Popen(
-            [*self.prefix(name), sys.executable, "-m", *words], stdout=log, stderr=log
-        )
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(
+                [*self.prefix(name), sys.executable, "-m", *words], stdout=log, stderr=log
+            )
 
     def place(self, name: str) -> Path:
         return self.folder / f"at-{name}"

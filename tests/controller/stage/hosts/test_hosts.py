@@ -66,7 +66,8 @@ def _played(display: PlayerDisplay) -> bool:
     try:
         display.play_sequence([("0", 0.1), ("1", 0.1, 0.05), ("2", 0.1)], deadline=in_seconds(10))
     except DeviceError as error:
-        assert error.code == "hosts-behind"
+        if error.code != "hosts-behind":
+            raise
         return False
     return True
 
