@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from controller.config.loader import FILE
 from controller.core import kiosk_places
@@ -23,6 +23,7 @@ from controller.kiosk.building import protocol as building
 from controller.kiosk.building.protocol import Configured
 from controller.kiosk.building.protocol import read as read_protocols
 from controller.kiosk.operations.dispatch import socket_table
+from controller.kiosk.operations.house import HOUSE_FILE, MEMBERSHIP, House, Stagehouse, no_link
 from controller.kiosk.panel_address import PanelAccess, addresses, bracketed, keep_first_login
 from controller.kiosk.service import Service
 from controller.kiosk.serving import serving
@@ -34,6 +35,10 @@ from controller.stage.sessions.run import leave_runtime_folder, stage_lock
 from hal.errors import CodedError, DeviceError
 from hal.links import host_and_port
 from hal.notices import Level
+
+if TYPE_CHECKING:
+    from controller.kiosk.house.house import House as OpenHouse
+    from controller.kiosk.house.member import Member
 
 RETRY_S: Final = 5.0
 _NO_STAGE: Final = "There is no stage yet. Set it up in the panel."
@@ -98,6 +103,7 @@ def serve(
             notifier.ready()
             return opened
 
+        kiosk.house = _linked(stack, kiosk, reporter)
         stack.callback(_leave_runtime_folder, stage)
         stack.callback(notifier.stopping)
         first, socket_served, entrance, reported = True, False, None, ""
@@ -137,6 +143,53 @@ def _leave_runtime_folder(stage: Path) -> None:
     # Another program that has the stage by now uses the folder, too.
     with contextlib.suppress(UsageError), stage_lock(stage):
         leave_runtime_folder(stage)
+
+
+def _linked(stack: contextlib.ExitStack, kiosk: StageKiosk, reporter: Reporter) -> House:
+    """This kiosk as a house (where it has a house.toml), and as a member of one; only then Zenoh is loaded. What is
+    wrong with either must not keep the stage dark, so it is only reported.
+    """
+    members: list[Member] = []
+
+    def member() -> Member:
+        try:
+            from controller.kiosk.house.member import Member
+        except ImportError as error:
+            raise no_link() from error
+        if not members:
+            members.append(stack.enter_context(Member(kiosk, kiosk.stage)))
+        return members[0]
+
+    def house() -> Stagehouse:
+        if problem is not None:
+            raise problem
+        return opened[0]
+
+    problem: VelaturaError | None = None
+    opened: list[Stagehouse] = []
+    is_house = (kiosk.stage / HOUSE_FILE).exists()
+    try:
+        if (kiosk.stage / MEMBERSHIP).exists():
+            member()
+        if is_house:
+            opened.append(stack.enter_context(_house(kiosk)))
+    except VelaturaError as error:
+        problem = error
+        kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
+        reporter.say(f"{error.what} {error.remedy} The stage runs without its house.", Level.ERROR)
+    return House(house, member) if is_house else House(member=member)
+
+
+def _house(kiosk: StageKiosk) -> OpenHouse:
+    """Raises UsageError("no-house-link") and as ``house_settings`` and ``OpenHouse``."""
+    try:
+        from controller.kiosk.house.house import House as OpenHouse
+        from controller.kiosk.house.house import house_settings
+    except ImportError as error:
+        raise no_link() from error
+    settings = house_settings(kiosk.stage)
+    assert settings is not None
+    return OpenHouse(kiosk.stage, settings, kiosk.record)
 
 
 def _protocols(kiosk: StageKiosk, reporter: Reporter) -> Sequence[Configured]:
@@ -252,7 +305,7 @@ def _panel(kiosk: StageKiosk, where: PanelAddress, reporter: Reporter) -> Iterat
         kiosk.warn("certificate", problem)
     accounts = kiosk.held_accounts()
     password = accounts.first_start()
-    app = make_panel(kiosk, accounts, options)
+    app = make_panel(kiosk, accounts, options, house=kiosk.house)
     kiosk.sessions_ended = app.state.panel.sessions.end_all
     server = PanelServer(app, options)
     address = server.start()

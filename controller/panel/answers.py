@@ -16,6 +16,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.kiosk.operations.dispatch import CALLER
 from controller.kiosk.operations.fields import Sent, Values, parse
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.panel.context import Panel
@@ -57,6 +58,7 @@ async def run(panel: Panel, operation: Operation, values: Values, who: str) -> A
     targets = [field.name for field in operation.fields if field.sent is Sent.TARGET]
 
     def do() -> Any:
+        CALLER.set(who)
         with operation.logged(panel.kiosk.record, who, values):
             files = {name: panel.targets.path(values[name]) for name in targets}
             return operation.function(panel.holders[operation.holder], **values | files)

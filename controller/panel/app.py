@@ -19,6 +19,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.house import House
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.panel_address import EVERYWHERE
@@ -43,8 +44,9 @@ STATIC: Final = ("style.css", "panel.js", "looks.js", "icon.svg", *FONTS)
 
 
 def make_panel(
-    kiosk: Kiosk, accounts: Accounts, options: PanelOptions, operations: Sequence[Operation] = OPERATIONS
-) -> Starlette:
+    kiosk: Kiosk, accounts: Accounts, options: PanelOptions, operations: Sequence[Operation] = OPERATIONS,
+    house: House | None = None,
+) -> Starlette:  # fmt: skip
     """The panel of ``kiosk``, ready to be served.
 
     The caller calls ``accounts.first_start()`` and shows the one-time password. The table of routes is at
@@ -70,6 +72,7 @@ def make_panel(
         targets=Targets(options.folder / "targets", options.uploads, fitted=kiosk.fitted, view_px=kiosk.view_px),
         hub=Hub(draw, frames_per_s=options.frames_per_s, most=options.most_open_panels),
         operations=operations,
+        house=house or House(),
     )
     with contextlib.suppress(*FAILURES):
         drawing.use_zone(kiosk.schedule().time_zone)

@@ -13,6 +13,7 @@ import anyio
 
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.accounts import Accounts as AccountsInUse
+from controller.kiosk.operations.house import House
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts
@@ -62,6 +63,7 @@ class Panel:
     targets: Targets
     hub: Hub
     operations: Sequence[Operation] = OPERATIONS
+    house: House = field(default_factory=House)
     by_address: LoginLimit = field(default_factory=LoginLimit)
     # High, so that wrong passwords from elsewhere can't lock a technician out.
     by_account: LoginLimit = field(default_factory=lambda: LoginLimit(burst=50))
@@ -80,7 +82,7 @@ class Panel:
     def holders(self) -> dict[str, Any]:
         """What operations work on, by the name of their first parameter."""
         accounts = AccountsInUse(lambda: self.accounts, self.sessions.end_all, self.costly)
-        return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets}
+        return {"kiosk": self.kiosk, "accounts": accounts, "targets": self.targets, "house": self.house}
 
     async def in_thread(self, question: Callable[[], T]) -> T:
         """Call ``question`` in a thread, because the kiosk is not asynchronous."""

@@ -161,6 +161,11 @@ ACCOUNT: Final = group(
     "People who may log in at the stage's panel, and tokens for programs.",
     {"Commands": (list_, *commands("kiosk account").values())},
 )
+HOUSE: Final = group(
+    "house",
+    "A house of many stages on one page, and this stage's place in one.",
+    {"Commands": tuple(commands("kiosk house").values())},
+)
 _SHOWN: Final = ("start", "stop", "show", "rotate", "next", "black", "pause", "brightness", "identify")
 _WORK: Final = ("calibrate", "photograph", "cancel", "appearances", "add", "remove", "canvas", "reach")
 
@@ -172,7 +177,7 @@ def _members() -> Members:
         "Run it": (serve, agent, install, uninstall, status, events),
         "What it shows": shown,
         "Calibration and appearances": (*work, results, aim),
-        "Look after it": (schedule, settings, ACCOUNT, *derived.values()),
+        "Look after it": (schedule, settings, ACCOUNT, HOUSE, *derived.values()),
     }
 
 

@@ -14,6 +14,7 @@ from controller.kiosk.api import finding
 from controller.kiosk.api.folder import FolderKiosk
 from controller.kiosk.api.snapshot import Snapshots
 from controller.kiosk.operations.accounts import Accounts as AccountsInUse
+from controller.kiosk.operations.house import House
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.kiosk.service import Service
 from controller.kiosk.state import EventLevel, EventRow, KioskState
@@ -40,6 +41,7 @@ class AttachedKiosk(FolderKiosk):
         self._world = world or World()
         self.reload = self._world.event()
         self.accounts: Accounts | None = None
+        self.house = House()
         self.sessions_ended: Callable[[str], object] = lambda name: None
         self._service: Service | None = None
         self._lock = threading.RLock()
@@ -88,7 +90,7 @@ class AttachedKiosk(FolderKiosk):
 
     def holders(self) -> dict[str, Any]:
         """The holders of the socket's operations."""
-        return {"kiosk": self, "accounts": AccountsInUse(self.held_accounts, self._end_sessions)}
+        return {"kiosk": self, "accounts": AccountsInUse(self.held_accounts, self._end_sessions), "house": self.house}
 
     def _end_sessions(self, name: str) -> None:
         # Looked up late, because a panel may be attached after the socket.

@@ -49,6 +49,7 @@ from controller.kiosk.operations.arguments import (
     UpToNumber,
     WithPhotographs,
 )
+from controller.kiosk.operations.house import HOUSE_OPERATIONS
 from controller.kiosk.operations.operation import Download, Effect, Jpeg, Names, Operation, Page, Picture, operation
 from controller.kiosk.roles import Role
 from controller.kiosk.schedule import expanded
@@ -529,6 +530,10 @@ def job(kiosk: Kiosk, number: JobNumber) -> Job | None:
     return kiosk.job(number)
 
 
-_DECLARED: Final = (*(each for each in list(globals().values()) if isinstance(each, Operation)), *ACCOUNT_OPERATIONS)
+_DECLARED: Final = (
+    *(each for each in list(globals().values()) if isinstance(each, Operation)),
+    *ACCOUNT_OPERATIONS,
+    *HOUSE_OPERATIONS,
+)
 OPERATIONS: Final[tuple[Operation, ...]] = tuple(each for each in _DECLARED if each.http)
 AT_SOCKET: Final[tuple[Operation, ...]] = _DECLARED

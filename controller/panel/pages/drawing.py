@@ -35,6 +35,7 @@ STATES: Final = {
 """Label and style of each state."""
 NOTHING_YET: Final = mark("Nothing to show yet")
 NOTHING_PLAYS: Final = mark("Nothing plays")
+UNKNOWN: Final = mark("Nothing is known yet")
 UNKNOWN_TIME: Final = mark("at an unknown time")
 
 EVENTS_SHOWN: Final = 200
@@ -138,6 +139,7 @@ class Drawing:
             "colour_differences": curves.colour_differences, "sharpness_of": curves.sharpness_of,
             "source_word": lambda kind: spoken.SOURCES.get(kind, ""), "nothing_yet": NOTHING_YET,
             "drift_word": lambda advice: spoken.DRIFTS.get(advice, advice), "nothing_plays": NOTHING_PLAYS,
+            "mark_unknown": UNKNOWN,
             "scene_word": lambda scene: gettext(spoken.SCENES.get(scene.name, scene.name.removesuffix(".blend"))),
         }  # fmt: skip
         self._environment = environment

@@ -7,7 +7,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from starlette.responses import RedirectResponse, Response
 from controller.core.errors import UsageError
 from controller.kiosk.operations.arguments import HoursRow
 from controller.kiosk.operations.fields import Values, missing, parse
+from controller.kiosk.operations.house import Invitation
 from controller.kiosk.operations.operation import Answer, Operation
 from controller.kiosk.operations.table import schedule_of
 from controller.kiosk.store.accounts import Role
@@ -46,6 +47,8 @@ LEADS_TO: Final = {
     "fit-target": "/appearances/new/{target}",
     "outline-target": "/appearances/new/{target}",
     "set-schedule": "/schedule",
+    **dict.fromkeys(("house-open", "house-close", "house-play", "house-add", "house-remove"), "/house"),
+    **dict.fromkeys(("house-join", "house-leave"), "/house"),
     "test-shots": "/aiming",
     "save-settings": "/settings",
 }
@@ -129,7 +132,8 @@ class Forms:
                 self._pages.prepare_reach(result.target if isinstance(result, NewTarget) else values["target"])
             if operation.answer is Answer.FILE:
                 return answers.response(operation, result, values)
-            visitor.session.notes.append(("good", gettext(self._done(operation)).format_map(values)))
+            made = asdict(result) if isinstance(result, Invitation) else {}
+            visitor.session.notes.append(("good", gettext(self._done(operation)).format_map(values | made)))
             return RedirectResponse("/" if back == "/" else _then(operation, result, values), 303)
 
         return answer

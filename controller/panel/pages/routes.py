@@ -10,7 +10,7 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, HTMLResponse, RedirectResponse, Response, StreamingResponse
 
 from controller.core.errors import UsageError
 from controller.kiosk.operations.fields import parse
@@ -32,6 +32,7 @@ _CAUSES: Final = [(cause.name.lower(), name) for cause, (name, _, _) in error_ca
 GROUPS: Final = (mark("Show"), mark("Calibration"), mark("System"))
 NAVIGATION: Final = (
     ("/", mark("Now"), Role.VIEWER, "Show"),
+    ("/house", mark("House"), Role.VIEWER, "Show"),
     ("/appearances", mark("Appearances"), Role.VIEWER, "Show"),
     ("/schedule", mark("Schedule"), Role.VIEWER, "Show"),
     ("/results", mark("Results"), Role.VIEWER, "Calibration"),
@@ -46,6 +47,7 @@ NAVIGATION: Final = (
 BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results", "/changes": "/doctor"}
 """Pages that are not in the navigation, and those that they belong to."""
 NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
+HOUSE_EVENTS: Final = 50
 FRAMED: Final = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:; "
     "frame-ancestors 'self'",
@@ -67,8 +69,10 @@ class Group:
     chosen: bool
 
 
-def _navigation(role: Role, here: str) -> list[Group]:
-    allowed = [entry for entry in NAVIGATION if role >= entry[2]]
+def _navigation(role: Role, here: str, *, house: bool) -> list[Group]:
+    """``house``: this kiosk is that of a house; any other may join one, which a technician does."""
+    least = {} if house else {"/house": Role.TECHNICIAN}
+    allowed = [entry for entry in NAVIGATION if role >= least.get(entry[0], entry[2])]
     at = "/" + here.split("/")[1]
     at = BELOW.get(at, at)
     groups = []
@@ -96,6 +100,7 @@ class Pages:
     def entries(self) -> list[Entry]:
         table: list[tuple[str, Role, str, Facts]] = [
             ("/", Role.VIEWER, "now.html", self._now),
+            ("/house", Role.VIEWER, "house.html", self._house),
             ("/appearances", Role.VIEWER, "appearances.html", self._appearances),
             ("/schedule", Role.VIEWER, "schedule.html", self._schedule),
             ("/results", Role.VIEWER, "results.html", self._results),
@@ -130,6 +135,7 @@ class Pages:
             Entry("GET", f"/late/{path}", "session", Role.OPERATOR, self._late(name, facts))
             for path, name, facts in late
         ]
+        entries.append(Entry("GET", "/late/house", "session", Role.VIEWER, self._late_house))
         entries.append(Entry("GET", "/shown/{run}", "session", Role.VIEWER, self._report))
         return [*entries, Entry("GET", "/live", "session", Role.VIEWER, self._live)]
 
@@ -146,7 +152,7 @@ class Pages:
             "visitor": visitor,
             "csrf": session.csrf,
             "notes": notes,
-            "navigation": _navigation(visitor.role, str(facts.get("here", "/"))),
+            "navigation": _navigation(visitor.role, str(facts.get("here", "/")), house=self._panel.house.there),
             "may": lambda name: visitor.role >= self._least[name],
             "typed": {},
         }
@@ -154,6 +160,9 @@ class Pages:
 
     def _page(self, template: str, facts: Facts) -> Callable[[Request, Visitor], Awaitable[Response]]:
         async def answer(request: Request, visitor: Visitor) -> Response:
+            if template == "now.html" and self._panel.house.there and self._panel.kiosk.snapshot().needs_setup:
+                # A house needs no stage of its own.
+                return RedirectResponse("/house", 303)
             try:
                 values = await self._panel.in_thread(lambda: facts(request))
                 return await self.show(template, visitor, {"here": request.url.path} | values)
@@ -225,6 +234,28 @@ class Pages:
             return {"appearances": [], "photographed": {}}
         photographed = {one.name: one.history[0] for one in kiosk.comparisons() if "achieved" in one.pictures}
         return {"appearances": list(kiosk.appearances()), "photographed": photographed}
+
+    def _house(self, _: Request) -> dict[str, Any]:
+        """None as the house where a technician may let this stage join one."""
+        if not self._panel.house.there:
+            return {"house": None}
+        house = self._panel.house.open()
+        now, rows = house.now(), house.events()[-HOUSE_EVENTS:][::-1]
+        names = sorted({name for stage in now.stages for name in stage.appearances})
+        return {"house": now, "names": names, "rows": rows}
+
+    async def _late_house(self, _: Request, visitor: Visitor) -> Response:
+        """The stages again, for an open page."""
+        assert visitor.session is not None
+        values = {"csrf": visitor.session.csrf, "may": lambda name: visitor.role >= self._least[name]}
+
+        def drawn() -> str:
+            return self._drawing.page("late_house.html", {"house": self._panel.house.open().now(), **values})
+
+        try:
+            return HTMLResponse(await self._panel.in_thread(drawn))
+        except answers.FAILURES as error:
+            return answers.failure(error)
 
     def _aiming(self, _: Request) -> dict[str, Any]:
         kiosk = self._panel.kiosk

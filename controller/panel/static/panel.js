@@ -131,7 +131,18 @@
       for (const inner of place.querySelectorAll("[data-late]")) late(inner);
     } else place.querySelector(".waiting").textContent = body.dataset.lateLost;
   }
-  for (const place of document.querySelectorAll("[data-late]")) late(place);
+  for (const place of document.querySelectorAll("[data-late]")) {
+    if (!place.dataset.again) late(place);
+    // Not while somebody is about to press something there.
+    else setInterval(() => { if (!document.hidden && !place.matches(":hover, :focus-within")) again(place); }, 1000 * place.dataset.again);
+  }
+  async function again(place) {
+    try {
+      const answer = await fetch(place.dataset.late, { redirect: "manual" });
+      const html = answer.ok ? await answer.text() : "";
+      if (html && place.dataset.drawn !== html) { place.innerHTML = html; place.dataset.drawn = html; }
+    } catch { /* not reachable: the next time brings it */ }
+  }
 
   for (const range of document.querySelectorAll("input[type=range]")) {
     const shown = document.querySelector(`output[for=${range.id}]`);

@@ -123,10 +123,10 @@ class Joining:
         with self._lock:
             if self._over.is_set() or self._boxes is None:
                 raise _expired()
-            told = _opened(self._boxes[0], sealed, _Admitted)
-            member = Membership(self._folder, self._name, told.house, told.endpoints)
+            sent = _opened(self._boxes[0], sealed, _Admitted)
+            member = Membership(self._folder, self._name, sent.house, sent.endpoints)
             try:
-                join(member, self._key, told.certificate.encode(), told.authority.encode())
+                join(member, self._key, sent.certificate.encode(), sent.authority.encode())
             except CodedError as error:
                 self._end(error)
                 raise
@@ -162,9 +162,9 @@ def admit(authority: Authority, address: str, code: str, endpoints: tuple[str, .
         except (SPAKEError, ValueError) as error:
             raise _wrong() from error
         certificate = authority.admit(asked.request.encode(), asked.name, host)
-        told = _Admitted(certificate.decode(), (authority.folder / AUTHORITY).read_text(), authority.name, endpoints)
+        sent = _Admitted(certificate.decode(), (authority.folder / AUTHORITY).read_text(), authority.name, endpoints)
         try:
-            link.ask("join/admitted", bytes(ours.encrypt(packed(told))), type(None), within_s=_WITHIN_S)
+            link.ask("join/admitted", bytes(ours.encrypt(packed(sent))), type(None), within_s=_WITHIN_S)
         except CodedError:
             authority.remove(asked.name)
             raise

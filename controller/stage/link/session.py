@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -18,7 +20,7 @@ import zenoh
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import from_json, to_json
 
-from controller.core.errors import WorkError
+from controller.core.errors import SEND_DIAGNOSTICS, WorkError
 from controller.stage.link.membership import AUTHORITY, CERTIFICATE, KEY, Authority, Member, Membership
 from hal.errors import CodedError
 
@@ -26,6 +28,8 @@ T = TypeVar("T")
 PORT: Final = 7447
 MOST_BYTES: Final = 8 << 20
 """Of one message; what is larger is sent in parts."""
+ALONE_S: Final = 4.0
+CLOSING_S: Final = 2.0
 _MOST_HANDLERS: Final = 8
 _RETRY: Final = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 1.5}
 _MESSAGES: Final = (
@@ -55,7 +59,7 @@ def unpacked(kind: type[T], data: bytes) -> T:
 
 
 class Link:
-    """An open session; a context manager. Handlers run in threads of their own and must not raise.
+    """An open session; a context manager. What answers runs in threads of its own.
 
     A member that can't reach the house tries again for as long as the link is open, and so does not wait for it.
     """
@@ -69,19 +73,48 @@ class Link:
         }
         link = {"protocols": [protocol], "rx": {"max_message_size": MOST_BYTES}}
         link |= {"tls": config["tls"]} if "tls" in config else {}
-        own = {key: value for key, value in config.items() if key != "tls"}
+        own = {key: value for key, value in config.items() if key not in ("tls", "alone_s")}
+        self._config = json.dumps(shared | own | {"transport": {"link": link}})
+        self._declarations: list[Callable[[], object]] = []
+        self._declared: list[object] = []
+        """What Zenoh would take back once nothing holds it."""
+        self._answering: set[Future[None]] = set()
+        self._handlers = ThreadPoolExecutor(_MOST_HANDLERS, thread_name_prefix="link")
+        self._opening, self._ended = threading.Lock(), threading.Event()
+        self._session = self._opened()
+        if "alone_s" in config:
+            threading.Thread(target=self._not_alone, args=(config["alone_s"],), name="link", daemon=True).start()
+
+    def _opened(self) -> zenoh.Session:
         try:
-            text = json.dumps(shared | own | {"transport": {"link": link}})
-            self._session = zenoh.open(zenoh.Config.from_json5(text))
+            return zenoh.open(zenoh.Config.from_json5(self._config))
         except zenoh.ZError as error:
             raise WorkError(
                 "link-not-opened",
                 what=f"The link to other computers could not be opened: {str(error)[:200]}",
                 remedy="Check that no other program uses its port, and start again.",
             ) from error
-        self._declared: list[object] = []
-        """What Zenoh would take back once nothing holds it."""
-        self._handlers = ThreadPoolExecutor(_MOST_HANDLERS, thread_name_prefix="link")
+
+    def _not_alone(self, alone_s: float) -> None:
+        """Open the session again where it has been with no other for a while: Zenoh may cease to try, as after a house
+        that restarted while the connection was being made.
+        """
+        alone_since_s = time.monotonic()
+        while not self._ended.wait(1.0):
+            if self._session.info.peers_zid():
+                alone_since_s = time.monotonic()
+            elif time.monotonic() - alone_since_s > alone_s:
+                alone_since_s = time.monotonic()
+                with self._opening, contextlib.suppress(WorkError):
+                    if not self._ended.is_set():
+                        self._session.close()  # type: ignore[no-untyped-call] # of the extension
+                        self._session = self._opened()
+                        self._declared = [declare() for declare in self._declarations]
+
+    def _declare(self, declare: Callable[[], object]) -> None:
+        with self._opening:
+            self._declarations.append(declare)
+            self._declared.append(declare())
 
     def __enter__(self) -> Link:
         return self
@@ -90,14 +123,20 @@ class Link:
         self.close()
 
     def close(self) -> None:
-        self._session.close()  # type: ignore[no-untyped-call] # of the extension
+        """What is being answered is answered, if that is soon."""
+        wait(tuple(self._answering), CLOSING_S)
+        self._ended.set()
+        with self._opening:
+            self._session.close()  # type: ignore[no-untyped-call] # of the extension
         self._handlers.shutdown(wait=False, cancel_futures=True)
 
     def publish(self, key: str, value: Any, *, urgent: bool = False) -> None:
-        """Send to all who subscribed; never waits for the network. ``urgent``: at once, before all else."""
+        """Send to all who subscribed, unless it is closed; never waits for the network. ``urgent``: before all else."""
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
-        self._session.put(key, packed(value), priority=priority, express=urgent,
-                          congestion_control=zenoh.CongestionControl.DROP)  # fmt: skip
+        # It may be closed, or be opened again just now.
+        with contextlib.suppress(zenoh.ZError):
+            self._session.put(key, packed(value), priority=priority, express=urgent,
+                              congestion_control=zenoh.CongestionControl.DROP)  # fmt: skip
 
     def subscribe(self, key: str, kind: type[T], heard: Callable[[T], object]) -> None:
         """Call ``heard`` for each value, in order, in Zenoh's thread: it must return at once. What is not of this
@@ -108,19 +147,25 @@ class Link:
             with contextlib.suppress(WorkError):
                 heard(unpacked(kind, one.payload.to_bytes()))
 
-        self._declared.append(self._session.declare_subscriber(key, sample))
+        self._declare(lambda: self._session.declare_subscriber(key, sample))
 
     def answer(self, key: str, kind: type[T], answers: Callable[[T], Any]) -> None:
         """Answer questions of this type; a ``CodedError`` that ``answers`` raises is raised where it was asked."""
-        self._declared.append(
-            self._session.declare_queryable(key, lambda query: self._handlers.submit(_answered, query, kind, answers))
-        )
+
+        def asked(query: zenoh.Query) -> None:
+            answering = self._handlers.submit(_answered, query, kind, answers)
+            self._answering.add(answering)
+            answering.add_done_callback(self._answering.discard)
+
+        self._declare(lambda: self._session.declare_queryable(key, asked))
 
     def ask(self, key: str, question: Any, kind: type[T], *, within_s: float = 10.0) -> T:
         """Ask, and wait for the answer. Raises WorkError("link-no-answer", "link-message-wrong") and what the other
         side raised, with its code.
         """
-        for reply in self._session.get(key, payload=packed(question), timeout=within_s):
+        for reply in (
+            () if self._session.is_closed() else self._session.get(key, payload=packed(question), timeout=within_s)
+        ):
             if reply.ok is not None:
                 return unpacked(kind, reply.ok.payload.to_bytes())
             assert reply.err is not None
@@ -135,7 +180,7 @@ class Link:
 
     def appear(self, key: str) -> None:
         """Others see by ``watch`` that this session is there, until it ends or is cut off."""
-        self._declared.append(self._session.liveliness().declare_token(key))
+        self._declare(lambda: self._session.liveliness().declare_token(key))
 
     def watch(self, key: str, heard: Callable[[bool], object]) -> None:
         """Call ``heard`` with True when ``key`` appears, now or later, and False when it is gone."""
@@ -143,7 +188,7 @@ class Link:
         def sample(one: zenoh.Sample) -> None:
             heard(one.kind == zenoh.SampleKind.PUT)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(key, sample, history=True))
+        self._declare(lambda: self._session.liveliness().declare_subscriber(key, sample, history=True))
 
 
 def _answered(query: zenoh.Query, kind: type[T], answers: Callable[[T], Any]) -> None:
@@ -153,6 +198,9 @@ def _answered(query: zenoh.Query, kind: type[T], answers: Callable[[T], Any]) ->
             data = packed(answers(unpacked(kind, sent)))
         except CodedError as error:
             query.reply_err(to_json({"code": error.code, "what": error.what, "remedy": error.remedy}))
+        except Exception as error:  # noqa: BLE001 - the last boundary of this thread: it answers and continues
+            what = f"The other computer met an unexpected error ({type(error).__name__})."
+            query.reply_err(to_json({"code": "crash", "what": what, "remedy": SEND_DIAGNOSTICS}))
         else:
             query.reply(query.key_expr, data)
 
@@ -183,6 +231,7 @@ def member_link(membership: Membership) -> Link:
     """A member's side. Raises WorkError("link-not-opened")."""
     endpoints = list(membership.endpoints)
     return Link({
+        "alone_s": ALONE_S,
         "connect": {"endpoints": endpoints, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
         "listen": {"endpoints": []},
         "tls": _files(membership.folder, "connect"),

@@ -17,6 +17,7 @@ from argon2 import PasswordHasher
 from starlette.applications import Starlette
 
 from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.house import House
 from controller.kiosk.operations.operation import Operation
 from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.store.accounts import Accounts, Role
@@ -84,11 +85,11 @@ def csrf(page: str) -> str:
 @contextlib.contextmanager
 def served(
     kiosk: Kiosk, folder: Path, *, port: int = 0, options: PanelOptions | None = None, accounts: Accounts | None = None,
-    operations: Sequence[Operation] = OPERATIONS,
+    operations: Sequence[Operation] = OPERATIONS, house: House | None = None,
 ) -> Iterator[Served]:  # fmt: skip
     accounts = accounts or accounts_in(folder)
     options = dataclasses.replace(options or PanelOptions(folder=folder, frames_per_s=20), port=port)
-    app = make_panel(kiosk, accounts, options, operations)
+    app = make_panel(kiosk, accounts, options, operations, house)
     # A panel for a network is tried out on the loopback, too.
     server = PanelServer(app, dataclasses.replace(options, host="127.0.0.1"))
     address = server.start()

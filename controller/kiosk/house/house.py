@@ -1,0 +1,303 @@
+"""A kiosk that is the house of many stages: what each last reported, orders to one, a group or all, one event log, and
+one place for the backups of all. Its settings are ``house.toml`` in the folder of its stage.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+import tomllib
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import BaseModel, Field, ValidationError
+
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.files import read_text
+from controller.core.storage import sha256_of
+from controller.kiosk.backup import OURS
+from controller.kiosk.backup import Folder as BackupFolder
+from controller.kiosk.house.member import PART_BYTES, MadeBackup, Order, Report
+from controller.kiosk.operations.dispatch import CALLER
+from controller.kiosk.operations.house import HOUSE_FILE, HouseEvent, HouseNow, StageNow
+from controller.kiosk.panel_address import own_addresses
+from controller.kiosk.state import EventLevel
+from controller.stage.link.joining import admit
+from controller.stage.link.membership import Authority
+from controller.stage.link.session import PORT, house_link
+from hal.errors import CodedError
+
+FOLDER: Final = "keys/house-authority"
+MOST_EVENTS: Final = 2000
+_AT_ONCE: Final = 16
+_ORDER_S: Final = 10.0
+_BACKUP_S: Final = 3600.0
+_LOOK_S: Final = 30.0
+_BACKUP_WINDOW_S: Final = 6 * 3600.0
+_AGAIN_S: Final = 1800.0
+
+Record = Callable[[str, str, EventLevel], object]
+
+
+class HouseSettings(BaseModel, extra="forbid"):
+    """house.toml. ``groups``: stages by the name of a group; ``addresses``: where stages reach the house, beside the
+    name and the numbers of this computer; ``backups``: a folder; ``backup_at``: local time; ``keep``: of each stage.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    groups: dict[str, list[str]] = {}
+    addresses: list[str] = []
+    port: Annotated[int, Field(ge=1, le=65535)] = PORT
+    backups: Path | None = None
+    backup_at: Annotated[str, Field(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "04:00"
+    keep: Annotated[int, Field(ge=1, le=1000)] = 14
+
+
+def house_settings(stage: Path) -> HouseSettings | None:
+    """None without a house.toml. Raises UsageError("house-toml-wrong")."""
+    file = stage / HOUSE_FILE
+    if not file.exists():
+        return None
+    try:
+        return HouseSettings.model_validate(tomllib.loads(read_text(file)))
+    except (OSError, ValueError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
+        raise UsageError(
+            "house-toml-wrong", what=f"{HOUSE_FILE} can't be used: {why[:200]}.", remedy="Correct it, and start again."
+        ) from error
+
+
+@dataclass(slots=True)
+class _Stage:
+    """What the house knows of one."""
+
+    linked: bool = False
+    report: Report | None = None
+    picture: bytes = b""
+    shown: tuple[str, str] = ("", "")
+    """The appearance and bundle of ``picture``."""
+    backup_again_s: float = 0.0
+    events: deque[HouseEvent] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+
+
+class House:
+    """``operations.house.Stagehouse``; a context manager. ``record``: adds to the event log of this kiosk."""
+
+    def __init__(self, stage: Path, settings: HouseSettings, record: Record, *, host: str = "[::]") -> None:
+        """Raises UsageError("house-keys-damaged"), WorkError("link-not-opened")."""
+        self._stage, self._settings, self._record, self._host = stage, settings, record, host
+        self._authority = Authority(stage / FOLDER, settings.name)
+        self._stages: dict[str, _Stage] = {}
+        self._openings = 0
+        self._changing, self._ended = threading.Lock(), threading.Event()
+        self._pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="house")
+        self._open()
+        self._thread = threading.Thread(target=self._look_after, name="house backups", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> House:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._link.close()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _open(self) -> None:
+        """A link for the members of now."""
+        link = self._link = house_link(self._authority, host=self._host, port=self._settings.port)
+        self._openings += 1  # what an older link still says counts no more
+        self._stages = {name: self._stages.get(name, _Stage()) for name in self._authority.members}
+        for name, stage in self._stages.items():
+            stage.linked = False
+            link.subscribe(f"member/{name}/state", Report, partial(self._hear, name))
+            link.watch(f"member/{name}/here", partial(self._appear, name, self._openings))
+
+    def _appear(self, name: str, opening: int, here: bool) -> None:
+        if opening != self._openings or self._ended.is_set():
+            return
+        self._stages[name].linked = here
+        if here:
+            self._pool.submit(self._greet, name)
+
+    def _greet(self, name: str) -> None:
+        """Ask for all that a stage said before it was linked."""
+        with contextlib.suppress(CodedError):
+            self._hear(name, self._link.ask(f"member/{name}/report", b"", Report))
+
+    def _hear(self, name: str, report: Report) -> None:
+        stage = self._stages.get(name)
+        if stage is None or self._ended.is_set():
+            return
+        last = stage.events[-1].event.number if stage.events else 0
+        stage.events.extend(HouseEvent(name, row) for row in report.events if row.number > last)
+        stage.report, stage.linked = report, True
+        shown = (report.state.playing, report.state.bundle.digest if report.state.bundle else "")
+        if shown != stage.shown:
+            stage.shown = shown
+            with contextlib.suppress(RuntimeError):  # the house ends just now
+                self._pool.submit(self._look, name)
+
+    def _look(self, name: str) -> None:
+        try:
+            self._stages[name].picture = self._link.ask(f"member/{name}/picture", b"", bytes)
+        except (CodedError, KeyError):
+            if (stage := self._stages.get(name)) is not None:
+                stage.shown = ("", "")  # it is asked again with the next report
+
+    def now(self) -> HouseNow:
+        stages = sorted(map(self._now, self._stages), key=lambda one: (-one.urgency, one.name))
+        return HouseNow(self._settings.name, tuple(stages), tuple(self._settings.groups))
+
+    def _now(self, name: str) -> StageNow:
+        stage = self._stages[name]
+        report = stage.report
+        groups = tuple(group for group, names in self._settings.groups.items() if name in names)
+        return StageNow(
+            name, stage.linked, None if report is None else report.state, groups,
+            () if report is None else report.appearances, "" if report is None else report.version,
+            self._newest_backup(name),
+        )  # fmt: skip
+
+    def picture(self, stage: str) -> bytes | None:
+        return self._known(stage).picture or None
+
+    def events(self) -> Sequence[HouseEvent]:
+        rows = [row for stage in list(self._stages.values()) for row in list(stage.events)]
+        return sorted(rows, key=lambda row: row.event.unix_s)[-MOST_EVENTS:]
+
+    def do(self, stages: str, verb: str, **values: object) -> None:
+        """Raises UsageError("house-stages-unknown"), WorkError("house-order-failed") once all others have done it."""
+        who = CALLER.get()
+
+        def order(name: str) -> str:
+            if not self._stages[name].linked:
+                return f"{name}: it is not linked now."
+            try:
+                self._link.ask(f"member/{name}/do", Order(verb, who, values), type(None), within_s=_ORDER_S)
+            except CodedError as error:
+                return f"{name}: {error.what}"
+            self._greet(name)  # the page is to show it at once
+            return ""
+
+        wanted = self._named(stages)
+        failed = [said for said in self._pool.map(order, wanted) if said]
+        if failed:
+            raise WorkError(
+                "house-order-failed",
+                what=f"{len(failed)} of {len(wanted)} stages did not do it. {' '.join(failed)[:600]}",
+                remedy="All others did. See these stages, and try again.",
+            )
+
+    def _named(self, stages: str) -> Sequence[str]:
+        """Stages of the house by a name, a group or "all"."""
+        chosen = [stages] if stages in self._stages else self._settings.groups.get(stages, [])
+        named = [name for name in (self._stages if stages == "all" else chosen) if name in self._stages]
+        if not named:
+            raise UsageError(
+                "house-stages-unknown",
+                what=f"The house has no stage and no group {stages[:64]}.",
+                remedy="Choose a stage of its page, a group of house.toml, or all.",
+            )
+        return named
+
+    def _known(self, name: str) -> _Stage:
+        if name not in self._stages:
+            raise UsageError("house-stage-unknown", what=f"The house has no stage {name}.", remedy="Choose another.")
+        return self._stages[name]
+
+    # -- members
+
+    def admit(self, address: str, code: str) -> None:
+        hosts = [*self._settings.addresses, f"{socket.gethostname()}.local", *own_addresses()]
+        with self._changing:
+            member = admit(self._authority, address, code, tuple(f"tls/{host}:{self._settings.port}" for host in hosts))
+            self._open_again()
+        self._record("house-joined", f"The stage {member.name} has joined the house.", "info")
+
+    def remove(self, stage: str) -> None:
+        self._known(stage)
+        with self._changing:
+            self._authority.remove(stage)
+            self._open_again()
+
+    def _open_again(self) -> None:
+        self._link.close()
+        self._open()
+
+    # -- backups
+
+    def _newest_backup(self, name: str) -> float | None:
+        folder = self._settings.backups
+        if folder is None:
+            return None
+        ours = [one for one in (self._stage / folder / name).glob("*") if OURS.fullmatch(one.name)]
+        return max((one.stat().st_mtime for one in ours), default=None)
+
+    def _look_after(self) -> None:
+        while not self._ended.wait(_LOOK_S):
+            for name in list(self._stages) if self._settings.backups is not None else ():
+                if self._backup_due(name, time.time()):
+                    self._fetch_backup(name)
+
+    def _backup_due(self, name: str, now_s: float) -> bool:
+        """Within some hours after ``backup_at``, if there is none since."""
+        hour, minute = map(int, self._settings.backup_at.split(":"))
+        now = datetime.fromtimestamp(now_s)
+        late_s = ((now.hour - hour) * 3600 + (now.minute - minute) * 60) % 86400
+        newest = self._newest_backup(name) or 0.0
+        stage = self._stages[name]
+        return late_s < _BACKUP_WINDOW_S and newest < now_s - late_s - 60 and stage.linked and (
+            not 0 < stage.backup_again_s - now_s <= _AGAIN_S
+        )  # fmt: skip
+
+    def _fetch_backup(self, name: str) -> None:
+        try:
+            self.fetch_backup(name)
+        except (VelaturaError, OSError) as error:
+            self._stages[name].backup_again_s = time.time() + _AGAIN_S
+            what = error.what if isinstance(error, VelaturaError) else f"A disk failed: {error.strerror}."
+            self._record("house-backup-failed", f"No backup of {name} was made. {what}", "error")
+
+    def fetch_backup(self, name: str) -> Path:
+        """Make a backup of a stage now, in the house's folder. Minutes.
+
+        Raises UsageError("house-no-backups"), WorkError, OSError; what was there before is then unchanged.
+        """
+        self._known(name)
+        if self._settings.backups is None:
+            raise UsageError("house-no-backups", what="house.toml names no folder for backups.",
+                             remedy='Add backups = "FOLDER".')  # fmt: skip
+        root = self._stage / self._settings.backups
+        if not root.is_dir():
+            raise WorkError("backup-folder-missing", what=f"The folder for backups, {root}, does not exist.",
+                            remedy="Plug the disk in, mount it, or correct house.toml.")  # fmt: skip
+        folder = root / name
+        folder.mkdir(mode=0o700, exist_ok=True)
+        made = self._link.ask(f"member/{name}/backup", b"", MadeBackup, within_s=_BACKUP_S)
+        part = folder / ".fetched.part"
+        try:
+            with part.open("wb") as file:
+                while file.tell() < made.size:
+                    data = self._link.ask(f"member/{name}/part", file.tell(), bytes)
+                    if not 0 < len(data) <= PART_BYTES:
+                        raise WorkError("backup-differs", what="The stage sent no part of its backup.",
+                                        remedy="It is tried again.")  # fmt: skip
+                    file.write(data)
+            if sha256_of(part) != made.sha256:
+                raise WorkError("backup-differs", what="The backup changed on its way.", remedy="It is tried again.")
+            day = f"{datetime.fromtimestamp(time.time()):%Y%m%d}"
+            stored = BackupFolder(folder, self._stage).store(part, day, self._settings.keep)
+        finally:
+            part.unlink(missing_ok=True)
+        self._record(stored.code, f"{name}: {stored.what}", "info")
+        return folder / f"velatura-{day}.tar.gz"

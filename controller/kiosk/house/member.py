@@ -1,0 +1,227 @@
+"""A stage's side in a house: it publishes its state, its picture and its events, does what the building's verbs allow,
+and gives its backup. It needs nothing of the house: without it, only this thread waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+from controller.core.errors import UsageError, WorkError
+from controller.core.storage import sha256_of
+from controller.kiosk.interface import Kiosk
+from controller.kiosk.operations.dispatch import local_values
+from controller.kiosk.operations.house import MEMBERSHIP, Invitation
+from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.panel_address import own_addresses
+from controller.kiosk.state import EventRow, KioskState
+from controller.stage.link.joining import VALID_S, Joining
+from controller.stage.link.membership import Membership, leave, membership
+from controller.stage.link.session import Link, member_link
+from hal.errors import CodedError
+
+PAUSE_S: Final = 2.0
+"""Between two states, at least."""
+AGAIN_S: Final = 30.0
+PART_BYTES: Final = 1 << 20
+MOST_EVENTS: Final = 200
+PICTURE_PX: Final = 160
+_VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a stage reports. ``events``: those after the last report, or the newest of all."""
+
+    state: KioskState
+    appearances: tuple[str, ...]
+    version: str
+    events: tuple[EventRow, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """One of the building's verbs, and ``who`` asked at the house."""
+
+    verb: str
+    who: str
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class MadeBackup:
+    """The backup that a stage made for the house, which reads it in parts of at most ``PART_BYTES``."""
+
+    size: int
+    sha256: str
+
+
+class Member:
+    """This stage's side. Use as a context manager; it follows a membership that begins or ends meanwhile."""
+
+    def __init__(self, kiosk: Kiosk, stage: Path, *, host: str = "[::]", **joining: Any) -> None:
+        """``host`` and ``joining``: as of ``Joining``."""
+        self._kiosk, self._folder = kiosk, stage / MEMBERSHIP
+        self._host, self._joining = host, joining
+        self._lock = threading.Lock()
+        self._running: _Reports | None = None
+        self._open_code: Joining | None = None
+
+    def __enter__(self) -> Member:
+        self._follow()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._end_code()
+            self._end_reports()
+
+    def invite(self, name: str) -> Invitation:
+        """As ``operations.house.house_join``. Raises UsageError("house-joined-already", "house-name-wrong"),
+        WorkError("link-not-opened").
+        """
+        with self._lock:
+            if (there := membership(self._folder)) is not None:
+                raise UsageError(
+                    "house-joined-already",
+                    what=f"This stage belongs to the house {there.house} already.",
+                    remedy="Leave that house first: velatura kiosk house leave.",
+                )
+            self._end_code()
+            opened = self._open_code = Joining(self._folder, name, host=self._host, **self._joining)
+        threading.Thread(target=self._wait, args=(opened,), name="house-code", daemon=True).start()
+        return Invitation(opened.code, own_addresses(), VALID_S)
+
+    def leave(self) -> None:
+        with self._lock:
+            self._end_code()
+            self._end_reports()
+            leave(self._folder)
+
+    def _wait(self, opened: Joining) -> None:
+        try:
+            joined = opened.wait()
+            self._kiosk.record("house-joined", f"This stage has joined the house {joined.house}.")
+        except CodedError as error:
+            self._kiosk.record(error.code, f"{error.what} {error.remedy}", "warning")
+        with self._lock:
+            if self._open_code is opened:
+                self._end_code()
+        self._follow()
+
+    def _follow(self) -> None:
+        with self._lock, contextlib.suppress(CodedError):
+            there = membership(self._folder)
+            if there is not None and self._running is None:
+                self._running = _Reports(self._kiosk, there)
+
+    def _end_code(self) -> None:
+        if self._open_code is not None:
+            self._open_code.__exit__()
+            self._open_code = None
+
+    def _end_reports(self) -> None:
+        if self._running is not None:
+            self._running.close()
+            self._running = None
+
+
+class _Reports:
+    """The link of one membership, and the thread that publishes."""
+
+    def __init__(self, kiosk: Kiosk, member: Membership) -> None:
+        self._kiosk, self._member = kiosk, member
+        self._key = f"member/{member.name}"
+        self._link: Link = member_link(member)
+        self._changed, self._ended = threading.Event(), threading.Event()
+        self._backup: Path | None = None
+        self._backing_up = threading.Lock()
+        self._unsubscribe = kiosk.subscribe(self._changed.set)
+        for name, answer in (("report", self._whole), ("picture", self._picture), ("backup", self._make_backup)):
+            self._link.answer(f"{self._key}/{name}", bytes, answer)
+        self._link.answer(f"{self._key}/do", Order, self._do)
+        self._link.answer(f"{self._key}/part", int, self._part)
+        self._link.appear(f"{self._key}/here")
+        self._thread = threading.Thread(target=self._publish, name="house", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._unsubscribe()
+        self._ended.set()
+        self._changed.set()
+        self._link.close()
+        if self._backup is not None:
+            self._backup.unlink(missing_ok=True)
+
+    def _publish(self) -> None:
+        last, sent_s, number = None, 0.0, 0
+        while not self._ended.is_set():
+            self._changed.wait(AGAIN_S)
+            self._changed.clear()
+            events = tuple(self._kiosk.events(number))
+            report = self._report(events[-MOST_EVENTS:])
+            if report != last or time.monotonic() - sent_s >= AGAIN_S:
+                self._link.publish(f"{self._key}/state", report)
+                last, sent_s = replace(report, events=()), time.monotonic()
+                number = events[-1].number if events else number
+            self._ended.wait(PAUSE_S)
+
+    def _report(self, events: Sequence[EventRow]) -> Report:
+        now = self._kiosk.snapshot()
+        # So that a lit lamp alone does not change it every second.
+        lamps = tuple(replace(lamp, hours=round(lamp.hours, 1)) for lamp in now.lamps)
+        names: tuple[str, ...] = ()
+        with contextlib.suppress(CodedError):
+            names = tuple(one.name for one in self._kiosk.appearances())
+        state = replace(now, revision=0, lamps=lamps, grades=now.grades[:1], drifts=now.drifts[:1], places=())
+        return Report(state, names, metadata.version("velatura"), tuple(events))
+
+    def _whole(self, _: bytes) -> Report:
+        return self._report(tuple(self._kiosk.events())[-MOST_EVENTS:])
+
+    def _do(self, order: Order) -> None:
+        operation = _VERBS.get(order.verb)
+        if operation is None:
+            raise UsageError("verb-unknown", what="There is no such verb.", remedy=f"Use one of {', '.join(_VERBS)}.")
+        values = local_values(operation, order.values)
+        with operation.logged(self._kiosk.record, f"{order.who} at the house {self._member.house}", values):
+            operation.function(self._kiosk, **values)
+
+    def _picture(self, _: bytes) -> bytes:
+        """Of what plays: photographed, else calculated, as a small JPEG; empty without one."""
+        import cv2
+
+        playing = self._kiosk.snapshot().playing
+        photographed = {one.name: one.pictures.get("achieved") for one in self._kiosk.comparisons()}
+        shown = next((one for one in self._kiosk.appearances() if one.name == playing), None)
+        path = photographed.get(playing) or (shown.preview if shown is not None else None)
+        picture = cv2.imread(str(path)) if path is not None else None
+        if picture is None:
+            return b""
+        scale = min(1.0, PICTURE_PX / max(picture.shape[:2]))
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
+
+    def _make_backup(self, _: bytes) -> MadeBackup:
+        job = self._kiosk.snapshot().job
+        if job is not None and not job.ended:
+            raise WorkError("backup-busy", what="A job runs on this stage.", remedy="Try again when it is done.")
+        with self._backing_up:
+            if self._backup is not None:
+                self._backup.unlink(missing_ok=True)
+            self._backup = self._kiosk.backup()
+            return MadeBackup(self._backup.stat().st_size, sha256_of(self._backup))
+
+    def _part(self, offset: int) -> bytes:
+        with self._backing_up:
+            if self._backup is None or not 0 <= offset < self._backup.stat().st_size:
+                raise UsageError("backup-part-unknown", what="There is no such part.", remedy="Make the backup again.")
+            with self._backup.open("rb") as file:
+                file.seek(offset)
+                return file.read(PART_BYTES)
