@@ -32,6 +32,8 @@ _DECODE_WAIT_S: Final = 0.02
 _LIVE_WAIT_S: Final = 0.004
 _REPORTS: Final = 4096
 """So many presentations of schedules are remembered for those who compare them with other players'."""
+_REORDERED_S: Final = 10.0
+"""A moment that is earlier than the last one by less is of a request that was overtaken on its way."""
 _REPORTS_AT_ONCE: Final = 1000
 
 
@@ -69,6 +71,7 @@ class Player:
         self._playlist: Playlist | None = None
         self._timetable: Timetable | None = None
         self._agreed: Agreed | None = None
+        self._agreed_at_s = 0.0
         self._ahead_s: float | None = None
         self._alone_at_s: float | None = None
         self._alone, self._alone_then = False, "on"
@@ -218,6 +221,9 @@ class Player:
 
     def _agree(self, agreed: Agreed) -> None:
         _ = self.ahead_s
+        if 0 < self._agreed_at_s - agreed.at_s < _REORDERED_S:
+            raise superseded()
+        self._agreed_at_s = agreed.at_s
         self._drop_agreed()
         self._agreed = agreed
         if self._playlist is not None and self._decoded is not None:

@@ -19,8 +19,8 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.stage.hosts.bundles import Arrivals, Offer
 from controller.stage.hosts.clock import HostClock
-from controller.stage.hosts.remote import BEAT, BEAT_S, Asked, Beat, Report, Wanted, key, placed_rows
-from controller.stage.hosts.screen import Screen
+from controller.stage.hosts.remote import BEAT, BEAT_S, Asked, Report, key, placed_rows
+from controller.stage.hosts.screen import Screen, Setup
 from controller.stage.link.joining import Joining, admit
 from controller.stage.link.membership import Authority, membership
 from controller.stage.link.session import Link, member_link
@@ -82,14 +82,14 @@ class Agent:
         self._bundles = Arrivals(folder, self._check)
         self._pictures: dict[tuple[str, str], Any] = {}
         self._heard_s = _NEVER_S
-        self._lock = threading.Lock()
+        self._lock, self._bundles_lock = threading.Lock(), threading.Lock()
         answer = partial(self._answer, link)
-        answer("prepare", Wanted, self._prepare)
+        answer("prepare", dict[str, Setup], self._prepare)
         answer("ask", Asked, self._ask)
         answer("rows", bytes, self._rows)
         answer("offer", Offer, self._offered)
         answer("part", bytes, self._part)
-        link.subscribe(BEAT, Beat, self._beat)
+        link.subscribe(BEAT, float, self._beat)
         link.appear(key(name, "there"))
 
     def _answer(self, link: Link, word: str, kind: type[Any], answers: Callable[[Any], Any]) -> None:
@@ -106,18 +106,19 @@ class Agent:
         """Look at the clock and at each player once, and report."""
         self._clock.look()
         silent_s = time.monotonic() - self._heard_s
-        states = {name: screen.step(screen.setup.keep_s - silent_s) for name, screen in list(self._screens.items())}
+        with self._lock:
+            states = {name: one.step(one.setup.keep_s - silent_s) for name, one in self._screens.items()}
         self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states))
 
-    def _beat(self, _: Beat) -> None:
+    def _beat(self, _: float) -> None:
         self._heard_s = time.monotonic()
 
-    def _prepare(self, wanted: Wanted) -> None:
+    def _prepare(self, setups: dict[str, Setup]) -> None:
         self._heard_s = time.monotonic()
         with self._lock:
-            for name in self._screens.keys() - wanted.setups.keys():
+            for name in self._screens.keys() - setups.keys():
                 self._screens.pop(name).end()
-            for name, setup in wanted.setups.items():
+            for name, setup in setups.items():
                 screen = self._screens.get(name) or self._make(name)
                 screen.prepare(setup)
                 screen.step(setup.keep_s)
@@ -137,11 +138,11 @@ class Agent:
         self._screen(screen).put({output: self._pictures[screen, output]})
 
     def _offered(self, offer: Offer) -> tuple[int, ...]:
-        with self._lock:
+        with self._bundles_lock:
             return self._bundles.offered(offer)
 
     def _part(self, data: bytes) -> None:
-        with self._lock:
+        with self._bundles_lock:
             self._bundles.part(data)
 
     def _check(self, bundle: Path) -> None:

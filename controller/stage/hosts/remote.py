@@ -36,20 +36,6 @@ def key(host: str, word: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
-    """That the conductor is there, and its common clock."""
-
-    common_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """The setups of a computer's players, by X screen."""
-
-    setups: dict[str, Setup]
-
-
-@dataclass(frozen=True, slots=True)
 class Asked:
     """A request to the player of an X screen; ``bundle`` in it is a bundle's name."""
 
@@ -111,7 +97,7 @@ def opened_link(keys: Path | None, clock: HostClock, port: int) -> Iterator[Link
 
         def beat() -> None:
             while not ended.wait(BEAT_S):
-                link.publish(BEAT, Beat(clock.now_s()), urgent=True)
+                link.publish(BEAT, clock.now_s(), urgent=True)
 
         threading.Thread(target=beat, daemon=True).start()
         try:
@@ -151,7 +137,7 @@ class Remote:
 
     def _prepare(self) -> None:
         with self._busy, contextlib.suppress(CodedError):
-            self._link.ask(key(self.host, "prepare"), Wanted(self._setups), type(None), within_s=_START_S)
+            self._link.ask(key(self.host, "prepare"), self._setups, type(None), within_s=_START_S)
             self._asked_at, self._has = None, None
             self._prepared = True
             log(f"The computer {self.host} is here.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,24 +14,16 @@ import numpy.typing as npt
 
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, write_public_key
-from controller.core.errors import WorkError
-from controller.play.control.launch import (
-    SOCKET_NAME,
-    AttachedPlayer,
-    PlayerProcess,
-    PlayerSettings,
-    end_leftover,
-    hello,
-)
+from controller.play.control.launch import SOCKET_NAME, PlayerProcess, PlayerSettings, end_leftover, hello
 from controller.stage.hosts.clock import HostClock
-from hal.codecs.player import accepted, parse_answer, request_line
 from hal.deadline import in_seconds
-from hal.errors import CodedError, DeviceGone, DeviceTimeout
-from hal.player import Inbox, connected
+from hal.errors import CodedError
+from hal.player import Inbox, PlayerClient
 from hal.values import OutputInfo
 
 ANSWER_S: Final = 2.0
-_SHOWS: Final = ("show", "play", "sequence", "stop")
+MOST_MISSES: Final = 3
+"""Questions in a row without an answer after which a player is started again."""
 Pictures = Mapping[str, npt.NDArray[np.uint8]]
 
 
@@ -71,21 +62,21 @@ class State:
 
 
 class Screen:
-    """A player of this computer. ``display``: its X screen, "" for the environment's."""
+    """A player of this computer. ``display``: its X screen, "" for the environment's.
+
+    It is what ``remote.Remote`` is for a player of another computer, which may be lost, and behind with a bundle.
+    """
 
     host = progress = trouble = ""
     there, behind = True, False
 
     def __init__(self, folder: Path, clock: HostClock, *, display: str = "") -> None:
         self.folder, self._clock, self._display = folder, clock, display
-        self.state = State()
-        self.setup = Setup((), 60.0)
-        self._player: PlayerProcess | AttachedPlayer | None = None
+        self.setup, self.state = Setup((), 60.0), State()
+        self._player: PlayerProcess | None = None
         self._staged: dict[str, npt.NDArray[np.uint8]] = {}
-        self._order = threading.Lock()
         self._last: dict[str, Any] | None = None
-        self._pid, self._reported = 0, 0
-        self._start_at_s = 0.0
+        self._pid = self._reported = self._misses = 0
 
     @property
     def socket(self) -> Path:
@@ -93,33 +84,34 @@ class Screen:
 
     def prepare(self, setup: Setup) -> None:
         """Have a player with this setup; one that has it already plays on. Raises WorkError("player-not-started")."""
-        settings = self._settings(setup)
-        noted = self.folder / "setup"
-        text = repr(sorted(asdict(setup).items())) + self._display
-        same = noted.exists() and noted.read_text() == text
+        noted, text = self.folder / "setup", repr(sorted(asdict(setup).items())) + self._display
         self.setup = setup
-        if same and self._player is not None and self._player.alive:
-            return
-        left = _Left(self.socket)
-        if same and left.alive:
-            self._player = left
-        else:
-            end_leftover(self.folder)
-            self._player = PlayerProcess(self.folder, settings)
-            self._player.wait_until_ready()
+        if noted.exists() and noted.read_text() == text:
+            with contextlib.suppress(CodedError, OSError):
+                self.ask({"op": "hello"})
+                return
+        self._start()
         noted.write_text(text)
 
-    def _settings(self, setup: Setup) -> PlayerSettings:
+    def _start(self) -> None:
+        end_leftover(self.folder)
+        if self._player is not None:
+            self._player.terminate()
+        self._player = PlayerProcess(self.folder, self._settings())
+        self._player.wait_until_ready()
+
+    def _settings(self) -> PlayerSettings:
+        setup = self.setup
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        keys = {kind: [self.folder / f"{kind}-{n}.pub" for n in range(len(getattr(setup, kind)))]
-                for kind in ("trusted", "revoked")}  # fmt: skip
-        for kind, paths in keys.items():
-            for path, key in zip(paths, getattr(setup, kind), strict=True):
+        keys: dict[str, list[Path]] = {}
+        for kind, hexed in (("trusted", setup.trusted), ("revoked", setup.revoked)):
+            keys[kind] = [self.folder / f"{kind}-{number}.pub" for number in range(len(hexed))]
+            for path, key in zip(keys[kind], hexed, strict=True):
                 write_public_key(path, bytes.fromhex(key))
         return PlayerSettings(
             setup.outputs, self.folder / "out.frame" if setup.frames else None, where=setup.where, part=True,
-            trusted=keys["trusted"], revoked=keys["revoked"], allow_unsigned=setup.allow_unsigned,
-            rate_hz=setup.rate_hz, display=self._display,
+            allow_unsigned=setup.allow_unsigned, rate_hz=setup.rate_hz, display=self._display,
+            trusted=keys["trusted"], revoked=keys["revoked"],
         )  # fmt: skip
 
     def check(self, bundle: Path) -> None:
@@ -131,72 +123,50 @@ class Screen:
         self._staged.update(pictures)
 
     def ask(self, request: Mapping[str, Any], *, within_s: float = ANSWER_S) -> dict[str, Any]:
-        """The answer, with ``common_s``: when it was presented on the common clock. Raises CodedError.
-
-        Of what has a moment, nothing older is asked after something newer.
-        """
+        """The answer, with ``common_s``: when it was presented on the common clock. Raises CodedError."""
         request = dict(request)
-        with contextlib.ExitStack() as stack:
-            with self._order:
-                scheduled = "at" in request and request["op"] in _SHOWS
-                if scheduled:
-                    if self._last is not None and request["at"] < self._last["at"]:
-                        raise WorkError("superseded", what="A later picture was agreed on.", remedy="Ask again.")
-                    self._last = dict(request)
-                channel = stack.enter_context(_opened(self.socket))
-                if request["op"] == "show":
-                    request["sequence"] = self._inbox_filled()
-                deadline = in_seconds(within_s)
-                channel.sendall(request_line(1, request))
-            channel.settimeout(max(0.01, deadline.left_s()))
-            try:
-                line = stack.enter_context(channel.makefile("rb")).readline()
-            except TimeoutError as error:
-                raise DeviceTimeout(
-                    "player-silent", what="The player did not answer in time.", remedy="It is asked again."
-                ) from error
-            answer = accepted(parse_answer(line)) if line else _gone()
+        if request["op"] == "show":
+            request["sequence"] = self._inbox_filled()
+        elif "at" in request:
+            self._last = request
+        client = PlayerClient()
+        try:
+            answer = client.request(self.socket, request, in_seconds(within_s))
+        finally:
+            client.hang_up()
         if isinstance(at_s := answer.get("presented_at"), float):
             answer["common_s"] = at_s + self._clock.ahead_s
         return answer
 
     def _inbox_filled(self) -> int:
-        description = hello(self.socket, ANSWER_S)
-        inbox = Inbox(Path(description["inbox"]), [OutputInfo(*output) for output in self.setup.outputs])
-        staged, self._staged = self._staged, {}
-        try:
+        path = Path(hello(self.socket, ANSWER_S)["inbox"])
+        with contextlib.closing(Inbox(path, [OutputInfo(*output) for output in self.setup.outputs])) as inbox:
+            staged, self._staged = self._staged, {}
             return inbox.put(staged)
-        finally:
-            inbox.close()
 
     def step(self, keep_s: float) -> State:
         """Twice a second: keep the player running, give it the clock for ``keep_s``, and a new one what is due."""
-        if self._player is None or not self.setup.outputs:
-            return State()
         try:
-            if not self._player.alive:
-                if time.monotonic() < self._start_at_s:
-                    return State()
-                self._start_at_s = time.monotonic() + 2
-                self._player = None
-                (self.folder / "setup").unlink(missing_ok=True)
-                self.prepare(self.setup)
-            clock = {"op": "clock", "ahead_s": self._clock.ahead_s, "then": self.setup.then}
-            if keep_s > 0:
-                self.ask({**clock, "keep_s": keep_s})
             pid = int(self.ask({"op": "hello"})["pid"])
+            if keep_s > 0 or pid != self._pid:
+                clock = {"op": "clock", "ahead_s": self._clock.ahead_s, "then": self.setup.then}
+                self.ask({**clock, "keep_s": max(0.001, keep_s)})
             if pid != self._pid:
-                if keep_s <= 0:
-                    self.ask({**clock, "keep_s": 0.001})
                 self._pid, self._reported = pid, 0
-                if self._last is not None and self._last["op"] != "show":
+                if self._last is not None:
                     threading.Thread(target=self._again, args=(self._last,), daemon=True).start()
             rows = self.ask({"op": "reports", "after": self._reported})["reports"]
             self._reported = rows[-1][0] if rows else self._reported
             status = {key: value for key, value in self.ask({"op": "status"}).items() if key not in ("id", "ok")}
-            return State(status, tuple((due, at, name) for _, due, at, name in rows))
-        except (CodedError, OSError, KeyError):
+        except (CodedError, OSError):
+            self._misses += 1
+            if self._misses >= MOST_MISSES and self.setup.outputs:
+                self._misses = 0
+                with contextlib.suppress(CodedError, OSError):
+                    self._start()
             return State()
+        self._misses = 0
+        return State(status, tuple((due, at, name) for _, due, at, name in rows))
 
     def look(self) -> tuple[tuple[float, float, str | None], ...]:
         """A step, with the clock for as long as the setup says; new reports."""
@@ -205,7 +175,7 @@ class Screen:
 
     def needs(self, request: Mapping[str, Any]) -> bool:
         """Whether it was not asked for this; one that an earlier conductor has left may play it all the same."""
-        return self._last is None or self._last["at"] < request["at"]
+        return self._last is None or self._last["at"] != request["at"]
 
     def bring(self, bundle: Path) -> None:
         """It is here."""
@@ -216,28 +186,6 @@ class Screen:
 
     def end(self) -> None:
         """Black, and the player's end."""
+        end_leftover(self.folder)
         if self._player is not None:
-            with contextlib.suppress(CodedError, OSError):
-                self.ask({"op": "stop"})
-            end_leftover(self.folder)
             self._player.terminate()
-
-
-class _Left(AttachedPlayer):
-    """A player that a former conductor or agent has left."""
-
-    def __init__(self, socket: Path) -> None:
-        super().__init__(socket, socket.with_name("none"), None)
-        with contextlib.suppress(WorkError):
-            self.wait_until_ready(0.3)
-
-
-def _opened(path: Path) -> Any:
-    try:
-        return connected(path, in_seconds(ANSWER_S))
-    except OSError:
-        return _gone()
-
-
-def _gone() -> Any:
-    raise DeviceGone("player-gone", what="The player of this screen does not run.", remedy="It is started again.")
