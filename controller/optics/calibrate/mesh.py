@@ -217,14 +217,13 @@ def places_in_rendering(camera: Pinhole) -> Float64:
     return (straight + margin_px(camera)).reshape(height, width, 2)
 
 
-def scene_script(geometry: Geometry, names: Sequence[str], mesh_file: str) -> str:
+def scene_script(views: Sequence[tuple[str, Pinhole]], cameras: int, mesh_file: str) -> str:
     """Python for ``blender --python`` or for a Python with bpy; it reads ``mesh_file`` (.glb) from its own folder.
 
-    ``names`` of the projectors in order; ``-- --render FILE`` renders, ``-- --save FILE`` keeps a .blend.
+    ``views``: all by name, first the ``cameras``; ``-- --render FILE`` renders, ``-- --save FILE`` keeps a .blend.
     """
-    views = [_view("camera", geometry.camera, margin_px(geometry.camera))]
-    views += [_view(f"projector {name}", own, 0) for name, own in zip(names, geometry.projectors, strict=True)]
-    return _SCRIPT.replace("@MESH@", json.dumps(mesh_file)).replace("@VIEWS@", json.dumps(views, indent=4))
+    made = [_view(name, own, margin_px(own) if n < cameras else 0) for n, (name, own) in enumerate(views)]
+    return _SCRIPT.replace("@MESH@", json.dumps(mesh_file)).replace("@VIEWS@", json.dumps(made, indent=4))
 
 
 def _view(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:

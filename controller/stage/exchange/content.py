@@ -3,18 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.calibrate.mesh import Mesh, grid_mesh
+from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
+from controller.optics.solve.targets.sheets import Places
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import CameraBox
+from controller.optics.transport.views import Sheet
+from controller.stage.artefacts.mesh import RegisteredMesh
+
+
+@dataclass(frozen=True, slots=True)
+class OtherView:
+    """A view that is not the first; ``pose`` from the first camera's frame to its own, in which ``shape`` is.
+
+    ``picture``, ``seen_px``: as of ``Content``
+    """
+
+    name: str
+    shape: Geometry
+    pose: Pose
+    picture: ByteImage | None
+    seen_px: tuple[FloatImage | None, ...]
+
+    @property
+    def camera(self) -> Pinhole:
+        """In the first camera's frame."""
+        return replace(self.shape.camera, rotation=self.pose.rotation, translation_m=self.pose.shift_m)
 
 
 @dataclass(frozen=True)
@@ -31,6 +55,8 @@ class Content:
     ``metapixels``, ``transport``: functions that read them
     ``black`` (camera rows, columns, 3) float32: a function that reads the light with all projectors at black
     ``crop``: the camera pixels of a transport; None: all
+    ``others``: the views that were joined with the first one, to which all above belongs
+    ``places``: of the transport's pixels on a mesh's sheet; None for the first view alone
     """
 
     folder: Path
@@ -43,6 +69,8 @@ class Content:
     transport: Callable[[], LightTransport]
     black: Callable[[], FloatImage]
     crop: CameraBox | None = None
+    others: tuple[OtherView, ...] = ()
+    places: Callable[[RegisteredMesh], Places] | None = None
 
     @property
     def geometry(self) -> Geometry:
@@ -61,32 +89,103 @@ class Content:
         return columns, rows
 
     @cached_property
+    def sheet(self) -> Sheet:
+        """Where the pictures of all views lie below each other; of one view it is its picture."""
+        width, height = self.geometry.camera.size_px
+        sizes = [one.shape.camera.size_px for one in self.others]
+        return Sheet(((height, width), *((rows, columns) for columns, rows in sizes)))
+
+    @cached_property
+    def all_pictures(self) -> ByteImage | None:
+        """The pictures of all views, as ``sheet`` says; None if one is unknown."""
+        pictures = [self.picture, *(one.picture for one in self.others)]
+        if not self.others or any(one is None for one in pictures):
+            return self.picture if not self.others else None
+        return np.asarray(self.sheet.joined([one for one in pictures if one is not None]), np.uint8)
+
+    @property
+    def pictures_px(self) -> tuple[int, int]:
+        """(width, height) of ``all_pictures``."""
+        rows, columns = self.sheet.shape
+        return (columns, rows) if self.others else self.geometry.camera.size_px
+
+    @cached_property
     def mesh(self) -> Mesh:
-        return grid_mesh(self.geometry, step=self.step)
+        """All views' surfaces in the first camera's frame; ``camera_px`` in ``all_pictures``.
+
+        Of what several views see, the first one's triangles stay.
+        """
+        meshes = [grid_mesh(self.geometry, step=self.step)]
+        for n, (one, box) in enumerate(zip(self.others, self.sheet.boxes()[1:], strict=True)):
+            own = grid_mesh(one.shape, step=self.step)
+            vertices = (own.vertices_m - one.pose.shift_m.astype(np.float32)) @ one.pose.rotation.astype(np.float32)
+            before = [(self.geometry.camera, self.geometry.points_m)]
+            before += [(other.camera, other.shape.points_m) for other in self.others[:n]]
+            new = ~np.any([_covers(camera, points, vertices) for camera, points in before], axis=0)
+            triangles = own.triangles[new[own.triangles].any(axis=1)]
+            used, renumbered = np.unique(triangles, return_inverse=True)
+            normals = own.normals[used] @ one.pose.rotation.astype(np.float32)
+            camera_px = own.camera_px[used] + np.array([box.left, box.top], np.float32)
+            meshes.append(Mesh(vertices[used], normals, renumbered.reshape(-1, 3).astype(np.int32), camera_px))
+        starts = np.cumsum([0, *(len(one.vertices_m) for one in meshes)])
+        return Mesh(
+            np.concatenate([one.vertices_m for one in meshes]),
+            np.concatenate([one.normals for one in meshes]),
+            np.concatenate([one.triangles + np.int32(start) for one, start in zip(meshes, starts, strict=False)]),
+            np.concatenate([one.camera_px for one in meshes]),
+        )
 
     @cached_property
     def colours(self) -> ByteImage | None:
         """(vertices, 3) uint8: the picture at each vertex of the mesh."""
-        if self.picture is None:
+        if self.all_pictures is None:
             return None
         x, y = self.mesh.camera_px.astype(np.int64).T
-        return np.asarray(self.picture[y, x])
+        return np.asarray(self.all_pictures[y, x])
+
+    @property
+    def cameras(self) -> tuple[tuple[str, Pinhole], ...]:
+        """The camera of each view by name, the first one first."""
+        return (("camera", self.geometry.camera), *((f"camera {one.name}", one.camera) for one in self.others))
 
     @property
     def views(self) -> tuple[tuple[str, Pinhole], ...]:
-        """The camera and all projectors, by name."""
+        """The cameras and all projectors, by name."""
         projectors = zip(self.names, self.geometry.projectors, strict=True)
-        return (("camera", self.geometry.camera), *((f"projector {name}", own) for name, own in projectors))
+        return (*self.cameras, *((f"projector {name}", own) for name, own in projectors))
 
     def measured_px(self, view: int) -> Float64:
-        """(vertices, 2) float64: where view 0 (the camera) or view n (projector n) sees each vertex; NaN if unknown."""
-        if view == 0:
-            return self.mesh.camera_px.astype(np.float64)
-        seen = self.seen_px[view - 1]
-        if seen is None:
-            return np.full((len(self.mesh.vertices_m), 2), np.nan)
-        x, y = self.mesh.camera_px.astype(np.int64).T
-        return np.asarray(seen[y, x], np.float64)
+        """(vertices, 2) float64: where each vertex is seen by a camera or projector, by number in ``views``; NaN if
+        unknown."""
+        place = self.mesh.camera_px.astype(np.float64)
+        found = np.full(place.shape, np.nan)
+        projector = view - len(self.cameras)
+        for n, box in enumerate(self.sheet.boxes() if self.others else [CameraBox(0, 0, *self.sheet.sizes[0])]):
+            mine = (place[:, 1] >= box.top) & (place[:, 1] < box.bottom)
+            own = place[mine] - (box.left, box.top)
+            if projector < 0:
+                if n == view:
+                    found[mine] = own
+                continue
+            seen = (self.seen_px if n == 0 else self.others[n - 1].seen_px)[projector]
+            if seen is not None:
+                x, y = own.astype(np.int64).T
+                found[mine] = seen[y, x]
+        return found
+
+
+COVERED: Final = 0.01
+"""Relative difference of distance up to which two views see the same surface."""
+
+
+def _covers(camera: Pinhole, points_m: FloatImage, vertices_m: FloatImage) -> Mask:
+    """(vertices,): whether a camera knows ``points_m`` (rows, columns, 3), in its own frame, where a vertex lies."""
+    px, depth = project(camera, vertices_m.astype(np.float64))
+    rows, columns = points_m.shape[:2]
+    x, y = np.rint(np.nan_to_num(px, nan=-1.0)).clip(-1, max(rows, columns)).astype(np.int64).T
+    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows) & (depth > 0)
+    known = np.where(inside, points_m[np.where(inside, y, 0), np.where(inside, x, 0), 2], np.nan)
+    return np.asarray(np.abs(known - depth) < COVERED * known)
 
 
 def projected(pinhole: Pinhole, points_m: FloatImage) -> Float64:

@@ -44,14 +44,14 @@ def write_glb_file(content: Content, path: Path) -> dict[str, int]:
         )
         for name, own in content.views
     ]
-    write_glb(path, content.mesh, content.geometry.camera.size_px, content.picture, views)
+    write_glb(path, content.mesh, content.pictures_px, content.all_pictures, views)
     return _figures(content)
 
 
 def write_blender_folder(content: Content, folder: Path) -> dict[str, int]:
     """The object and a script that sets up camera and projectors in Blender."""
-    write_glb(folder / MESH, content.mesh, content.geometry.camera.size_px, content.picture)
-    write_atomically(folder / SCRIPT, scene_script(content.geometry, content.names, MESH).encode())
+    write_glb(folder / MESH, content.mesh, content.pictures_px, content.all_pictures)
+    write_atomically(folder / SCRIPT, scene_script(content.views, len(content.cameras), MESH).encode())
     return _figures(content)
 
 
@@ -82,8 +82,10 @@ def write_usd(content: Content, path: Path) -> dict[str, int]:
     """
     mesh = content.mesh
     parts = [_HEAD, *_mesh(content)]
+    cameras = len(content.cameras)
     for n, (name, own) in enumerate(content.views):
-        parts += _camera("Camera" if n == 0 else f"Projector_{n}", name, own)
+        prim = "Camera" if n == 0 else f"Camera_{n}" if n < cameras else f"Projector_{n - cameras + 1}"
+        parts += _camera(prim, name, own)
     write_atomically(path, ("\n".join([*parts, "}"]) + "\n").encode())
     return {"vertices": len(mesh.vertices_m), "triangles": len(mesh.triangles)}
 
@@ -105,7 +107,7 @@ def _mesh(content: Content) -> list[str]:
     mesh = content.mesh
     flip = np.diag(FLIP).astype(np.float32)
     vertices = mesh.vertices_m * flip
-    width, height = content.geometry.camera.size_px
+    width, height = content.pictures_px
     across = (mesh.camera_px.astype(np.float64) + 0.5) / (width, height)
     extent = np.stack([vertices.min(axis=0), vertices.max(axis=0)]) if len(vertices) else np.zeros((2, 3))
     lines = [
@@ -188,7 +190,7 @@ def write_sheet(content: Content, path: Path) -> dict[str, object]:
     if mesh is None or mesh.uv is None:
         uv, sheet = "camera", np.dstack([picture, mask])
     else:
-        places = mesh.places(content.geometry.camera)
+        places = mesh.places(content.geometry.camera) if content.places is None else content.places(mesh)
         # twice as fine as the camera sees it, if a half of the sheet is seen
         side = int(2 ** np.clip(np.round(np.log2(2.8 * np.sqrt(mask.sum()))), 9, 12))
         uv, sheet = "mesh", photographed(picture, places, mask, side)

@@ -139,11 +139,11 @@ def _figures(model: _Model) -> dict[str, int]:
 
 
 def write_storage(content: Content, path: Path) -> dict[str, int]:
-    """Write ``camera``, the list ``projectors``, ``points_m`` and ``camera_px``.
+    """Write ``camera``, the lists ``cameras`` of other views and ``projectors``, ``points_m`` and ``camera_px``.
 
     A camera or projector has ``image_width``, ``image_height``, ``camera_matrix``, ``distortion_coefficients`` (k1, k2,
     p1, p2), ``rvec`` and ``tvec``: the arguments of ``cv2.projectPoints``. ``points_m`` (points, 3) float32, metres, in
-    the camera's frame; ``camera_px`` (points, 2) float32, where the camera sees them.
+    the camera's frame; ``camera_px`` (points, 2) float32, where the first camera sees them, or NaN.
 
     Raises WorkError("no-space", "cannot-write").
     """
@@ -151,15 +151,18 @@ def write_storage(content: Content, path: Path) -> dict[str, int]:
     storage.startWriteStruct("camera", cv2.FILE_NODE_MAP)
     _write_view(storage, content.geometry.camera)
     storage.endWriteStruct()
-    storage.startWriteStruct("projectors", cv2.FILE_NODE_SEQ)
-    for name, own in zip(content.names, content.geometry.projectors, strict=True):
-        storage.startWriteStruct("", cv2.FILE_NODE_MAP)
-        storage.write("name", name)
-        _write_view(storage, own)
+    others = [(one.name, one.camera) for one in content.others]
+    projectors = list(zip(content.names, content.geometry.projectors, strict=True))
+    for key, listed in (("cameras", others), ("projectors", projectors)):
+        storage.startWriteStruct(key, cv2.FILE_NODE_SEQ)
+        for name, own in listed:
+            storage.startWriteStruct("", cv2.FILE_NODE_MAP)
+            storage.write("name", name)
+            _write_view(storage, own)
+            storage.endWriteStruct()
         storage.endWriteStruct()
-    storage.endWriteStruct()
     storage.write("points_m", np.ascontiguousarray(content.mesh.vertices_m))
-    storage.write("camera_px", np.ascontiguousarray(content.mesh.camera_px))
+    storage.write("camera_px", np.ascontiguousarray(content.measured_px(0).astype(np.float32)))
     write_atomically(path, storage.releaseAndGetString().encode())
     return {"points": len(content.mesh.vertices_m)}
 

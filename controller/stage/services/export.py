@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,16 +13,18 @@ from controller.core.arrays import ByteImage, FloatImage, summed
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.transport.planes import CameraBox
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import Calibrated, all_views
 from controller.stage.artefacts.geometry import (
     has_geometry,
     known_geometry,
     projectors_of,
     read_geometry_figures,
+    read_view_pose,
     require_shape,
 )
 from controller.stage.artefacts.projectors import Light, Pixels
-from controller.stage.exchange.content import Content
+from controller.stage.artefacts.views import view_folders
+from controller.stage.exchange.content import Content, OtherView
 from controller.stage.exchange.formats import format_of
 from controller.stage.exchange.pairs import is_pairs, write_pairs_transport
 from controller.stage.sessions.calibrations import finished_calibration
@@ -57,13 +60,14 @@ def export(*, run: Path, kind: str, out: Path | None, step: int | None, crop: st
     if kind == "uv" and has_geometry(run):
         carried_mesh(run)
     target = run / chosen.place if out is None else out
-    return {"written": target, **chosen.write(_content(run, step, box), target)}
+    return {"written": target, **chosen.write(_content(run, step, box, all_sides=kind == "uv"), target)}
 
 
-def _content(run: Path, step: int | None, crop: CameraBox | None) -> Content:
+def _content(run: Path, step: int | None, crop: CameraBox | None, *, all_sides: bool) -> Content:
+    """``all_sides``: the transport is that of all views."""
     shape = known_geometry(run)
     names = tuple(projectors_of(run))
-    calibrated = Calibrated(run, names)
+    calibrated = all_views(run, names) if all_sides else Calibrated(run, names)
     return Content(
         folder=run,
         shape=shape,
@@ -75,7 +79,17 @@ def _content(run: Path, step: int | None, crop: CameraBox | None) -> Content:
         transport=lambda: calibrated.transport,
         black=lambda: calibrated.calibration.black,
         crop=crop,
+        others=() if shape is None else tuple(_others(run, names)),
+        places=calibrated.places,
     )
+
+
+def _others(run: Path, names: tuple[str, ...]) -> Iterator[OtherView]:
+    """The views that were joined with the first one."""
+    for name, folder in list(view_folders(run).items())[1:]:
+        pose, own = read_view_pose(folder), known_geometry(folder, names)
+        if pose is not None and own is not None:
+            yield OtherView(name, own, pose, _picture(folder, names), tuple(_seen(folder, one) for one in names))
 
 
 def _usual_step(geometry: Geometry) -> int:

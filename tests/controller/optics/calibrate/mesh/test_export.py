@@ -59,7 +59,7 @@ def views_of(script: str) -> list[dict[str, Any]]:
 
 def test_blenders_cameras_see_the_points_where_the_calibrated_ones_do() -> None:
     geometry = stage()
-    script = scene_script(geometry, ["left"], "object.glb")
+    script = scene_script([("camera", geometry.camera), ("projector left", geometry.projectors[0])], 1, "object.glb")
     points = geometry.points_m.reshape(-1, 3).astype(np.float64)
     in_blender = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
     camera, projector = views_of(script)
