@@ -77,8 +77,8 @@ def _aligned(pixels: int) -> int:
 class ViewsTransport(LightTransport):
     """T of several views.
 
-    Their light is in the same units, as nearly as cameras agree (``calibrate.photometry.view_colours``). ``mixing`` is
-    that of the first view; each part of T has its own.
+    Their light is in the same units (``calibrate.photometry.view_colours``). ``mixing`` is that of the first view; each
+    part of T has its own.
 
     ``views``: T of each; ``sheet``: where their pictures lie
     ``shares`` (rows, columns) float32: how much each pixel counts, 0 to 1; a place's own views add up to 1

@@ -12,7 +12,7 @@ import numpy as np
 from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.errors import UsageError
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
-from controller.optics.calibrate.photometry.view_colours import ViewColour, in_common_units, view_colours
+from controller.optics.calibrate.photometry.view_colours import in_common_units, view_gains
 from controller.optics.calibrate.values import Calibration, Geometry, ProjectorCalibration
 from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.engine import Engine, Processor
@@ -38,7 +38,7 @@ from controller.stage.artefacts.views import first_view, view_folders
 
 class View(NamedTuple):
     """``folder`` of a view; ``part`` takes its part of a camera image (rows, columns, ...); ``gain`` (3,): as of
-    ``ViewColour``, None for the only view."""
+    ``view_gains``, None for the only view."""
 
     folder: Path
     part: Callable[[Any], Any]
@@ -196,7 +196,7 @@ class AllViews(Calibrated):
         super().__init__(next(iter(folders.values())), projectors, engine)
         self.names = tuple(folders)
         self._views = [Calibrated(folder, projectors, self.engine) for folder in folders.values()]
-        self._colours: list[ViewColour] | None = None
+        self._gains: list[FloatImage] | None = None
 
     @property
     def first(self) -> Calibrated:
@@ -204,13 +204,13 @@ class AllViews(Calibrated):
         return self._views[0]
 
     @property
-    def colours(self) -> list[ViewColour]:
-        """How each view's light is brought to the units of the first one's."""
-        if self._colours is None:
-            self._colours = view_colours([view.calibration for view in self._views])
-            for view, colour in zip(self._views, self._colours, strict=True):
-                view._calibration = in_common_units(view.calibration, colour, self.folder)
-        return self._colours
+    def gains(self) -> list[FloatImage]:
+        """As of ``view_gains``; the views' calibrations are in common units from then on."""
+        if self._gains is None:
+            self._gains = view_gains([view.calibration for view in self._views])
+            for view, gain in zip(self._views, self._gains, strict=True):
+                view._calibration = in_common_units(view.calibration, gain, self.folder)
+        return self._gains
 
     @property
     def sheet(self) -> Sheet:
@@ -220,8 +220,7 @@ class AllViews(Calibrated):
 
     def views(self) -> list[View]:
         parts = [(lambda image, box=box: image[box.window]) for box in self.sheet.boxes()]
-        every = zip(self._views, parts, self.colours, strict=True)
-        return [View(view.folder, part, colour.gain) for view, part, colour in every]
+        return [View(*one) for one in zip(self.folders, parts, self.gains, strict=True)]
 
     @property
     def folders(self) -> tuple[Path, ...]:
@@ -234,7 +233,7 @@ class AllViews(Calibrated):
     def calibration(self) -> Calibration:
         """As of one camera whose picture is the sheet; where it looks is known to the views alone."""
         if self._calibration is None:
-            _ = self.colours
+            _ = self.gains
             own = [view.calibration for view in self._views]
             parts = tuple(self._projector([one.projectors[n] for one in own]) for n in range(len(self.projectors)))
             black, mask = (self.sheet.joined([getattr(one, name) for one in own]) for name in ("black", "object_mask"))
@@ -253,13 +252,13 @@ class AllViews(Calibrated):
     @property
     def transport(self) -> LightTransport:
         if self._transport is None:
-            _ = self.colours
+            _ = self.gains
             self._transport = ViewsTransport.of([view.transport for view in self._views])
         return self._transport
 
     @property
     def light(self) -> StageLight:
-        _ = self.colours
+        _ = self.gains
         indirect = tuple(view.indirect for view in self._views)
         known = None if all(one is None for one in indirect) else ViewsIndirect(indirect, self.sheet)
         return StageLight(self.transport, self.calibration.black, known, self.drive)
@@ -268,7 +267,7 @@ class AllViews(Calibrated):
     def base(self) -> Base:
         if self._base is None:
             solved = [SolvedBase.read(view.folder, self.projectors) for view in self._views]
-            image = self.sheet.joined([one.image * own.gain for one, own in zip(solved, self.colours, strict=True)])
+            image = self.sheet.joined([one.image * gain for one, gain in zip(solved, self.gains, strict=True)])
             self.keep_base(prepare_base(self.transport, image, self.calibration.black, solved[0].solution))
         assert self._base is not None
         return self._base

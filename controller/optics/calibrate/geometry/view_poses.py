@@ -8,7 +8,7 @@ first camera's frame by the chain rule. Views need not overlap: two projectors t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -301,26 +301,20 @@ def _adjusted(problems: Sequence[ba.AdjustmentProblem], places: _Places) -> tupl
     return places, normals, ba.covariance_of(information, whole)
 
 
-def _proposals(problems: Sequence[ba.AdjustmentProblem], places: _Places) -> _Proposal:
-    return _Proposal(problems, places, [ba.data_equations(one, places.seen_by(v)) for v, one in enumerate(problems)])
+def _proposals(problems: Sequence[ba.AdjustmentProblem], places: _Places) -> Callable[[float], _Places]:
+    """The next places by a damping."""
+    normals = [ba.data_equations(one, places.seen_by(v)) for v, one in enumerate(problems)]
 
-
-@dataclass(frozen=True, slots=True)
-class _Proposal:
-    """The next places by a damping, from the views' equations here."""
-
-    problems: Sequence[ba.AdjustmentProblem]
-    places: _Places
-    normals: Sequence[ba.Normal]
-
-    def __call__(self, damping: float) -> _Places:
-        whole, information, right = _summed(self.problems, self.places, self.normals, damping)
+    def proposed(damping: float) -> _Places:
+        whole, information, right = _summed(problems, places, normals, damping)
         step = solve_positive(information + damping * np.diag(np.diag(whole)), right)
         depths = []
-        for v, normal in enumerate(self.normals):
-            own = _chain(self.places, v) @ step
+        for v, normal in enumerate(normals):
+            own = _chain(places, v) @ step
             depths.append(-(normal.depth_gradient + normal.cross @ own) / (normal.depth * (1 + damping) + 1e-12))
-        return self.places.moved(step, depths)
+        return places.moved(step, depths)
+
+    return proposed
 
 
 def _summed(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -125,7 +126,8 @@ def residual_px(model: pycolmap.Reconstruction) -> float:
 
 def test_a_gltf_has_every_surface_once_and_all_pictures(content: Content, tmp_path: Path) -> None:
     format_of("glb").write(content, tmp_path / "object.glb")
-    mesh = trimesh.load(tmp_path / "object.glb", process=False).geometry["object"]
+    scene: Any = trimesh.load(tmp_path / "object.glb", process=False)
+    mesh = scene.geometry["object"]
     assert len(mesh.vertices) == len(content.mesh.vertices_m)
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
     assert texture.shape[:2] == content.sheet.shape
