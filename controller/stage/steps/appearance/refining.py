@@ -356,8 +356,8 @@ def causes_step(calibrated: Calibrated, names: Sequence[str], photographs: int, 
 
 
 def _look(calibrated: Calibrated, names: Sequence[str], photographs: int, context: Context) -> Sequence[Path]:
-    left = [Refining.read(context.folder, name, photographs, calibrated.projectors).equations for name in names]
-    found = [one for one in left if one is not None]
+    left = [Refining.read(context.folder, name, photographs, calibrated.projectors) for name in names]
+    found = [one.equations for one in left if one.equations is not None and _confirmed(one)]
     causes = common_causes(found, len(calibrated.projectors)) if len(found) > 1 else CommonCauses((), 0.0)
     lines = sentences(causes, calibrated.projectors)
     for text in lines:
@@ -367,6 +367,11 @@ def _look(calibrated: Calibrated, names: Sequence[str], photographs: int, contex
         for cause in causes.causes
     ]
     return [write_causes(context.folder, {"share": causes.share, "causes": rows, "sentences": lines})]
+
+
+def _confirmed(state: Refining) -> bool:
+    """Whether the photograph of the first correction did not deny what led to it: that light may have passed by."""
+    return all(row.get("kept", True) and "refused" not in row for row in state.photographs[1:2])
 
 
 def sentences(found: CommonCauses, projectors: Sequence[str]) -> list[str]:

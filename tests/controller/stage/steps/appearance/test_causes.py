@@ -89,3 +89,19 @@ def test_two_photographs_at_least_are_needed_and_what_is_found_is_kept(
     assert bool(reporter.said) is told
     assert [row["projector"] for row in kept["causes"]] == ["left"] * 3 * told
     assert [row["amount"] for row in kept["causes"]] == pytest.approx([-0.1] * 3 * told, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("next_one", "told"), [({}, True), ({"kept": False}, False), ({"refused": "it is too bright"}, False)]
+)
+def test_a_photograph_that_the_next_one_denies_names_no_cause(
+    tmp_path: Path, next_one: dict[str, object], told: bool
+) -> None:
+    """A flash during all exposures of a photograph looks like a projector that became darker or brighter."""
+    frames = {name: np.zeros((2, 3, 3), np.float32) for name in NAMES}
+    for appearance, after in (("gold", next_one), ("marble", {})):
+        Refining(frames, None, None, equations=products(-0.1), photographs=({}, after)).write(tmp_path, appearance, 1)
+    step = causes_step(Calibrated(tmp_path, NAMES), ("gold", "marble"), 1, after=())
+    with Journal(tmp_path) as journal:
+        Runner([step], journal, reporter=Told()).run("refine", deadline=in_seconds(30))
+    assert bool(json.loads((tmp_path / "causes.json").read_text())["causes"]) is told
