@@ -110,6 +110,11 @@ class ProjectorDrift:
         """Whether a homography explains all of its motion."""
         return self.known and self.local_px <= LOCAL_PX
 
+    def flickering(self, flicker: float) -> ProjectorDrift:
+        """The same of a lamp whose light differs by so much from one photograph to the next, relative."""
+        red, green, blue = (math.hypot(sigma, flicker) for sigma in self.gain_sigma)
+        return replace(self, gain_sigma=(red, green, blue))
+
     @property
     def dimmed(self) -> bool:
         """Whether the light of some channel has changed, either way."""

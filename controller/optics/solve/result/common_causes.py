@@ -40,6 +40,8 @@ LEAST_SHARE: Final = 0.03
 """Of the squared error: what explains less is left out, since it may stand for something that no cause describes."""
 FITS: Final = 0.85
 """Causes that explain this much of what more of them explain are enough: the others mop up what is not quite so."""
+HALF: Final = 0.5
+"""Of a cause's amount: a photograph that is sure of less denies it."""
 MOSTLY: Final = 0.5
 """Of the squared error: where all causes explain less, something else is wrong, and none is named."""
 
@@ -108,7 +110,7 @@ def common_causes(photographs: Sequence[Float64], projectors: int) -> CommonCaus
 
     The fewest causes: the one that explains most is added until none explains ``LEAST_SHARE`` more, and what the others
     have made needless is taken out again, and so is what came after a few that fit. Each photograph by itself has to
-    say that of a cause, too: darker, or brighter.
+    say that of a cause, too: darker, or brighter, and about as much.
     """
     summed = np.sum(photographs, axis=0)
     products, values = summed[:-1], float(summed[-1, 0])
@@ -141,9 +143,15 @@ def common_causes(photographs: Sequence[Float64], projectors: int) -> CommonCaus
         alone = [_amounts(one, chosen, group, values, projectors) for one in each]
         for cause, *single in zip(amounts, *alone, strict=True):
             sure = abs(cause.amount) > max(LEAST[cause.kind], SURE * cause.sigma)
-            if sure and all(one.amount * cause.amount > 0 for one in single):
+            if sure and all(_agree(one, cause) for one in single):
                 found.append(replace(cause, share=share))
     return CommonCauses(tuple(found), 1 - now / energy)
+
+
+def _agree(one: Cause, together: Cause) -> bool:
+    """Whether one photograph's cause may be that of all: as sure as it is, and of the same sign."""
+    near = abs(one.amount - together.amount) < SURE * one.sigma
+    return one.amount * together.amount > 0 and (near or abs(one.amount) > HALF * abs(together.amount))
 
 
 _Group = tuple[Kind, int | None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from controller.stage.artefacts.drift import write_drift
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import DRIFT as TAKEN
 from controller.stage.artefacts.photographs import PATTERN as PATTERN_NAME
+from controller.stage.artefacts.projectors import IndirectFigures
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.capture.exposure import bracket
@@ -127,6 +129,9 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     seen = DriftPhotographs(black=together["black"].per_second(), white=white, patterns=patterns)
     context.advance(0.2)
     drift = find_drift(calibrated.transport, calibration, frames, seen)
+    known = {name: IndirectFigures.read(calibrated.folder, name) for name in calibrated.projectors}
+    flicker = {name: figures.flicker for name, figures in known.items() if figures is not None}
+    drift = replace(drift, projectors=tuple(one.flickering(flicker.get(one.name, 0.0)) for one in drift.projectors))
     return [write_drift(context.folder, drift, calibration=calibrated.folder.name, photographs=len(taken))]
 
 

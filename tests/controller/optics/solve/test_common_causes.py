@@ -137,9 +137,10 @@ def test_a_room_that_is_darker_by_less_than_matters_is_not_named() -> None:
     assert found(lambda frames: np.asarray(light(frames) - 0.003 * white, np.float32)).causes == ()
 
 
-def test_what_one_photograph_says_and_another_denies_is_no_common_cause() -> None:
-    """A lamp that flickers: darker in one photograph, brighter in the next."""
-    gains = {id(frames): gain for frames, gain in zip(appearances(), (0.8, 1.02, 0.8), strict=True)}
+@pytest.mark.parametrize("one", [1.02, 0.97])
+def test_what_one_photograph_says_and_another_denies_is_no_common_cause(one: float) -> None:
+    """A lamp that flickers: darker in one photograph, brighter, or hardly darker, in the next."""
+    gains = {id(frames): gain for frames, gain in zip(appearances(), (0.8, one, 0.8), strict=True)}
     causes = found(lambda frames: light((frames[0] * np.float32(gains[id(frames)]), frames[1])))
     assert causes.causes == ()
 

@@ -63,6 +63,11 @@ def test_a_lamp_is_as_strong_as_its_light_and_not_as_its_contrast(optics: Optics
         assert np.all(np.abs(np.array(one.gain) - gain) < 3 * np.array(one.gain_sigma) + 5e-4)
 
 
+def test_a_lamp_that_flickers_has_not_dimmed_where_flicker_says_as_much() -> None:
+    for one in checked(as_it_is, gain=0.98).projectors:
+        assert (one.dimmed, one.flickering(0.01).dimmed, one.flickering(0.002).dimmed) == (True, False, True)
+
+
 def test_white_that_was_photographed_once_more_has_the_noise_of_all_photographs() -> None:
     """A lamp that has dimmed a little, and a shadow that has moved; 0.5 % of noise, and 0.1 % in the mean of many."""
     rng = np.random.default_rng(1)
