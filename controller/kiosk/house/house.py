@@ -218,7 +218,7 @@ class House:
     # -- members
 
     def admit(self, address: str, code: str) -> None:
-        hosts = [*self._settings.addresses, f"{socket.gethostname()}.local", *own_addresses()]
+        hosts = [*self._settings.addresses, *own_addresses(), f"{socket.gethostname()}.local"]
         with self._changing:
             member = admit(self._authority, address, code, tuple(f"tls/{host}:{self._settings.port}" for host in hosts))
             self._open_again()

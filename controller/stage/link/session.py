@@ -11,6 +11,7 @@ import contextlib
 import json
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -28,7 +29,10 @@ T = TypeVar("T")
 PORT: Final = 7447
 MOST_BYTES: Final = 8 << 20
 """Of one message; what is larger is sent in parts."""
+BEAT_S: Final = 1.0
 ALONE_S: Final = 4.0
+"""A member that has heard no beat of its house for so long connects again."""
+_BEAT: Final = "all/beat"
 CLOSING_S: Final = 2.0
 _MOST_HANDLERS: Final = 8
 _RETRY: Final = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 1.5}
@@ -49,13 +53,19 @@ def unpacked(kind: type[T], data: bytes) -> T:
     if kind is bytes:
         return data  # type: ignore[return-value] # mypy does not narrow the type of a type
     try:
-        return TypeAdapter(kind).validate_json(data)
+        adapter = _adapters.get(kind) or _adapters.setdefault(kind, TypeAdapter(kind))
+        value: T = adapter.validate_json(data)
     except ValidationError as error:
         raise WorkError(
             "link-message-wrong",
             what=f"Another computer sent what this one does not understand ({error.error_count()} values).",
             remedy="Install the same version of Velatura on both.",
         ) from error
+    return value
+
+
+_adapters: Final[dict[Any, TypeAdapter[Any]]] = {}
+"""By type: to make one takes longer than to read a message."""
 
 
 class Link:
@@ -64,8 +74,10 @@ class Link:
     A member that can't reach the house tries again for as long as the link is open, and so does not wait for it.
     """
 
-    def __init__(self, config: dict[str, Any], protocol: str = "tls") -> None:
-        """``config``: Zenoh's, beside what all links share. Raises WorkError("link-not-opened")."""
+    def __init__(self, config: dict[str, Any], protocol: str = "tls", endpoints: Sequence[str] = ()) -> None:
+        """``config``: Zenoh's, beside what all links share; ``endpoints``: of a house, which is tried at one after the
+        other. Raises WorkError("link-not-opened").
+        """
         shared = {
             "mode": "peer",
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -73,8 +85,9 @@ class Link:
         }
         link = {"protocols": [protocol], "rx": {"max_message_size": MOST_BYTES}}
         link |= {"tls": config["tls"]} if "tls" in config else {}
-        own = {key: value for key, value in config.items() if key not in ("tls", "alone_s")}
-        self._config = json.dumps(shared | own | {"transport": {"link": link}})
+        own = {key: value for key, value in config.items() if key != "tls"}
+        self._config = shared | own | {"transport": {"link": link}}
+        self._endpoints = deque(endpoints)
         self._declarations: list[Callable[[], object]] = []
         self._declared: list[object] = []
         """What Zenoh would take back once nothing holds it."""
@@ -82,12 +95,20 @@ class Link:
         self._handlers = ThreadPoolExecutor(_MOST_HANDLERS, thread_name_prefix="link")
         self._opening, self._ended = threading.Lock(), threading.Event()
         self._session = self._opened()
-        if "alone_s" in config:
-            threading.Thread(target=self._not_alone, args=(config["alone_s"],), name="link", daemon=True).start()
+        self._heard_s = time.monotonic()
+        if endpoints:
+            self.subscribe(_BEAT, bytes, lambda _: self._hear())
+        beats = self._follow if endpoints else self._beat if "access_control" in config else None
+        if beats is not None:
+            threading.Thread(target=beats, name="link", daemon=True).start()
 
     def _opened(self) -> zenoh.Session:
+        config = self._config
+        if self._endpoints:
+            # At one only: a second connection to the same house would be refused, and tried again for ever.
+            config = config | {"connect": config["connect"] | {"endpoints": [self._endpoints[0]]}}
         try:
-            return zenoh.open(zenoh.Config.from_json5(self._config))
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             raise WorkError(
                 "link-not-opened",
@@ -95,21 +116,27 @@ class Link:
                 remedy="Check that no other program uses its port, and start again.",
             ) from error
 
-    def _not_alone(self, alone_s: float) -> None:
-        """Open the session again where it has been with no other for a while: Zenoh may cease to try, as after a house
-        that restarted while the connection was being made.
+    def _beat(self) -> None:
+        while not self._ended.wait(BEAT_S):
+            self.publish(_BEAT, b"")
+
+    def _hear(self) -> None:
+        self._heard_s = time.monotonic()
+
+    def _follow(self) -> None:
+        """Open the session again where the house has said nothing for a while. A house that restarts while a connection
+        is being made can leave one behind that Zenoh takes for alive.
         """
-        alone_since_s = time.monotonic()
-        while not self._ended.wait(1.0):
-            if self._session.info.peers_zid():
-                alone_since_s = time.monotonic()
-            elif time.monotonic() - alone_since_s > alone_s:
-                alone_since_s = time.monotonic()
-                with self._opening, contextlib.suppress(WorkError):
-                    if not self._ended.is_set():
-                        self._session.close()  # type: ignore[no-untyped-call] # of the extension
-                        self._session = self._opened()
-                        self._declared = [declare() for declare in self._declarations]
+        while not self._ended.wait(BEAT_S):
+            if time.monotonic() - self._heard_s < ALONE_S:
+                continue
+            with self._opening, contextlib.suppress(WorkError):
+                if not self._ended.is_set():
+                    self._session.close()  # type: ignore[no-untyped-call] # of the extension
+                    self._endpoints.rotate(-1)
+                    self._session = self._opened()
+                    self._declared = [declare() for declare in self._declarations]
+            self._hear()
 
     def _declare(self, declare: Callable[[], object]) -> None:
         with self._opening:
@@ -229,13 +256,12 @@ def house_link(authority: Authority, *, host: str = "[::]", port: int = PORT) ->
 
 def member_link(membership: Membership) -> Link:
     """A member's side. Raises WorkError("link-not-opened")."""
-    endpoints = list(membership.endpoints)
-    return Link({
-        "alone_s": ALONE_S,
-        "connect": {"endpoints": endpoints, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
+    config = {
+        "connect": {"timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
         "listen": {"endpoints": []},
         "tls": _files(membership.folder, "connect"),
-    })  # fmt: skip
+    }
+    return Link(config, endpoints=membership.endpoints)
 
 
 def _rules(members: Iterable[Member]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ PAGES = (
     "/appearances",
     "/appearances/new",
     "/appearances/scenes/gold",
+    "/house",
     "/schedule",
     "/results",
     "/lamps",
