@@ -75,12 +75,12 @@ def publish_appearances(session: StageSession, *, reporter: Reporter, cancel: th
 
 def _checked(stage: Path) -> tuple[tuple[str, ...], dict[str, str]]:
     """The appearances of stage.toml that can be solved, and why the others can't."""
-    from controller.stage.artefacts.calibrated import Calibrated
+    from controller.stage.artefacts.calibrated import all_views
     from controller.stage.sessions.calibrations import finished_calibration
     from controller.stage.steps.appearance.requests import requests_of
 
     checked = check_stage(stage)
-    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
+    calibrated = all_views(finished_calibration(checked.stage.folder), checked.names)
     names, failed = [], {}
     for table in checked.stage.tables.appearances:
         try:

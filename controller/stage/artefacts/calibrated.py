@@ -37,8 +37,11 @@ from controller.stage.artefacts.views import first_view, view_folders
 
 
 class View(NamedTuple):
-    """``folder`` of a view; ``part`` takes its part of a camera image (rows, columns, ...); ``gain`` (3,): as of
-    ``view_gains``, None for the only view."""
+    """A view of a run.
+
+    ``folder`` of its solutions; ``part`` takes its part of a camera image (rows, columns, ...); ``gain`` (3,): as of
+    ``view_gains``, None for the only view
+    """
 
     folder: Path
     part: Callable[[Any], Any]
@@ -106,7 +109,7 @@ class Calibrated:
 
     def views(self) -> list[View]:
         """The first one first."""
-        return [View(self.folder, lambda image: image, None)]
+        return [View(self.base_folder, lambda image: image, None)]
 
     @property
     def folders(self) -> tuple[Path, ...]:

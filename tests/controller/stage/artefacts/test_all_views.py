@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError
+from controller.kiosk.jobs.failover import Survivors
 from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.calibrate.photometry.view_colours import in_common_units, view_gains
 from controller.optics.calibrate.values import Calibration
@@ -19,7 +20,7 @@ from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views
 from controller.stage.artefacts.projectors import Light
-from controller.stage.artefacts.solved import SolvedBase, read_solved
+from controller.stage.artefacts.solved import SolvedBase, is_solved, read_solved
 from controller.stage.artefacts.views import view_folder, write_view
 from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
 from hal.deadline import in_seconds
@@ -108,6 +109,18 @@ def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_pa
 def test_one_view_is_read_as_ever(tmp_path: Path) -> None:
     names = write_synthetic_run(tmp_path, projector=PROJECTOR, camera=CAMERAS["left"])
     assert type(all_views(tmp_path, names)) is Calibrated
+
+
+def test_solutions_without_a_projector_stay_beside_those_with_all(tmp_path: Path) -> None:
+    names = write_synthetic_run(tmp_path, projector=PROJECTOR, camera=CAMERAS["left"])
+    (own := tmp_path / "without").mkdir()
+    grey = Target(np.full((*CAMERAS["left"], 3), 0.3, np.float32), np.ones(CAMERAS["left"], np.bool_))
+    survivors, request = Survivors(tmp_path, names[1:], own), AppearanceRequest("look", "Look", lambda: grey, {})
+    with Journal(own) as journal:
+        steps = solve_steps(survivors, [request], SolveOptions(0.9, 0.001, "full"), ())
+        Runner(steps, journal, reporter=Silent()).run("takeover", deadline=in_seconds(120))
+    assert is_solved(own, "look")
+    assert not is_solved(tmp_path, "look")
 
 
 def test_views_without_a_common_place_are_refused_where_the_shape_counts(tmp_path: Path) -> None:
