@@ -40,6 +40,7 @@ from controller.stage.artefacts.grade import FIGURES
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import CAPTURES, json_path, write_json
 from controller.stage.artefacts.published import BUNDLE_FIGURES
+from controller.stage.artefacts.views import VIEWS
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import PANELS_FILE
 from controller.stage.sessions.run import tapes
@@ -88,10 +89,16 @@ def backup(stage: Path, *, photographs: bool = False) -> Path:
         for name, text in changed.items():
             add(archive, name, text)
         for name, path in (files | named).items():
-            if photographs or not (name.startswith(f"{_RUNS}/") and name.split("/")[2:3] == [CAPTURES]):
+            if photographs or not _is_photograph(name.split("/")):
                 _add_file(archive, name, path)
 
     return write_tar(new_file(stage, "backup", "tar.gz"), write)
+
+
+def _is_photograph(parts: Sequence[str]) -> bool:
+    """Whether a path, in its parts, lies among a run's photographs, or those of one of its views."""
+    inside = parts[4:5] if parts[2:3] == [VIEWS] else parts[2:3]
+    return parts[0] == _RUNS and inside == [CAPTURES]
 
 
 def missing(stage: Path) -> list[str]:

@@ -19,6 +19,7 @@ from controller.kiosk.store import archive
 from controller.kiosk.store.event_log import EventLog
 from controller.run.journal import Journal, JournalError
 from controller.stage.artefacts.names import CAPTURES, run_kind
+from controller.stage.artefacts.views import VIEWS
 from hal.notices import Level, Notice
 
 PHOTOGRAPHS_GOING: Final = f"{CAPTURES}.going"
@@ -53,11 +54,12 @@ def expired(stage: Path, *, now_s: float) -> list[Path]:
 def purge(runs: Sequence[Path]) -> int:
     """Delete the photographs of these runs; returns the freed bytes. Raises OSError."""
     freed = 0
-    for run in runs:
-        going = run / PHOTOGRAPHS_GOING
+    folders = (folder for run in runs for folder in (run, *run.glob(f"{VIEWS}/*")))
+    for folder in filter(_has_photographs, folders):
+        going = folder / PHOTOGRAPHS_GOING
         if not going.exists():
-            (run / CAPTURES).rename(going)
-            sync_folder(run)
+            (folder / CAPTURES).rename(going)
+            sync_folder(folder)
         freed += sum(path.lstat().st_size for path in going.rglob("*"))
         shutil.rmtree(going)
     return freed

@@ -12,9 +12,19 @@ from controller.core.errors import UsageError, VelaturaError
 from controller.kiosk.state import DriftCheck, Grade
 from controller.kiosk.values import Achieved, Comparison, Results
 from controller.stage.artefacts.comparison import Compared, all_compared, history_of, pictures_of
-from controller.stage.artefacts.grade import BEFORE, PICTURE, RESOLUTION, graded, passes, worst_letter, worst_of
+from controller.stage.artefacts.grade import (
+    BEFORE,
+    PICTURE,
+    RESOLUTION,
+    graded,
+    passes,
+    worst_letter,
+    worst_of,
+    worst_view,
+)
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.names import REPORT_PAGE, json_path, read_json, run_kind
+from controller.stage.artefacts.views import view_folders
 from controller.stage.sessions.calibrations import finished_calibrations
 from controller.stage.sessions.check import Checked
 
@@ -152,10 +162,16 @@ def _folder(stage: Path, run: str) -> Path:
 def results(stage: Path, run: str, worst_grade: float) -> Results:
     """Raises UsageError("run-unknown")."""
     folder = _folder(stage, run)
-    pictures = {"error": folder / PICTURE} if (folder / PICTURE).exists() else {}
+    views = view_folders(folder)
+    worst = worst_view(folder)[1] / PICTURE
+    pictures = {"error": worst} if worst.exists() else {}
     for name, file in _PICTURES.items():
         if (folder / file).exists():
             pictures[name] = folder / file
-    figures = [(f"Error of {name}", f"{percent:.2f} %") for name, percent in (graded(folder) or {}).items()]
+    figures = [
+        (f"Error of {name}" + (f" in view {view}" if len(views) > 1 else ""), f"{percent:.2f} %")
+        for view, of_view in views.items()
+        for name, percent in (graded(of_view) or {}).items()
+    ]
     grade = next((grade for grade in grades(stage, worst_grade) if grade.run == run), None)
     return Results(run, grade, pictures, tuple(figures))

@@ -13,13 +13,14 @@ from typing import Final
 from controller.config.models import ONLY_CAMERA
 from controller.stage.artefacts.names import read_json, safe_name, write_json
 
-_FOLDER: Final = "views"
+VIEWS: Final = "views"
+"""The folder with the views of a run that are not its first."""
 _RECORD: Final = "view.json"
 
 
 def view_folder(run: Path, name: str) -> Path:
     """The folder of a view that is not the first, whole or not."""
-    return run / _FOLDER / safe_name(name)
+    return run / VIEWS / safe_name(name)
 
 
 def write_view(folder: Path, name: str, number: int) -> Path:
@@ -48,6 +49,6 @@ def view_folders(run: Path) -> Mapping[str, Path]:
 
     For a run of one camera this is the run's folder alone.
     """
-    rows = [(read_json(record), record.parent) for record in run.glob(f"{_FOLDER}/*/{_RECORD}")]
+    rows = [(read_json(record), record.parent) for record in run.glob(f"{VIEWS}/*/{_RECORD}")]
     others = sorted((int(row["number"]), str(row["name"]), folder) for row, folder in rows)
     return {first_view(run): run, **{name: folder for _, name, folder in others}}

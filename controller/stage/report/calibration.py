@@ -34,8 +34,10 @@ from controller.stage.artefacts.grade import (
     read_troubles,
     trouble_row,
 )
+from controller.stage.artefacts.names import REPORT_PAGE
 from controller.stage.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
+from controller.stage.artefacts.views import VIEWS, first_view, view_folders
 from controller.stage.report import plots
 from controller.stage.report.galleries import causes_gallery, light_gallery, whites
 from controller.stage.report.page import Goal, Page, PageTable, ReportPicture, write_report
@@ -72,8 +74,14 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
                          remedy="Give the folder of a finished calibration.")  # fmt: skip
     calibration = read_calibration(run, asked.projectors)
     crop = crop_around(calibration.object_mask)
-    earlier = [one for one in graded_runs(run.parent) if one.name < run.name][-SHOWN_RUNS + 1 :]
+    # Beside a view that is not the first there are the other views of its run.
+    earlier = [one for one in graded_runs(run.parent) if one.name < run.name and run.parent.name != VIEWS]
+    earlier = earlier[-SHOWN_RUNS + 1 :]
     figures = figures_of(run, asked.projectors)
+    views = view_folders(run)
+    for folder in views.values():
+        if folder != run:
+            write_calibration_report(folder, asked)
     last = [figures_of(one, asked.projectors) for one in earlier[-COMPARED:]]
     before, resolution = _white(calibration, crop), resolution_px(calibration)
     _keep(run / BEFORE, before)
@@ -87,7 +95,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
         + (f" {SUPERPOSITION}" if len(asked.projectors) == 1 else ""),
         goals=_goals(run, figures, asked.worst_grade),
         rows=(),
-        tables=(_compared(run, figures, earlier[-COMPARED:], last, when),),
+        tables=(*_views(run, views), _compared(run, figures, earlier[-COMPARED:], last, when)),
         troubles=tuple(trouble["sentence"] for trouble in figures["troubles"]),
         galleries=(
             ("Maps", "Cropped to the object; dark where nothing is known.",
@@ -101,6 +109,17 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
     )  # fmt: skip
     html, _ = write_report(out or run, page, figures)
     return html
+
+
+def _views(run: Path, views: Mapping[str, Path]) -> tuple[PageTable, ...]:
+    """The error of each projector in each view, and where the view's own report is; () for the only view."""
+    if len(views) == 1:
+        return ()
+    errors = {name: graded(folder) or {} for name, folder in views.items()}
+    named = [(name, [f"{errors[view].get(name, np.nan):.2f} %" for view in views]) for name in errors[first_view(run)]]
+    reports = [str((folder / REPORT_PAGE).relative_to(run)) for folder in views.values()]
+    rows = (*((f"Error of {name}", *values) for name, values in named), ("Report", *reports))
+    return (PageTable("Views", ("", *views), rows),)
 
 
 def graded_runs(runs: Path) -> list[Path]:
@@ -126,6 +145,7 @@ def figures_of(run: Path, projectors: Sequence[str]) -> dict[str, Any]:
         "colours_px": {name: None if one is None else one.colours_px for name, one in pixels.items()},
         "radiometry": {name: read_radiometry_figures(run, name) for name in projectors},
         "verification": read_grade_figures(run),
+        "views": {name: read_grade_figures(of) for name, of in view_folders(run).items() if of != run},
         "troubles": [trouble_row(trouble) for trouble in read_troubles(run)],
         "steps": {str(step): seconds for step, seconds in steps.items()},
     }

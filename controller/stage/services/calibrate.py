@@ -45,6 +45,7 @@ from controller.stage.steps.appearance.publishing import BundleTarget, publish_s
 from controller.stage.steps.appearance.requests import requests_of, scene_request
 from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.stage.steps.calibrate.dots import dot_steps
+from controller.stage.steps.calibrate.drift import swapped_views
 from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
 from controller.stage.steps.calibrate.grade import verify_step
@@ -92,6 +93,8 @@ def calibrate(
         place.finish()
         run, last = place.run, None
     join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
+    for sentence in swapped_views(view_folders(run), before):
+        reporter.say(sentence, Level.WARNING)
     report_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
 

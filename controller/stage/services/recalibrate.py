@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -18,9 +20,11 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.drift import read_drift_figures
 from controller.stage.artefacts.grade import passes
 from controller.stage.artefacts.kinds import CALIBRATED, StepKind
+from controller.stage.artefacts.names import json_path
 from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named
 from controller.stage.artefacts.projectors import mode_of
+from controller.stage.artefacts.views import view_folder, view_folders
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.calibrations import finished_calibration, worst_grade
@@ -28,8 +32,8 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import marker
 from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.calibrate.dots import dot_steps
-from controller.stage.steps.calibrate.drift import drift_steps
-from controller.stage.steps.calibrate.full import calibration_steps
+from controller.stage.steps.calibrate.drift import drift_steps, swapped_views
+from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
 from controller.stage.steps.calibrate.quick import one_projector_steps, quick_steps
 from controller.stage.steps.modes import MODES, CalibrationMode, DotOptions
@@ -47,15 +51,21 @@ def check_drift(
     Raises UsageError("not-calibrated"), and what the devices raise.
     """
     checked = check_stage(session.stage)
-    calibrated = Calibrated(finished_calibration(checked.stage.folder), checked.names)
+    last = finished_calibration(checked.stage.folder)
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
-        return drift_steps(rig, calibrated, longest_exposure_s=_longest_s(checked))
+        return drift_steps(rig, _calibrated(checked, last, rig), longest_exposure_s=_longest_s(checked))
 
-    run = session.run(checked, StageWork("drift", steps), reporter=reporter, cancel=cancel)
+    run = session.run(checked, StageWork("drift", steps, views=True), reporter=reporter, cancel=cancel)
     content = read_drift_figures(run)
-    for sentence in content["sentences"]:
-        reporter.say(sentence, Level.INFO if content["advice"] == "nothing" else Level.WARNING)
+    folders = view_folders(run)
+    for name, folder in folders.items():
+        of_view = read_drift_figures(folder)
+        for sentence in of_view["sentences"]:
+            level = Level.INFO if of_view["advice"] == "nothing" else Level.WARNING
+            reporter.say(sentence if len(folders) == 1 else f"View {name}: {sentence}", level)
+    for sentence in swapped_views(folders, view_folders(last)):
+        reporter.say(sentence, Level.WARNING)
     with Journal(run) as journal:
         content["seconds"] = journal.steps()[StepId(StepKind.DRIFT_PHOTOGRAPHS)]
     return {"run": str(run), **(content if details else {"advice": content["advice"]})}
@@ -82,13 +92,13 @@ def recalibrate(
     checked = check_stage(session.stage)
     check_name(checked, projector)
     last = finished_calibration(checked.stage.folder)
-    calibrated = Calibrated(last, checked.names)
 
     def steps(rig: Rig, run: Path) -> Sequence[Step]:
-        longest_s = _longest_s(checked)
-        keep_outline(run, checked.stage.tables.object.outline)
-        mode: CalibrationMode = next((one for one in MODES if one == mode_of(last)), "fast")
-        taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, last)
+        longest_s, calibrated = _longest_s(checked), _calibrated(checked, last, rig)
+        if rig.is_first:
+            keep_outline(run, checked.stage.tables.object.outline)
+        mode: CalibrationMode = next((one for one in MODES if one == mode_of(calibrated.folder)), "fast")
+        taking = PhotographOptions(chosen or checked.stage.tables.calibration.photographs, calibrated.folder)
         shape = checked.stage.tables.object.shape
         prior = checked.prior(rig.view)
         full = [*calibration_steps(rig, prior, longest_exposure_s=longest_s, options=taking, shape=shape),
@@ -106,12 +116,41 @@ def recalibrate(
         ]
 
     name = "recalibrate" if projector is None else "projector"
-    run = session.run(checked, StageWork(name, steps, dark=True), reporter=reporter, cancel=cancel)
+    run = session.run(checked, StageWork(name, steps, dark=True, views=True), reporter=reporter, cancel=cancel)
+    _keep_views(run, last, reporter)
+    join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
     compare_with_last(run, last, reporter)
     if not passes(run, worst_grade(checked)):
         raise below_grade(run, worst_grade(checked))
     advice = "projector" if projector is not None else read_drift_figures(run)["advice"]
     return {"run": str(run), **grade_figures(run), "advice": advice, **_effort(run)}
+
+
+def _calibrated(checked: Checked, last: Path, rig: Rig) -> Calibrated:
+    """The last calibration of the rig's view. Raises UsageError("view-not-calibrated")."""
+    folders = view_folders(last)
+    if rig.view in folders or rig.is_first:
+        return Calibrated(folders.get(rig.view, last), checked.names)
+    raise UsageError(
+        "view-not-calibrated", what=f"The calibration {last.name} has no view {rig.view}.",
+        remedy=f"Run `velatura calibrate STAGE --view {rig.view}` to add it.",
+    )  # fmt: skip
+
+
+def _keep_views(run: Path, last: Path, reporter: Reporter) -> None:
+    """Take over the last calibration's views that were not photographed now, where nothing moved."""
+    drift = json_path(run, StepKind.DRIFT)
+    moved = drift.exists() and any(row["moved"] for row in read_drift_figures(run)["projectors"].values())
+    moved |= drift.exists() and read_drift_figures(run)["advice"] == "full"
+    for name, folder in view_folders(last).items():
+        if name in view_folders(run):
+            continue
+        if moved:
+            reporter.say(f"View {name} is lost: something has moved, and it was not photographed.", Level.WARNING)
+            continue
+        shutil.rmtree(view_folder(run, name), ignore_errors=True)
+        shutil.copytree(folder, view_folder(run, name), copy_function=os.link)
+        reporter.say(f"View {name} was not photographed: it stays as it was.", Level.WARNING)
 
 
 def _effort(run: Path) -> dict[str, float]:

@@ -47,18 +47,20 @@ class OtherViews:
         self._rig, self._journal, self._name, self._reporter = rig, journal, name, reporter
         self._stop = EitherEvent(deadline.cancel)
         self._deadline = Deadline(deadline.at_s, self._stop, deadline.time)
-        self._views = [
-            _View(number, other.seat, replace(rig.seen_by(other), drawn_by=self._drawn_by), make_steps,
-                  view_folder(journal.folder, other.name))
-            for number, other in enumerate(rig.others, start=1)
-        ]  # fmt: skip
+        self._absent, self._views = dict(rig.absent), []
+        for number, other in enumerate(rig.others, start=1):
+            own, folder = replace(rig.seen_by(other), drawn_by=self._drawn_by), view_folder(journal.folder, other.name)
+            try:
+                self._views.append(_View(number, other.seat, own, make_steps, folder))
+            except CodedError as error:
+                self._absent[other.name] = error
         self._beside = threads_may_compute()
 
     def around(self, steps: Sequence[Step]) -> list[Step]:
         """The first view's ``steps``, and before and after its photographs those that start the others and wait."""
         photographs = [n for n, step in enumerate(steps) if not step.unsteady and step.enter is None]
         first = photographs[0] if photographs else len(steps)
-        last = next((n for n, step in enumerate(steps) if step.leave or step.id.kind == _DARK_AFTER), len(steps))
+        last = next((n for n, step in enumerate(steps) if step.leave or step.id.kind in _LAST), len(steps))
         begin = Step(StepId("views-begin"), self._begin, title="Starting the other cameras", weight=0.01, always=True)
         weight = max(0.1, 0.25 * sum(step.weight for step in steps))
         done = Step(StepId("views"), self._wait, title="Waiting for the other views", weight=weight, always=True)
@@ -97,7 +99,7 @@ class OtherViews:
             self._join()
 
     def _begin(self, context: Context) -> Sequence[Path]:
-        for name, error in self._rig.absent.items():
+        for name, error in self._absent.items():
             self._lose(name, error)
         write_view(context.folder, self._rig.view, 0)
         if self._beside and self._views:
@@ -144,10 +146,9 @@ class OtherViews:
             view.seat.leave()
 
     def _lose(self, name: str, error: CodedError) -> None:
-        text = (
-            f"View {name} is not whole: {error.what} {error.remedy} The other views continue. Then run "
-            f"`velatura calibrate STAGE --view {name}` to complete it."
-        )
+        text = f"View {name} is not whole: {error.what} {error.remedy} The other views continue."
+        if self._name == "calibrate":
+            text += f" Then run `velatura calibrate STAGE --view {name}` to complete it."
         self._reporter.say(text, Level.WARNING)
         self._journal.record("view-not-whole", text, Level.WARNING)
 
@@ -211,6 +212,7 @@ class _Named:
         self._reporter.say(f"View {self._view.rig.view}: {text}", level)
 
 
-_DARK_AFTER: Final = "dark-after"
+_LAST: Final = ("dark-after", "take-over")
+"""Kinds of steps that concern all views."""
 
 __all__ = ["MakeSteps", "OtherViews"]

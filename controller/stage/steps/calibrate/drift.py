@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Final
 
+import cv2
 import numpy as np
 
 from controller.core import channels
@@ -22,10 +24,11 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.drift import write_drift
+from controller.stage.artefacts.geometry import projectors_of
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import DRIFT as TAKEN
 from controller.stage.artefacts.photographs import PATTERN as PATTERN_NAME
-from controller.stage.artefacts.projectors import IndirectFigures
+from controller.stage.artefacts.projectors import IndirectFigures, Light
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.capture.exposure import bracket
@@ -133,6 +136,53 @@ def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     flicker = {name: figures.flicker for name, figures in known.items() if figures is not None}
     drift = replace(drift, projectors=tuple(one.flickering(flicker.get(one.name, 0.0)) for one in drift.projectors))
     return [write_drift(context.folder, drift, calibration=calibrated.folder.name, photographs=len(taken))]
+
+
+ALIKE: Final = 0.9
+"""Correlation from which two pictures show the stage from the same place."""
+CLEARLY: Final = 0.1
+"""By so much better another view's picture has to fit than the view's own."""
+SMALL_PX: Final = 96
+
+
+def swapped_views(now: Mapping[str, Path], before: Mapping[str, Path]) -> list[str]:
+    """A sentence for each pair of views whose cameras seem swapped, or whose cameras are turned upside down.
+
+    ``now``: of drift checks or calibrations, by name; ``before``: of calibrations
+    """
+    seen, known = ({name: _white_of(folder) for name, folder in of.items()} for of in (now, before))
+    found = []
+    for name in seen:
+        own = _alike(seen[name], known[name]) if name in known else -1.0
+        if name in known and _alike(seen[name][::-1, ::-1], known[name]) > max(ALIKE, own + CLEARLY):
+            found.append(f"The camera of view {name} is upside down: its picture is turned by 180 degrees.")
+        found += [
+            f"The cameras of the views {name} and {other} are swapped: each sees what the other one saw."
+            for other in seen
+            if name < other and other in known and name in known
+            and _alike(seen[name], known[other]) > max(ALIKE, own + CLEARLY)
+            and _alike(seen[other], known[name]) > max(ALIKE, _alike(seen[other], known[other]) + CLEARLY)
+        ]  # fmt: skip
+    return found
+
+
+def _white_of(folder: Path) -> FloatImage:
+    """The stage at white, small (rows, columns): as the drift check photographed it, or as the calibration knows it."""
+    if TAKEN.index(folder).exists():
+        together = (one for one in TAKEN.read(folder) if one.name == "white" and one.projector is None)
+        return _small(next(together).per_second())
+    whites = (_small(Light.read(folder, name).white) for name in projectors_of(folder))
+    return sum(whites, start=np.zeros((SMALL_PX, SMALL_PX), np.float32))
+
+
+def _small(white: FloatImage) -> FloatImage:
+    grey = np.asarray(np.nan_to_num(white).mean(axis=2), np.float32)
+    return np.asarray(cv2.resize(grey, (SMALL_PX, SMALL_PX), interpolation=cv2.INTER_AREA))
+
+
+def _alike(one: FloatImage, other: FloatImage) -> float:
+    """The correlation of two pictures; 0 where one is even."""
+    return float(np.nan_to_num(np.corrcoef(one.ravel(), other.ravel())[0, 1]))
 
 
 def linear_frames(calibrated: Calibrated, pattern: Pattern) -> list[FloatImage]:
