@@ -24,7 +24,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.drift import write_drift
-from controller.stage.artefacts.geometry import projectors_of
+from controller.stage.artefacts.geometry import read_geometry_figures
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import DRIFT as TAKEN
 from controller.stage.artefacts.photographs import PATTERN as PATTERN_NAME
@@ -148,8 +148,10 @@ SMALL_PX: Final = 96
 def swapped_views(now: Mapping[str, Path], before: Mapping[str, Path]) -> list[str]:
     """A sentence for each pair of views whose cameras seem swapped, or whose cameras are turned upside down.
 
-    ``now``: of drift checks or calibrations, by name; ``before``: of calibrations
+    ``now``: of drift checks or calibrations, by name, of the only camera nothing is said; ``before``: of calibrations
     """
+    if len(now) < 2:
+        return []
     seen, known = ({name: _white_of(folder) for name, folder in of.items()} for of in (now, before))
     found = []
     for name in seen:
@@ -168,10 +170,11 @@ def swapped_views(now: Mapping[str, Path], before: Mapping[str, Path]) -> list[s
 
 def _white_of(folder: Path) -> FloatImage:
     """The stage at white, small (rows, columns): as the drift check photographed it, or as the calibration knows it."""
-    if TAKEN.index(folder).exists():
+    names = read_geometry_figures(folder).get("projectors")
+    if names is None:
         together = (one for one in TAKEN.read(folder) if one.name == "white" and one.projector is None)
         return _small(next(together).per_second())
-    whites = (_small(Light.read(folder, name).white) for name in projectors_of(folder))
+    whites = (_small(Light.read(folder, name).white) for name in names)
     return sum(whites, start=np.zeros((SMALL_PX, SMALL_PX), np.float32))
 
 

@@ -55,5 +55,9 @@ def test_a_camera_that_is_upside_down_is_named(tmp_path: Path, before: dict[str,
     assert "view front is upside down" in said
 
 
+def test_nothing_is_said_of_the_only_camera(tmp_path: Path, before: dict[str, Path]) -> None:
+    assert swapped_views(now(tmp_path, front=scene(1)[::-1, ::-1].copy()), before) == []
+
+
 def test_another_object_and_a_new_view_are_neither(tmp_path: Path, before: dict[str, Path]) -> None:
     assert swapped_views(now(tmp_path, back=scene(7), front=scene(8), new=scene(0)), before) == []
