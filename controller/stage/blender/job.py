@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask, save_arrays
+from controller.core.arrays import FloatImage, Mask, nearest_known, save_arrays
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import TO_BLENDER, Mesh, grid_mesh, margin_px, places_in_rendering
@@ -167,8 +167,6 @@ def as_seen(picture: FloatImage, camera: Pinhole, mask: Mask) -> Target:
 
     The picture is scaled so that all but its highlights lie below 1, and clipped at 1.5; the exposure is the solver's.
     """
-    from scipy import ndimage
-
     at = places_in_rendering(camera).astype(np.float32)
     # linear, since splines would ring around highlights and silhouettes
     picture = np.asarray(cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float32)
@@ -177,8 +175,8 @@ def as_seen(picture: FloatImage, camera: Pinhole, mask: Mask) -> Target:
     colour = np.where(covered[..., None], picture[..., :3] / np.maximum(picture[..., 3:], 0.5), 0)
     colour = np.where(np.isfinite(colour), np.maximum(colour, 0), 0)
     scale = float(np.percentile(colour[mask & covered].max(axis=1), BRIGHTEST_PERCENT)) if covered[mask].any() else 1.0
-    distance, nearest = ndimage.distance_transform_edt(~(covered & mask), return_indices=True)
+    distance, nearest = nearest_known(covered & mask)
     filled = mask & (distance <= FURTHEST_FILL_PX)
     # Where a bent shape leaves the object bare, there is nothing to be seen: black.
-    image = np.where(filled[..., None], np.minimum(colour[tuple(nearest)] / max(scale, 1e-9), 1.5), 0)
+    image = np.where(filled[..., None], np.minimum(colour[nearest] / max(scale, 1e-9), 1.5), 0)
     return Target(np.ascontiguousarray(image, np.float32), mask)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, strips
+from controller.core.arrays import FloatImage, Mask, nearest_known, strips
 from controller.core.blur import gaussian_blur
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.geometry.background import room_pixels
@@ -202,11 +202,8 @@ def filled(surface: Surface, mesh: RegisteredMesh) -> RegisteredMesh:
 
     None is filled through a hole, or beside a place where the measurement contradicts the mesh.
     """
-    from scipy.ndimage import distance_transform_edt
-
     solid, step, deviation_m = mesh.solid, mesh.figures["step"], mesh.arrays["deviation_m"]
-    nearest = distance_transform_edt(~np.isfinite(deviation_m), return_distances=False, return_indices=True)
-    agrees = np.abs(deviation_m[tuple(nearest)]) <= 1e-3 * mesh.figures["limit_mm"]
+    agrees = np.abs(deviation_m[nearest_known(np.isfinite(deviation_m))[1]]) <= 1e-3 * mesh.figures["limit_mm"]
     empty = surface.mask & ~np.isfinite(surface.points_m[..., 2])
     empty &= np.kron(agrees, np.ones((step, step), np.bool_))[: len(empty), : empty.shape[1]]
     y, x = np.nonzero(empty)

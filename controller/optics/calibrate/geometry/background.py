@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, strips
+from controller.core.arrays import FloatImage, Mask, nearest_known, strips
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 
@@ -52,8 +52,6 @@ def room_pixels(points_m: FloatImage) -> Mask:
     the room's where no plane reaches the picture's border, or where hardly anything else is seen. A picture in its
     frame is no part of the wall behind it.
     """
-    from scipy.ndimage import distance_transform_edt
-
     known = channels.finite(points_m)
     room, loose = np.zeros_like(known), np.zeros_like(known)
     border, rng = _border(known.shape), np.random.default_rng(0)
@@ -77,8 +75,7 @@ def room_pixels(points_m: FloatImage) -> Mask:
         room |= known & ~_things(known & ~room, loose, border)
     if not room.any() or np.count_nonzero(known & ~room) < LEAST_OBJECT * np.count_nonzero(known):
         return np.zeros_like(room)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    filled = room[tuple(nearest)].astype(np.uint8)
+    filled = room[nearest_known(known)[1]].astype(np.uint8)
     # the median of 25
     room = np.asarray(cv2.boxFilter(filled, -1, (5, 5), normalize=False, borderType=cv2.BORDER_REFLECT) > 12)
     return room & ~_pictures(room)

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
 from controller.optics.calibrate.values import Calibration, Geometry
 
 BRIGHT: Final = 0.3
@@ -45,6 +45,25 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
         return np.full(calibration.black.shape, np.nan, np.float32)
     reflectance = np.divide(light, falling, out=np.full(light.shape, np.nan, np.float32), where=known[..., None])
     return np.asarray(reflectance / np.percentile(reflectance[known], WHITEST), np.float32)
+
+
+def reflectance_everywhere(calibration: Calibration, own: FloatImage) -> FloatImage:
+    """``own_reflectance`` on all of the object, also where it is not known, as on a frame beside a plane.
+
+    There as much light falls as on the nearest pixel that the same projectors light, and whose reflectance is known.
+    """
+    whites = np.stack([part.white for part in calibration.projectors])
+    lit = whites.min(axis=3) > 1e-3 * whites.max(initial=0)
+    known, everywhere = channels.finite(own), own.copy()
+    for by in np.unique(lit[:, calibration.object_mask & ~known], axis=1).T:
+        both = known & lit[by].all(axis=0)
+        if not by.any() or not both.any():
+            continue
+        here = calibration.object_mask & ~known & (lit == by[:, None, None]).all(axis=0)
+        there = tuple(index[here] for index in nearest_known(both)[1])
+        light = whites[by].sum(axis=0)
+        everywhere[here] = np.minimum(own[there] * light[here] / light[there], 1)
+    return everywhere
 
 
 def falling_light(geometry: Geometry) -> list[FloatImage]:

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
 from controller.core.channels import mean
 from controller.core.errors import UsageError
 from controller.core.jit import compiled
@@ -265,13 +265,10 @@ def by_pixels(
     ``reachable``: where ``asked`` is in reach; ``valid``: where it says something. Beyond that, a pixel is compared
     with the nearest one where it does. ``white``: radiance of the target's white.
     """
-    from scipy.ndimage import distance_transform_edt
-
     seen = visible_object(lit)
     whole = asked
     if (valid & lit).any() and (seen & ~(valid & lit)).any():
-        nearest = distance_transform_edt(~(valid & lit), return_distances=False, return_indices=True)
-        whole = asked[tuple(nearest)]
+        whole = asked[nearest_known(valid & lit)[1]]
     sets = {"in_reach": reachable & valid & lit, "lit": valid & lit, "visible": seen}
     error = colour_difference(np.nan_to_num(photograph), whole, camera_to_xyz, white, seen)
     return {name: _figures(error, pixels, int(seen.sum())) for name, pixels in sets.items()}

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, nearest_known
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.solve.targets.patterns import Colour
@@ -84,15 +84,15 @@ def smooth_normals(
     from scipy import ndimage
 
     known = mask & channels.finite(geometry.normals) & channels.finite(geometry.points_m)
-    distance, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
+    distance, nearest = nearest_known(known)
     filled = mask & (distance <= reach_px) & known.any()
-    normals = np.where(filled[..., None], geometry.normals[tuple(nearest)], 0).astype(np.float32)
+    normals = np.where(filled[..., None], geometry.normals[nearest], 0).astype(np.float32)
     normals = np.nan_to_num(normals)
     if sigma_px > 0:
         # beyond the picture as beyond the object: nothing
         normals = ndimage.gaussian_filter(normals, (sigma_px, sigma_px, 0), mode="constant", truncate=3.0)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    directions = np.where(filled[..., None], geometry.points_m[tuple(nearest)], 0)
+    directions = np.where(filled[..., None], geometry.points_m[nearest], 0)
     directions /= np.maximum(np.linalg.norm(directions, axis=2, keepdims=True), 1e-9)
     unit = np.where(filled[..., None], normals / np.maximum(length, 1e-9), 0)
     return unit.astype(np.float32), directions.astype(np.float32), filled

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import cv2
 import numpy as np
 
-from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.arrays import Float64, FloatImage, Mask, nearest_known, strips
 from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh, rays_of
 from controller.optics.calibrate.values import Pinhole
 from controller.optics.solve.targets.values import Target, through_camera
@@ -134,8 +134,6 @@ def _positions(at: Float64, steps: Float64) -> Iterator[tuple[float, float, Floa
 
 def photographed(picture: FloatImage, places: Places, mask: Mask, side: int) -> FloatImage:
     """The sheet (side, side, 4) with ``picture`` (rows, columns, 3) of the object in ``mask``, clear elsewhere."""
-    from scipy.ndimage import distance_transform_edt
-
     total = np.zeros((side * side, 4))
     for rows in strips(len(mask)):
         y, x = np.nonzero(mask[rows])
@@ -148,5 +146,5 @@ def photographed(picture: FloatImage, places: Places, mask: Mask, side: int) -> 
             for channel, values in enumerate([*colours.T, np.ones(len(texel))]):
                 total[:, channel] += np.bincount(texel, values, side * side)
     sheet = (total / np.maximum(total[:, 3:], 1)).astype(np.float32).reshape(side, side, 4)
-    far, nearest = distance_transform_edt(sheet[..., 3] == 0, return_indices=True)
-    return np.where((far <= _BESIDE_PX)[..., None], sheet[tuple(nearest)], sheet)
+    far, nearest = nearest_known(sheet[..., 3] > 0)
+    return np.where((far <= _BESIDE_PX)[..., None], sheet[nearest], sheet)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, nearest_known
 from controller.core.blur import masked_blur
 from controller.optics.calibrate.values import Geometry
 
@@ -60,8 +60,7 @@ def pieces(mask: Mask) -> list[Mask]:
     sizes = np.bincount(labels.ravel())[1:]
     order = np.argsort(-sizes, kind="stable") + 1
     large = [int(label) for label in order if sizes[label - 1] >= LEAST_SHARE * mask.sum()] or [int(order[0])]
-    nearest = ndimage.distance_transform_edt(~np.isin(labels, large), return_distances=False, return_indices=True)
-    owner = labels[tuple(nearest)]
+    owner = labels[nearest_known(np.isin(labels, large))[1]]
     return [mask & (owner == label) for label in large]
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.solve.targets.values import Target
@@ -50,8 +50,6 @@ def object_space(
     An object too flat to have an axis is mapped as a plane. ``up``: direction in the camera's frame.
     Raises WorkError("target-no-geometry") when no pixel of ``mask`` has a known position.
     """
-    from scipy import ndimage
-
     known = channels.finite(geometry.points_m) & channels.finite(geometry.normals)
     wanted = known & mask
     if not wanted.any():
@@ -71,13 +69,13 @@ def object_space(
             angle = np.arctan2(right - axis[0], near - axis[1])
             radius = float(np.median(np.hypot(right - axis[0], near - axis[1])))
             across = radius * angle
-    distance, nearest = ndimage.distance_transform_edt(~wanted, return_indices=True)
+    distance, nearest = nearest_known(wanted)
     filled = mask & (distance <= FURTHEST_FILL_PX)
     maps = []
     for values in (across, height - middle[1]):
         full = np.zeros(mask.shape, dtype=np.float32)
         full[wanted] = values
-        maps.append(np.where(filled, full[tuple(nearest)], np.float32(0)))
+        maps.append(np.where(filled, full[nearest], np.float32(0)))
     return ObjectSpace(maps[0], maps[1], filled, radius)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
 from controller.optics.transport.indirect.blocks import down
 
 Indices = npt.NDArray[Any]
@@ -76,8 +76,6 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
     ``points_m``, ``normals`` (rows, columns, 3) in the camera's frame, NaN where unknown; ``grid`` (rows, columns) of
     blocks of ``side`` x ``side`` pixels
     """
-    from scipy.ndimage import distance_transform_edt
-
     count = grid[0] * grid[1]
     surface = _continued(_cells(points_m, normals, max(1, round(side / FINER))), GAP_BLOCKS * FINER)
     senders = _continued(_cells(points_m, normals, max(1, round(side / ACROSS))), GAP_BLOCKS * ACROSS)
@@ -90,8 +88,8 @@ def form_factors(points_m: FloatImage, normals: FloatImage, grid: tuple[int, int
         out += np.bincount(block * (count + 1) + met, minlength=len(out))
     patches = np.bincount(block, minlength=count)
     shares = out.reshape(count, count + 1)[:, :count] / np.maximum(RAYS * patches, 1)[:, None]
-    nearest = distance_transform_edt((patches == 0).reshape(grid), return_distances=False, return_indices=True)
-    return np.asarray(shares[np.ravel_multi_index(tuple(nearest.reshape(2, -1)), grid)], np.float32)
+    nearest = nearest_known((patches > 0).reshape(grid))[1]
+    return np.asarray(shares[np.ravel_multi_index(nearest, grid).ravel()], np.float32)
 
 
 def _cells(points_m: FloatImage, normals: FloatImage, side: int) -> _Cells:
@@ -113,15 +111,11 @@ def _cells(points_m: FloatImage, normals: FloatImage, side: int) -> _Cells:
 
 def _continued(cells: _Cells, reach: float) -> _Cells:
     """With the plane of the nearest known cell at those which have one within ``reach`` cells."""
-    from scipy.ndimage import distance_transform_edt
-
     if not cells.good.any():
         return cells
-    unknown = ~cells.good.reshape(cells.grid)
-    apart: Float64 = distance_transform_edt(unknown)
-    nearest: Indices = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    apart, nearest = nearest_known(cells.good.reshape(cells.grid))
     gaps = np.flatnonzero((apart.ravel() > 0) & (apart.ravel() <= reach))
-    source = np.asarray(np.ravel_multi_index(tuple(nearest.reshape(2, -1)), cells.grid))[gaps]
+    source = np.ravel_multi_index(nearest, cells.grid).ravel()[gaps]
     row, column = np.divmod(np.arange(len(cells.points)), cells.grid[1])
     at = np.stack([column, row, np.ones_like(row)], axis=1).astype(np.float64)
     known = cells.points[cells.good]

@@ -13,6 +13,7 @@ import numpy as np
 from controller.config.models import SolveTable
 from controller.core import channels
 from controller.core.arrays import moved_to_file
+from controller.optics.calibrate.photometry.reflectance import reflectance_everywhere
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import with_less_light
 from controller.optics.solve.targets.files import read_large_picture
@@ -51,7 +52,8 @@ class Restoration:
         own = np.where(mask[..., None], calibrated.reflectance, np.nan)
         points = [((x + 0.5) / by - 0.5, (y + 0.5) / by - 0.5, right, down) for x, y, right, down in look.points]
         registration = register(picture, own, points)
-        target = restored(picture, registration, own, mask, look, calibrated.calibration.camera_to_xyz)
+        everywhere = reflectance_everywhere(calibrated.calibration, own)
+        target = restored(picture, registration, everywhere, mask, look, calibrated.calibration.camera_to_xyz)
         exposure = None
         if self._brightness is not None:
             whites = channels.mean(calibrated.transport.reach()) / channels.mean(own)

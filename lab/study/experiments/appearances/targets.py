@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import FloatImage, Mask, nearest_known
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.solve.targets.files import read_picture
 from controller.optics.solve.targets.patterns import replace_pattern
@@ -73,8 +72,7 @@ def _paint_everywhere(subject: Subject) -> FloatImage:
     """The object's own paint; where its shape is not known, that of the nearest place where it is."""
     geometry = subject.geometry
     known = subject.mask & np.isfinite(geometry.normals).all(axis=2) & np.isfinite(geometry.points_m).all(axis=2)
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    paint: FloatImage = own_paint(geometry, subject.transport.reach())[tuple(nearest)]
+    paint: FloatImage = own_paint(geometry, subject.transport.reach())[nearest_known(known)[1]]
     return paint
 
 

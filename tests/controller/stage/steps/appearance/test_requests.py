@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageCms
 from scipy import ndimage
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, load_arrays, save_arrays
 from controller.core.errors import CalibrationError, UsageError
 from controller.kiosk.store.targets import on_object
 from controller.optics.calibrate.geometry.shape import FoundShape
@@ -207,6 +207,20 @@ def test_a_restoration_is_laid_by_points_at_the_light_that_is_asked_for(tmp_path
     kept = Registered.read(calibrated.folder, "x")
     assert kept is not None
     assert kept.figures["share"] <= kept.figures["then_share"] <= 1
+
+
+def test_what_lies_beside_the_planes_of_one_projector_stays_as_it_is(tmp_path: Path, calibrated: Calibrated) -> None:
+    stage = load(tmp_path, STAGE + RESTORATION + CORNERS + 'outside = "as-is"\n')
+    whole = requests_of(stage, Calibrated(calibrated.folder, ("left",)))[0].target()
+    arrays = load_arrays(calibrated.folder / "geometry.npz")
+    frame = np.zeros(CAMERA, np.bool_)
+    frame[20:40, :4] = True
+    arrays["points_m"][frame] = arrays["normals"][frame] = np.nan
+    save_arrays(calibrated.folder / "geometry.npz", arrays)
+    target = requests_of(stage, Calibrated(calibrated.folder, ("left",)))[0].target()
+    assert target.mask[frame].all()
+    assert whole.image[frame].min() > 0.05
+    np.testing.assert_allclose(target.image[frame], whole.image[frame], rtol=0.15)
 
 
 @pytest.mark.parametrize(
