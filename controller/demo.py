@@ -111,7 +111,7 @@ class DemoStage:
     @property
     def appearances(self) -> tuple[dict[str, Any], ...]:
         its = OF_OBJECT.get(self.built_in, IN_OTHER_LIGHT)
-        return IN_OTHER_LIGHT if self.projectors == 1 and its is not RESTORED else its
+        return IN_OTHER_LIGHT if self.projectors == 1 and self.built_in != "painting" else its
 
     @property
     def object_file(self) -> Path | None:

@@ -134,7 +134,8 @@ def reconstruct_planes(
     share = np.count_nonzero(label >= 0) / max(1, int(np.count_nonzero(lit)))
     if share < LEAST_FLAT:
         raise _not_flat(share)
-    towards = np.where(label[..., None] >= 0, planes[label], np.float32(np.nan)).astype(np.float32)
+    # the last one where there is none
+    towards = np.append(planes, np.full((1, 3), np.nan), axis=0).astype(np.float32)[label]
     directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1), np.float32)], axis=2)
     inverse = channels.total(towards * directions)
     local = np.asarray(directions / inverse[..., None], np.float32)
@@ -444,10 +445,11 @@ def _measured(problem: _Problem, planes: Float64) -> Float64:
     return np.array(rows).reshape(-1, 2)
 
 
-def _projected(rays: FloatImage, inverse: FloatImage, stage: ba.AdjustmentState, n: int) -> FloatImage:
-    """Places (rows, columns, 2) in projector ``n``'s picture of points on rays, in the arrays' own precision."""
+def _projected(rays: FloatImage, plane: Float64, stage: ba.AdjustmentState, n: int) -> FloatImage:
+    """Places (rows, columns, 2) in projector ``n``'s picture of where rays meet a plane, in the rays' own precision."""
     log_focal, x, y, k1 = (np.float32(value) for value in stage.intrinsics[n])
-    local = (rays - inverse[..., None] * stage.centres[n].astype(np.float32)) @ stage.rotations[n].T.astype(np.float32)
+    turn = stage.rotations[n]
+    local = rays @ (turn - np.outer(turn @ stage.centres[n], plane)).T.astype(np.float32)
     flat = local[..., :2] / np.maximum(local[..., 2:], np.float32(_LEAST_INVERSE))
     bent = 1 + k1 * channels.total(flat * flat)[..., None]
     return np.asarray(np.exp(log_focal) * bent * flat + np.array([x, y]), np.float32)
@@ -467,7 +469,7 @@ def _dense_labels(
             square, off, count = (np.zeros(inverse.shape, np.float32) for _ in range(3))
             for n, own in enumerate(correspondences):
                 seen = own.valid[rows] & channels.finite(own.projector_px[rows])
-                apart = channels.length(_projected(directions, inverse, state.stage, n) - own.projector_px[rows])
+                apart = channels.length(_projected(directions, values, state.stage, n) - own.projector_px[rows])
                 apart = np.where(seen, apart, np.float32(0))
                 square, off, count = square + (apart / np.float32(limits_px[n])) ** 2, off + apart**2, count + seen
             mean = np.where((count > 0) & (inverse > 0), square / np.maximum(count, 1), np.float32(np.inf))
@@ -483,8 +485,9 @@ def _relative_sigma(directions: FloatImage, inverse: FloatImage, label: Labels, 
     for plane in range(int(label.max(initial=-1)) + 1):
         own = covariance[3 * plane : 3 * plane + 3, 3 * plane : 3 * plane + 3]
         here = label == plane
-        along = directions[here].astype(np.float64)
-        relative[here] = np.sqrt(np.einsum("pi,ij,pj->p", along, own, along)) / inverse[here]
+        shares, axes = np.linalg.eigh(own)
+        root = (axes * np.sqrt(np.maximum(shares, 0))).astype(np.float32)
+        relative[here] = channels.length(directions[here] @ root) / inverse[here]
     return relative
 
 

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.values import Geometry
@@ -41,7 +42,7 @@ class MeasuredDistance:
 
 def nearest_distance(points: FloatImage) -> float:
     """Distance from the camera to the nearest point of (rows, columns, 3), but for the nearest thousandth of them."""
-    distance = np.linalg.norm(points[np.isfinite(points[..., 2])].astype(np.float64), axis=1)
+    distance = channels.length(points[np.isfinite(points[..., 2])])
     return float(np.quantile(distance, NEAREST_SHARE))
 
 
