@@ -23,6 +23,7 @@ from controller.kiosk.values import (
     Computed,
     Fit,
     FoundDevice,
+    LaidMesh,
     LampDay,
     Reach,
     RecalibrationKind,
@@ -130,6 +131,21 @@ class Kiosk(Protocol):
 
         Raises UsageError("scene-unknown", "blender-missing", "appearance-other").
         """
+
+    def meshes(self) -> Sequence[str]:
+        """Files of meshes in the stage's folder."""
+
+    def mesh_picture(self, mesh: str, side: int) -> Path:
+        """A mesh from one of 32 sides (PNG). Raises UsageError("mesh-unknown", "mesh-unreadable", "mesh-no-faces")."""
+
+    def lay_mesh(self, mesh: str, side: int, points: str = "") -> None:
+        """Lay a mesh on the object, by itself or by ``points`` (see ``operations.arguments.MeshPoints``). Seconds.
+
+        Raises UsageError and WorkError with codes "mesh-...", UsageError("not-calibrated", "shape-unknown").
+        """
+
+    def laid_mesh(self) -> LaidMesh | None:
+        """The mesh that lies on the object. Raises UsageError("not-calibrated")."""
 
     def appearances(self) -> Sequence[Appearance]: ...
 

@@ -102,6 +102,19 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
+class LaidMesh:
+    """The mesh that lies on the object: its file, how far both differ, ``size`` in words; ``pictures``: "laid", it in
+    the camera's view, and "map" of the differences.
+    """
+
+    file: str
+    median_off_mm: float
+    most_off_mm: float
+    size: str
+    pictures: Pictures = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class NewTarget:
     """An uploaded picture: ``target`` is its key."""
 

@@ -17,7 +17,7 @@ from controller.kiosk.store.archive import diagnostics
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.event_log import EventLog
 from controller.kiosk.supervisors.light_records import LampHistory
-from controller.kiosk.values import Appearance, Changes, Comparison, LampDay, Reach, Results, Scene, Schedule
+from controller.kiosk.values import Appearance, Changes, Comparison, LaidMesh, LampDay, Reach, Results, Scene, Schedule
 from controller.stage.sessions.calibrations import finished_calibration, stage_trust, worst_grade
 from controller.stage.sessions.check import Checked, check_stage
 
@@ -79,6 +79,26 @@ class FolderKiosk:
         from controller.kiosk.preview.scenes import scene_reach
 
         return scene_reach(check_stage(self.stage), scene)
+
+    def meshes(self) -> Sequence[str]:
+        from controller.kiosk.preview.meshes import meshes
+
+        return meshes(self.stage)
+
+    def mesh_picture(self, mesh: str, side: int) -> Path:
+        from controller.kiosk.preview.meshes import mesh_picture
+
+        return mesh_picture(self.stage, mesh, side)
+
+    def lay_mesh(self, mesh: str, side: int, points: str = "") -> None:
+        from controller.kiosk.preview.meshes import lay_mesh
+
+        lay_mesh(self.stage, mesh, side, points)
+
+    def laid_mesh(self) -> LaidMesh | None:
+        from controller.kiosk.preview.meshes import laid_mesh
+
+        return laid_mesh(self.stage)
 
     def schedule(self) -> Schedule:
         return self._schedule().now

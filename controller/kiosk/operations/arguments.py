@@ -57,6 +57,14 @@ PointPairs = Annotated[str, Field(max_length=1 << 14, description=(
     "number from 0 to 1; default: found by what both show")), TEXT]  # fmt: skip
 SceneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,47}$", max_length=48, description=(
     "a scene's name, as `scenes` lists it")), TEXT]  # fmt: skip
+MeshName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,51}$", max_length=52, description=(
+    "the file of a mesh, as `meshes` lists it")), TEXT]  # fmt: skip
+MeshSide = Annotated[int, Field(ge=0, le=31, description=(
+    "from where a mesh is seen: 0 to 7 turned by 45 degrees, then tipped by a quarter")), INTEGER]  # fmt: skip
+MeshPoints = Annotated[str, Field(max_length=1 << 14, description=(
+    "at least four [x, y, x, y], a place in the mesh's picture and the same one in the camera's view, each number from "
+    "0 to 1; default: found by its shape")), TEXT]  # fmt: skip
+LaidPicture = Annotated[Literal["laid", "map"], Field(description="laid or map")]
 ReachPicture = Annotated[Literal["target", "result", "map"], Field(description="target, result or map")]
 ComparisonPicture = Annotated[Literal["before", "target", "achieved", "error", "resolution"], Field(
     description="before, target, achieved, error or resolution")]  # fmt: skip

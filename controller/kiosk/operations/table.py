@@ -28,6 +28,10 @@ from controller.kiosk.operations.arguments import (
     HoursRow,
     Identifying,
     JobNumber,
+    LaidPicture,
+    MeshName,
+    MeshPoints,
+    MeshSide,
     MostEvents,
     NewName,
     OnlyAppearance,
@@ -63,6 +67,7 @@ from controller.kiosk.values import (
     Finding,
     Fit,
     FoundDevice,
+    LaidMesh,
     LampDay,
     NewTarget,
     Reach,
@@ -343,6 +348,38 @@ def scene_reach(kiosk: Kiosk, scene: SceneName) -> Reach:
 def scene_reach_picture(kiosk: Kiosk, scene: SceneName, picture: ReachPicture) -> Picture:
     """The scene, what it will look like, or a map of what is out of reach."""
     return kiosk.scene_reach(scene).pictures.get(picture)
+
+
+@operation("GET /meshes", OPERATOR, LOOKS, names=Names(part_of="register"), offline=True)
+def meshes(kiosk: Kiosk) -> Sequence[str]:
+    """Meshes in the stage's folder that can be laid on the object."""
+    return kiosk.meshes()
+
+
+@operation("GET /meshes/{mesh}/sides/{side}", OPERATOR, LOOKS, names=Names(part_of="register"), offline=True)
+def mesh_picture(kiosk: Kiosk, mesh: MeshName, side: MeshSide) -> Picture:
+    """A mesh from one side."""
+    return kiosk.mesh_picture(mesh, side)
+
+
+@operation("POST /meshes/{mesh}", OPERATOR, CHANGES, done="The mesh lies on the object.",
+           names=Names(part_of="register"), offline=True)  # fmt: skip
+def lay_mesh(kiosk: Kiosk, mesh: MeshName, side: MeshSide = 0, points: MeshPoints = "") -> None:
+    """Lay a mesh on the object, by itself or by the same places on both."""
+    kiosk.lay_mesh(mesh, side, points)
+
+
+@operation("GET /mesh", OPERATOR, LOOKS, names=Names(part_of="register"), offline=True)
+def laid_mesh(kiosk: Kiosk) -> LaidMesh | None:
+    """The mesh that lies on the object."""
+    return kiosk.laid_mesh()
+
+
+@operation("GET /mesh/{picture}", OPERATOR, LOOKS, names=Names(part_of="register"), offline=True)
+def laid_mesh_picture(kiosk: Kiosk, picture: LaidPicture) -> Picture:
+    """The mesh in the camera's view, or a map of how far it differs from the object."""
+    found = kiosk.laid_mesh()
+    return None if found is None else found.pictures.get(picture)
 
 
 # -- results

@@ -46,6 +46,7 @@ LEADS_TO: Final = {
     "upload-target": "/appearances/new/{target}",
     "fit-target": "/appearances/new/{target}",
     "outline-target": "/appearances/new/{target}",
+    "lay-mesh": "/mesh",
     "set-schedule": "/schedule",
     **dict.fromkeys(("house-open", "house-close", "house-play", "house-add", "house-remove"), "/house"),
     **dict.fromkeys(("house-join", "house-leave"), "/house"),

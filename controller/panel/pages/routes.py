@@ -44,7 +44,8 @@ NAVIGATION: Final = (
     ("/care", mark("Backup"), Role.TECHNICIAN, "System"),
     ("/accounts", mark("Accounts"), Role.TECHNICIAN, "System"),
 )
-BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results", "/changes": "/doctor"}
+BELOW: Final = {"/setup": "/settings", "/password": "/accounts", "/reports": "/results", "/changes": "/doctor",
+                "/mesh": "/appearances"}  # fmt: skip
 """Pages that are not in the navigation, and those that they belong to."""
 NO_TARGET: Final[dict[str, Any]] = {"target": None, "reach": None, "outline": "[]", "stamp": 0}
 HOUSE_EVENTS: Final = 50
@@ -112,6 +113,8 @@ class Pages:
             ("/appearances/new", Role.OPERATOR, "target.html", self._new),
             ("/appearances/new/{target}", Role.OPERATOR, "target.html", self._target),
             ("/appearances/scenes/{scene}", Role.OPERATOR, "scene.html", self._scene),
+            ("/mesh", Role.OPERATOR, "mesh.html", self._mesh),
+            ("/mesh/{mesh}", Role.OPERATOR, "mesh.html", self._mesh),
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
@@ -327,6 +330,16 @@ class Pages:
     def _view_px(self) -> tuple[int, int]:
         """Of the camera; a usual one while it is not known."""
         return self._panel.kiosk.view_px() or (3, 2)
+
+    def _mesh(self, request: Request) -> dict[str, Any]:
+        """``side``: see ``operations.arguments.MeshSide``."""
+        kiosk, mesh, side = self._panel.kiosk, request.path_params.get("mesh"), request.query_params.get("side", "0")
+        names, laid = kiosk.meshes(), kiosk.laid_mesh()
+        if mesh is not None and mesh not in names:
+            raise UsageError("mesh-unknown", what="There is no such mesh.", remedy="Choose one of the list.")
+        stamp = 0 if laid is None else laid.pictures["laid"].stat().st_mtime_ns
+        return {"meshes": names, "mesh": mesh, "laid": laid, "stamp": stamp,
+                "side": int(side) % 32 if side.isdecimal() else 0}  # fmt: skip
 
     def _scene(self, request: Request) -> dict[str, Any]:
         """Without a script the page has to wait for what Blender renders."""

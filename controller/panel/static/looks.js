@@ -19,7 +19,6 @@
 
   function outline(place) {
     const field = place.querySelector("#outline"), svg = place.querySelector("#draw");
-    const over = place.querySelector(".over"), through = place.querySelector("#through");
     let regions = [];
     const draw = () => {
       field.value = JSON.stringify(regions.filter((one) => one.length > 2));
@@ -54,14 +53,16 @@
     place.querySelector("#clear").addEventListener("click", () => { regions = []; draw(); });
     field.addEventListener("change", typed);
     for (const hidden of [place, ...place.querySelectorAll("[hidden]")]) hidden.hidden = false;
-    if (over) {
-      const blink = place.querySelector("#blink");
-      blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
-      const fade = () => over.style.setProperty("opacity", String(through.value / 100));
-      through.addEventListener("input", fade);
-      fade();
-    }
+    if (place.querySelector(".over")) blinking(place);
     typed();
+  }
+  // One picture over another.
+  function blinking(place) {
+    const over = place.querySelector(".over"), through = place.querySelector("#through"), blink = place.querySelector("#blink");
+    blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
+    const fade = () => over.style.setProperty("opacity", String(through.value / 100));
+    through.addEventListener("input", fade);
+    fade();
   }
   // The chosen picture in the camera's view, in each of the ways to fit it, as small as the drawings of them.
   function fit(ways, picture) {
@@ -142,7 +143,8 @@
     });
     place.hidden = false;
   }
-  const place = document.getElementById("on-object"), byPoints = document.getElementById("by-points");
+  const place = document.getElementById("on-object"), byPoints = document.getElementById("by-points"), laid = document.getElementById("laid");
+  if (laid) blinking(laid);
   if (place && place.querySelector("#draw")) outline(place);
   if (byPoints) pairs(byPoints);
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.calibrate.mesh_alignment import Pairs, Pose
@@ -32,12 +33,12 @@ FARTHEST_PX: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class MeshOrder:
-    """``unit`` of ``UNITS``, None: guessed; ``pairs``: a JSON file (docs/how-to/known-mesh.md); ``limit_mm``: most that
-    the mesh may differ; ``fill``: whether it fills what no two projectors measured"""
+    """``unit`` of ``UNITS``, None: guessed; ``pairs``: a JSON file (docs/how-to/known-mesh.md), or what it holds;
+    ``limit_mm``: most that the mesh may differ; ``fill``: whether it fills what no two projectors measured"""
 
     mesh: Path
     unit: str | None = None
-    pairs: Path | None = None
+    pairs: Path | Float64 | None = None
     limit_mm: float | None = None
     fill: bool = False
 
@@ -53,7 +54,7 @@ def register_in(run: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str,
     Raises UsageError("mesh-unreadable", "mesh-no-faces", "mesh-unit-wrong", "mesh-pairs-file", "mesh-pair-beside"), and
     as ``lay_mesh`` and ``Surface.read``. Nothing is written then.
     """
-    mesh = _read(order.mesh)
+    mesh = read_known_mesh(order.mesh)
     surface = Surface.read(run)
     pairs = None if order.pairs is None else _pairs(order.pairs, surface)
     limit_m = None if order.limit_mm is None else 1e-3 * order.limit_mm
@@ -79,7 +80,8 @@ def register_in(run: Path, order: MeshOrder, reporter: Reporter) -> Mapping[str,
     }
 
 
-def _read(path: Path) -> RegisteredMesh:
+def read_known_mesh(path: Path) -> RegisteredMesh:
+    """A mesh that lies nowhere yet. Raises UsageError("mesh-unreadable", "mesh-no-faces")."""
     try:
         mesh = read_mesh(path, coloured=False)
     except MeshUnreadable as error:
@@ -103,9 +105,11 @@ def _read(path: Path) -> RegisteredMesh:
     return RegisteredMesh(arrays, nowhere, {"file": path.name, "sha256": sha256_of(path)})
 
 
-def _pairs(path: Path, surface: Surface) -> Pairs:
+def _pairs(given: Path | Float64, surface: Surface) -> Pairs:
+    source = given if isinstance(given, Path) else "The list"
     try:
-        pairs = np.array(json.loads(path.read_text("utf-8")), np.float64)
+        rows = json.loads(given.read_text("utf-8")) if isinstance(given, Path) else given
+        pairs = np.array(rows, np.float64)
         right = len(pairs) > 2 and pairs.shape[1:] == (5,) and np.isfinite(pairs).all()
         why = "" if right else "it needs three or more lists of five numbers"
     except (OSError, ValueError, TypeError) as error:
@@ -113,7 +117,7 @@ def _pairs(path: Path, surface: Surface) -> Pairs:
     if why:
         raise UsageError(
             "mesh-pairs-file",
-            what=f"{path} has no pairs of points ({why}).",
+            what=f"{source} has no pairs of points ({why}).",
             remedy="Write [[x, y, z, column, row], ...]: a point of the mesh, and the camera pixel that shows it.",
         )
     known = np.argwhere(surface.mask & np.isfinite(surface.points_m[..., 2]))
@@ -122,7 +126,7 @@ def _pairs(path: Path, surface: Surface) -> Pairs:
         if far_px > FARTHEST_PX:
             raise UsageError(
                 "mesh-pair-beside",
-                what=f"Nothing of the object was measured near the camera pixel of pair {number} in {path}.",
+                what=f"Nothing of the object was measured near the camera pixel of pair {number}.",
                 remedy="Choose a place on the object that two projectors light, not at its edge.",
             )
     return Pairs(pairs[:, :3], surface.points_m[tuple(known[far.argmin(axis=1)].T)].astype(np.float64))

@@ -41,6 +41,7 @@ PLAYING, OTHER, RUN = "marble", "glass", "20260101-100000-calibrate"
 TEXT = f"{vase.TEXT}\n[bundle]\nallow_unsigned = true\n"
 NEEDS_A_CALIBRATION = {
     "computed-picture", "computed-preview", "feasibility", "reach", "reach-picture", "scene-reach-picture", "view",
+    "laid-mesh", "laid-mesh-picture",
 }  # fmt: skip
 """What no stage of these tests can do: tests/end_to_end/test_kiosk_targets.py asks it of a calibrated one."""
 
@@ -160,6 +161,12 @@ CASES: tuple[Case, ...] = (
     Case("scene-picture", {"scene": "gold"}, holds=a_file),
     Case("scene-picture", {"scene": "no such"}, holds=lambda found, _: found is None),
     Case("scene-picture", {"scene": "../stage.toml"}, "field-wrong"),
+    Case("meshes", holds=lambda names, _: list(names) == ["bust.glb"]),
+    Case("mesh-picture", {"mesh": "bust.glb", "side": 9}, holds=a_file),
+    Case("mesh-picture", {"mesh": "no such.glb", "side": 0}, "mesh-unknown"),
+    Case("mesh-picture", {"mesh": "../stage.toml", "side": 0}, "field-wrong"),
+    Case("mesh-picture", {"mesh": "bust.glb", "side": 32}, "field-wrong"),
+    Case("lay-mesh", {"mesh": "no such.glb"}, "mesh-unknown"),
     Case("scene-reach", {"scene": "no such"}, "scene-unknown"),
     Case("compute-scene", {"name": "golden", "scene": "gold"}, holds=a_job),
     Case("compute-scene", {"name": "golden", "scene": "no such"}, "scene-unknown"),

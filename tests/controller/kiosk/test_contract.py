@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from controller.bundle.describe import png
 from controller.bundle.install import current, install
@@ -92,6 +93,8 @@ class TestStageKiosk(Contract):
         (stage / "stage.toml").write_text(contract.TEXT)
         graded_run(stage, RUN, {"left": 0.01})
         (stage / "runs" / RUN / "geometry.json").write_text('{"camera": {"size_px": [240, 160]}}')
+        (stage / "meshes").mkdir()
+        trimesh.creation.box().export(stage / "meshes" / "bust.glb")
         install_two(stage)
         log = EventLog(stage / EventLog.FILE, durable=False)
         log.add(Notice("first", "It begins."))

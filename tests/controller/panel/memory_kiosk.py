@@ -28,6 +28,7 @@ from controller.kiosk.values import (
     Computed,
     Fit,
     FoundDevice,
+    LaidMesh,
     LampDay,
     Reach,
     RecalibrationKind,
@@ -57,6 +58,7 @@ class MemoryKiosk(MemoryWork):
         run: str = "first", toml: str = TOML,
     ) -> None:  # fmt: skip
         super().__init__(step_s, examples.state(names[0]))
+        self.laid = ""
         self._folder, self._before = pictures, names[0]
         pictures.mkdir(parents=True, exist_ok=True)
         # Requests draw side by side, each into a file of its own.
@@ -217,6 +219,27 @@ class MemoryKiosk(MemoryWork):
         self._known_scene(scene)
         self.asked.append(("compute-scene", (name, scene)))
         return self._solve(name)
+
+    def meshes(self) -> Sequence[str]:
+        return ["bust.glb"]
+
+    def mesh_picture(self, mesh: str, side: int) -> Path:
+        self._known_mesh(mesh)
+        return self._drawn(f"{mesh}-{side}")
+
+    def lay_mesh(self, mesh: str, side: int, points: str = "") -> None:
+        self._known_mesh(mesh)
+        self.asked.append(("lay-mesh", (mesh, side, points)))
+        self.laid = mesh
+
+    def laid_mesh(self) -> LaidMesh | None:
+        pictures = {name: self._drawn(name) for name in ("laid", "map")}
+        size = "in mm, 1.02 times as large as the object"
+        return LaidMesh(self.laid, 0.12, 0.4, size, pictures) if self.laid else None
+
+    def _known_mesh(self, mesh: str) -> None:
+        if mesh not in self.meshes():
+            raise UsageError("mesh-unknown", what="There is no such mesh.", remedy="Choose another.")
 
     def appearances(self) -> Sequence[Appearance]:
         return list(self._appearances.values())

@@ -33,6 +33,8 @@ PAGES = (
     "/appearances/new",
     "/appearances/scenes/gold",
     "/house",
+    "/mesh",
+    "/mesh/bust.glb",
     "/schedule",
     "/results",
     "/lamps",

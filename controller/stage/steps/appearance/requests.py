@@ -120,11 +120,9 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
     if table.kind == "restoration":
         assert file is not None
         return restoration_request(table.name, file, options, calibrated, stage.tables.solve, inputs)
-    title = TITLES[table.kind]
     if table.kind == "texture":
         assert file is not None
-        inputs["mesh"], is_whole = _check_sheet(table, file, options, calibrated)
-        title += " (the sheet is nowhere transparent)" * is_whole
+        inputs["mesh"] = _check_sheet(table, file, options, calibrated)
     elif table.kind not in NEEDS_NO_SHAPE and (mesh := RegisteredMesh.read(calibrated.folder)) is not None:
         inputs["filled"] = str(mesh.figures.get("filled_pixels", 0))
 
@@ -132,7 +130,7 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
         return make_target(table.kind, file, arguments, calibrated)
 
-    return AppearanceRequest(table.name, title, target, inputs)
+    return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
 
 
 def _pictures(table: AppearanceTable, file: Path, calibrated: Calibrated) -> list[Path]:
@@ -195,15 +193,12 @@ def _check_picture(
     check_picture(file, picture, (picture.shape[1], picture.shape[0]) if size is None else size)
 
 
-def _check_sheet(
-    table: AppearanceTable, file: Path, options: Mapping[str, Any], calibrated: Calibrated
-) -> tuple[str, bool]:
-    """What identifies the mesh and its pose, and whether the sheet has no transparency. Raises UsageError.
+def _check_sheet(table: AppearanceTable, file: Path, options: Mapping[str, Any], calibrated: Calibrated) -> str:
+    """What identifies the mesh and its pose. Raises UsageError.
 
     A mesh that was laid on an earlier calibration is laid on this one; that raises as ``lay_mesh``.
     """
-    sheet = read_picture(file, options.get("colour"), soft=True)
-    height, width = sheet.shape[:2]
+    height, width = read_picture(file, options.get("colour"), soft=True).shape[:2]
     size_px, identity = calibrated.camera_px, "camera"
     # A run that calibrates first has neither camera picture nor mesh yet.
     if options.get("uv", "mesh") == "mesh" and size_px is not None:
@@ -226,7 +221,7 @@ def _check_sheet(
             what=f"{file.name} is {width} x {height} pixels, and its sheet is {size_px[0]} x {size_px[1]}.",
             remedy="Save it with the size of the exported sheet, or a multiple of it, and do not crop it.",
         )
-    return identity, sheet.shape[2] == 3
+    return identity
 
 
 SHEET_SHAPE: Final = 0.005

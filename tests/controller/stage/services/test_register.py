@@ -16,10 +16,13 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from controller.core.arrays import Float64, FloatImage, save_arrays
 from controller.core.errors import VelaturaError
-from controller.optics.calibrate.mesh_alignment import Pose
+from controller.kiosk.api.folder import FolderKiosk
+from controller.kiosk.preview.meshes import VIEWER, seen_from
+from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.step_id import StepId
@@ -158,6 +161,44 @@ def test_clicks_that_are_off_by_5_pixels_are_enough(stage: Path, tmp_path: Path,
     pairs = pairs_file(tmp_path, clicked(np.random.default_rng(seed), vertices))
     register(stage, MeshOrder(file_of(tmp_path, vertices), pairs=pairs), Silent())
     assert np.median(off_px(stage, 1.02)) < 0.1
+
+
+def test_places_chosen_in_the_panel_lay_a_mesh(stage: Path) -> None:
+    kiosk, vertices = FolderKiosk(stage), 1.02 * np.asarray(stone().vertices)
+    (stage / "meshes").mkdir()
+    file_of(stage / "meshes", vertices)
+    assert kiosk.meshes() == ("stone.ply",)
+    solid = SolidMesh(vertices, np.asarray(stone().faces, np.int32))
+    side = min(range(32), key=lambda one: TRUTH.degrees_from(seen_from(solid, one)))
+    chosen = np.array(clicked(np.random.default_rng(2), vertices))
+    on_picture = seen_from(solid, side).placed(chosen[:, :3]) @ VIEWER.matrix.T
+    on_picture = on_picture[:, :2] / on_picture[:, 2:]
+    with Image.open(kiosk.mesh_picture("stone.ply", side)) as picture:
+        alpha = np.asarray(picture.getchannel("A"))
+    assert alpha[*on_picture.round().astype(int).T[::-1]].all(), "each is on the mesh in its picture"
+    assert 0.3 < (alpha > 0).mean() < 0.9
+    shares = np.hstack([(on_picture + 0.5) / alpha.shape[::-1], (chosen[:, 3:] + 0.5) / (WIDTH, HEIGHT)])
+    kiosk.lay_mesh("stone.ply", side, json.dumps(shares.tolist()))
+    assert np.median(off_px(stage, 1.02)) < 0.1
+    laid = kiosk.laid_mesh()
+    assert laid is not None
+    with Image.open(laid.pictures["laid"]) as picture:
+        seen = np.asarray(picture.getchannel("A")) > 0
+    of_object = np.nan_to_num(measured()[..., 2], nan=2.0) < 1.9
+    assert (seen & of_object).sum() > 0.99 * of_object.sum()
+    assert seen.sum() < 1.5 * of_object.sum()
+
+
+@pytest.mark.parametrize("points", ["[[0.5, 0.5]]", "{", "[" * 9000, "[1e999]", '["a"]'])
+def test_places_that_are_none_are_named(stage: Path, points: str) -> None:
+    (stage / "meshes").mkdir()
+    file_of(stage / "meshes", np.asarray(stone().vertices))
+    with pytest.raises(VelaturaError) as error:
+        FolderKiosk(stage).lay_mesh("stone.ply", 0, points)
+    assert error.value.code == "mesh-pairs-file"
+    with pytest.raises(VelaturaError) as error:
+        FolderKiosk(stage).lay_mesh("stone.ply", 0, json.dumps([[0, 0, 0.5, 0.5]] * 4))
+    assert error.value.code == "mesh-pair-beside"
 
 
 def test_a_mesh_that_is_like_itself_needs_clicks(tmp_path: Path) -> None:

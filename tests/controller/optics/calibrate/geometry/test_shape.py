@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
@@ -174,7 +177,8 @@ def sides(points: Array) -> tuple[MeasuredDistance, ...]:
 @pytest.mark.parametrize("tilt_deg", [(8, -6), (20, 15), (5, -25)])
 @pytest.mark.parametrize("projectors", [1, 2])
 def test_a_plane_with_measured_sides_is_metric_and_turned_right(tilt_deg: tuple[float, float], projectors: int) -> None:
-    """Judged by the truth, and by OpenCV's homography and its pose of a flat target."""
+    """Judged by the truth, and by the homographies and poses of a flat target that OpenCV and COLMAP find."""
+    pycolmap: Any = pytest.importorskip("pycolmap")
     points = points_of(panel(tilt_deg))
     stage = stage_of(points, everywhere(projectors))
     found = shape_of(stage, "plane", sides(points)).reconstruction
@@ -197,6 +201,32 @@ def test_a_plane_with_measured_sides_is_metric_and_turned_right(tilt_deg: tuple[
         assert np.linalg.norm(shift.ravel() - own.translation_m) < 0.01
         ours, _ = project(own, target.astype(np.float64))
         assert np.sqrt(np.mean(np.sum((ours - straight) ** 2, axis=1))) < 0.05
+        some = np.s_[:: max(1, len(px) // 300)]
+        again = pycolmap.estimate_homography_matrix(camera_px[some], px[some].astype(np.float64))["H"]
+        theirs = cv2.perspectiveTransform(camera_px[:, None], again)[:, 0]
+        assert np.sqrt(np.mean(np.sum((ours - theirs) ** 2, axis=1))) < 0.2
+        lens = [*own.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], own.distortion[0], 0, 0, 0]
+        camera = pycolmap.Camera(model="OPENCV", width=PROJECTOR[0], height=PROJECTOR[1], params=lens)
+        placed = pycolmap.estimate_and_refine_absolute_pose(px[some].astype(np.float64), target[some], camera)
+        pose = placed["cam_from_world"].matrix()
+        assert np.degrees(np.linalg.norm(cv2.Rodrigues(pose[:, :3] @ own.rotation.T)[0])) < 0.5
+        assert np.linalg.norm(pose[:, 3] - own.translation_m) < 0.015
+
+
+@pytest.mark.slow
+@settings(max_examples=3)
+@given(tilt=st.tuples(st.floats(-30, 30), st.floats(-30, 30)), away_m=st.floats(0.6, 3), seed=st.integers(0, 99))
+def test_any_plane_lies_as_its_sides_were_measured(tilt: tuple[float, float], away_m: float, seed: int) -> None:
+    points = points_of(panel(tilt, (0, 0, away_m)))
+    some = np.random.default_rng(seed).random(CAMERA[::-1]) < 0.7
+    found = shape_of(stage_of(points, [some]), "plane", sides(points)).reconstruction
+    assert found is not None
+    known = np.isfinite(found.geometry.points_m[..., 2])
+    np.testing.assert_array_equal(known, np.isfinite(found.geometry.normals).all(axis=2))
+    assert np.ptp(found.geometry.normals[known], axis=0).max() < 1e-5, "one plane has one normal"
+    off_m = np.linalg.norm(found.geometry.points_m - points, axis=2)[known]
+    assert off_m.max() < 0.01 * away_m
+    assert np.median(found.sigma_m[known]) < 0.01 * away_m
 
 
 def test_a_plane_says_how_little_is_certain_without_measured_sides() -> None:

@@ -138,12 +138,6 @@ def recolour_white(folder: Path, calibrated: Calibrated) -> FloatImage:
     return requests_of(load(folder, text), calibrated)[0].target().image
 
 
-def test_a_sheet_without_transparency_is_named(tmp_path: Path, calibrated: Calibrated) -> None:
-    lay_wall(calibrated.folder)
-    painted(tmp_path, np.full((60, 80, 3), 200, np.uint8))
-    assert "nowhere transparent" in requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0].title
-
-
 def test_a_sheet_that_does_not_fit_is_refused_before_anything_is_solved(tmp_path: Path, calibrated: Calibrated) -> None:
     def code(settings: str = "") -> str:
         with pytest.raises(UsageError) as refused:
