@@ -10,11 +10,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.kiosk.values import LaidMesh
-from controller.optics.calibrate.mesh_alignment import Hits, Pose, SolidMesh, rays_of
+from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh, rays_of
 from controller.optics.calibrate.values import Pinhole
 from controller.run.progress import Silent
 from controller.stage.artefacts.geometry import read_camera
@@ -40,6 +39,8 @@ VIEWER: Final = Pinhole(
 )  # fmt: skip
 """What sees a mesh."""
 LAID_PX: Final = 1200
+LIGHT: Final = np.array([-0.4, -0.5, -0.77])
+"""From where a mesh is lit in pictures."""
 
 
 def meshes(stage: Path) -> tuple[str, ...]:
@@ -58,7 +59,7 @@ def mesh_picture(stage: Path, mesh: str, side: int) -> Path:
         for old in kept.parent.glob(f"{mesh}-{side}-*.png"):
             old.unlink(missing_ok=True)
         solid = read_known_mesh(file).solid
-        _write(kept, _met(solid, seen_from(solid, side), VIEWER, 1))
+        _draw(kept, solid, seen_from(solid, side), VIEWER, 1)
     return kept
 
 
@@ -95,7 +96,7 @@ def laid_mesh(stage: Path) -> LaidMesh | None:
     figures, picture = found.figures, run / "mesh-laid.png"
     if not picture.is_file() or picture.stat().st_mtime_ns < (run / "mesh.json").stat().st_mtime_ns:
         camera = read_camera(run)
-        _write(picture, _met(found.solid, found.pose, camera, max(1, camera.size_px[0] // LAID_PX)))
+        _draw(picture, found.solid, found.pose, camera, max(1, camera.size_px[0] // LAID_PX))
     return LaidMesh(figures["file"], figures["median_off_mm"], figures["most_off_mm"], figures["size"],
                     {"laid": picture, "map": run / "mesh.png"})  # fmt: skip
 
@@ -120,16 +121,11 @@ def seen_from(solid: SolidMesh, side: int) -> Pose:
     return Pose(scale, rotation, np.array([0, 0, AWAY]) - scale * nearest)
 
 
-def _met(solid: SolidMesh, pose: Pose, camera: Pinhole, step: int) -> tuple[Hits, tuple[int, int]]:
+def _draw(file: Path, solid: SolidMesh, pose: Pose, camera: Pinhole, step: int) -> None:
+    """At every so many pixels of the camera: light from the upper left, and nothing beside the mesh."""
     y, x = np.mgrid[0 : camera.size_px[1] : step, 0 : camera.size_px[0] : step]
-    return solid.met_by(rays_of(camera, x.ravel(), y.ravel()), pose), x.shape
-
-
-def _write(file: Path, met: tuple[Hits, tuple[int, int]]) -> None:
-    """Light from the upper left, and nothing beside the mesh."""
-    hits, shape = met
-    light: Float64 = np.array([-0.4, -0.5, -0.77])
-    grey = np.where(hits.face >= 0, 40 + 200 * np.clip(np.nan_to_num(hits.normals) @ light, 0, 1), 0).reshape(shape)
-    alpha = np.where(hits.face >= 0, 255, 0).reshape(shape)
-    picture = np.dstack([grey, grey, grey, alpha]).astype(np.uint8)
-    write_atomically(file, cv2.imencode(".png", picture)[1].tobytes())
+    met = solid.met_by(rays_of(camera, x.ravel(), y.ravel()), pose)
+    is_on = met.face >= 0
+    grey = 40 + 200 * np.clip(np.nan_to_num(met.normals) @ LIGHT, 0, 1)
+    picture = np.stack([grey, grey, grey, np.full(len(grey), 255)], axis=1) * is_on[:, None]
+    write_atomically(file, cv2.imencode(".png", picture.reshape(*x.shape, 4).astype(np.uint8))[1].tobytes())

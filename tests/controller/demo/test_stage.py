@@ -176,7 +176,7 @@ def test_each_object_gets_appearances_of_its_own_and_none_that_needs_a_shape_fro
     stages = [prepared(tmp_path / str(count), thing=thing, projectors=count) for count in (None, 1)]
     whole, alone = ({one.kind for one in load_stage(stage).tables.appearances} for stage in stages)
     assert whole == kinds
-    assert alone == (kinds if "restoration" in kinds else {"recolour"})
+    assert alone == (kinds if thing == "painting" else {"recolour"})
 
 
 @pytest.mark.parametrize(
