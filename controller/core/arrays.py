@@ -60,14 +60,6 @@ def strips(rows: int, at_once: int = STRIP_ROWS) -> Iterator[slice]:
     return (slice(first, min(first + at_once, rows)) for first in range(0, rows, at_once))
 
 
-def nearest_known(known: Mask) -> tuple[Float64, tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]]:
-    """How far each pixel is from the nearest one of ``known`` (rows, columns), and which that is, as an index."""
-    from scipy.ndimage import distance_transform_edt
-
-    distance_px, (rows, columns) = distance_transform_edt(~known, return_indices=True)
-    return distance_px, (rows, columns)
-
-
 def summed(pictures: Sequence[FloatImage]) -> FloatImage:
     """The sum of one picture or more, without a copy of all of them, as ``np.sum(pictures, axis=0)`` makes."""
     whole = pictures[0].copy()

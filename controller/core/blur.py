@@ -1,4 +1,4 @@
-"""Gaussian blur that costs the same however wide it is."""
+"""Gaussian blur that costs the same however wide it is, and the nearest pixels that are known."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import Final
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import Float64, FloatImage, Mask
 
 FINEST_PX: Final = 4.0
 """Standard deviation in pixels of the smaller picture: so wide a Gaussian is not seen to have been sampled."""
@@ -43,3 +44,11 @@ def gaussian_blur(image: FloatImage, sigma_px: float) -> FloatImage:
     soft = cv2.GaussianBlur(small, (0, 0), sigma_px / block)
     wide = cv2.resize(soft, (mirrored.shape[1], mirrored.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(wide[beside : beside + rows, beside : beside + columns], np.float32)
+
+
+def nearest_known(known: Mask) -> tuple[Float64, tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]]:
+    """How far each pixel is from the nearest one of ``known`` (rows, columns), and which that is, as an index."""
+    from scipy.ndimage import distance_transform_edt
+
+    distance_px, (rows, columns) = distance_transform_edt(~known, return_indices=True)
+    return distance_px, (rows, columns)

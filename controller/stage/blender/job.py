@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import FloatImage, Mask, nearest_known, save_arrays
+from controller.core.arrays import FloatImage, Mask, save_arrays
+from controller.core.blur import nearest_known
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import TO_BLENDER, Mesh, grid_mesh, margin_px, places_in_rendering

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, nearest_known, strips
-from controller.core.blur import gaussian_blur
+from controller.core.arrays import FloatImage, Mask, strips
+from controller.core.blur import gaussian_blur, nearest_known
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.geometry.background import room_pixels
 from controller.optics.calibrate.mesh_alignment import (

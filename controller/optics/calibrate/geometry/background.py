@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, nearest_known, strips
+from controller.core.arrays import FloatImage, Mask, strips
+from controller.core.blur import nearest_known
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 

@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.optics.calibrate.values import Calibration, Geometry
 
 BRIGHT: Final = 0.3

@@ -18,7 +18,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.core.channels import mean
 from controller.core.errors import UsageError
 from controller.core.jit import compiled

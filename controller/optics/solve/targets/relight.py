@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, nearest_known
+from controller.core.arrays import FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.core.errors import UsageError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.solve.targets.patterns import Colour

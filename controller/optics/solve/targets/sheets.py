@@ -13,7 +13,8 @@ from typing import Final, TypeAlias
 import cv2
 import numpy as np
 
-from controller.core.arrays import Float64, FloatImage, Mask, nearest_known, strips
+from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.blur import nearest_known
 from controller.optics.calibrate.mesh_alignment import Pose, SolidMesh, rays_of
 from controller.optics.calibrate.values import Pinhole
 from controller.optics.solve.targets.values import Target, through_camera

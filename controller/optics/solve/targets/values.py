@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import FloatImage, Mask, nearest_known
-from controller.core.blur import masked_blur
+from controller.core.arrays import FloatImage, Mask
+from controller.core.blur import masked_blur, nearest_known
 from controller.optics.calibrate.values import Geometry
 
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry
 from controller.optics.solve.targets.values import Target

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core import channels
-from controller.core.arrays import Float64, FloatImage, Mask, nearest_known
+from controller.core.arrays import Float64, FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.optics.transport.indirect.blocks import down
 
 Indices = npt.NDArray[Any]

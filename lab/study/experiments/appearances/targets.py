@@ -11,7 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import FloatImage, Mask, nearest_known
+from controller.core.arrays import FloatImage, Mask
+from controller.core.blur import nearest_known
 from controller.core.storage import sha256_of, write_atomically
 from controller.optics.solve.targets.files import read_picture
 from controller.optics.solve.targets.patterns import replace_pattern
