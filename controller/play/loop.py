@@ -101,7 +101,8 @@ class Player:
             serve(self._patience_s())
             self._output.pump()
             self._take_live()
-            self._keep_times()
+            if self._ahead_s is not None:
+                self._keep_times()
             self._present_if_due()
             self._notifier.alive()
         self._notifier.stopping()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,9 +130,29 @@ def agent(
 
         if admit:
             return admitted(stage, admit, code)
-        return keep(keys, name, reporter.say, cancel)
+        return keep(keys, name, partial(_on_screen, reporter.say), cancel)
 
     work(do)
+
+
+@contextlib.contextmanager
+def _on_screen(say: Callable[[str], object], code: str) -> Iterator[None]:
+    """The code of a computer that joins, on its first projector; here in any case."""
+    from controller.kiosk.outputs import outputs_of_x, placed, player_outputs
+    from controller.kiosk.supervisors.on_screen_text import notice, outputs_of, put
+    from controller.play.control.launch import PlayerSettings, start_player
+    from hal.deadline import in_seconds
+    from hal.player import PlayerClient
+
+    say(code)
+    with contextlib.ExitStack() as stack:
+        if found := player_outputs(placed(outputs_of_x())):
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            player = stack.enter_context(start_player(folder, PlayerSettings(found, None)))
+            hello = player.wait_until_ready()
+            sequence = put(Path(hello["inbox"]), outputs_of(hello), notice(outputs_of(hello), [code], 0))
+            PlayerClient().request(player.socket, {"op": "show", "sequence": sequence}, in_seconds(5))
+        yield
 
 
 def install(
@@ -149,6 +172,9 @@ def install(
     restart: Annotated[
         bool, typer.Option("--restart", help="Start controller and player again, for a new version. Lamps stay lit.")
     ] = False,
+    player: Annotated[
+        bool, typer.Option("--player", help="Only outputs of a stage that another computer runs.")
+    ] = False,
 ) -> None:
     """Make this computer a kiosk, and start it. As root, on Debian 12 or 13: user, services, X server and panel."""
     from controller.kiosk.install import restored, steps
@@ -158,6 +184,8 @@ def install(
     system = System(console.say, dry=dry_run)
     if backup is not None:
         restored.restore(system, backup.absolute(), ask=lambda text: str(typer.prompt(text)), say=console.say)
+    elif player:
+        steps.install_player(system, say=console.say)
     else:
         steps.install(system, outputs_again=outputs, restart=restart, say=console.say)
     text = "The kiosk runs, and starts with this computer."

@@ -63,6 +63,8 @@ PACKAGES: Final = (
 AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
+AGENT: Final = "velatura-agent"
+NETWORK: Final = Path("/etc/systemd/system/velatura-player.service.d/network.conf")
 TARGET: Final = "velatura.target"
 DEBIAN: Final = {"bookworm": "12", "trixie": "13"}
 PYTHON: Final = {"bookworm": "3.11", "trixie": "3.13"}
@@ -71,6 +73,31 @@ NO_OUTPUTS: Final = [("projector", 1024, 768)]
 """For the player, while nothing is plugged in."""
 READY_S: Final = 60.0
 _X: Final = {"DISPLAY": ":0", "XAUTHORITY": "/run/velatura-x11/cookie"}
+
+
+def install_player(system: System, *, say: Callable[[str], None], prefix: Path = Path(sys.prefix)) -> None:
+    """Make this computer one with outputs of another one's stage: X server and agent. Raises as ``install``."""
+    check(system, prefix)
+    system.folder(CONFIGURATION)
+    _packages(system, "chrony")
+    _user(system)
+    for path, text in shipped(prefix).items():
+        system.write(path, text)
+    _folders(system)
+    system.run("systemctl", "daemon-reload")
+    system.run("systemctl", "mask", "--quiet", "--now", *SERVICES[1:])
+    system.run("systemctl", "enable", "--quiet", TARGET, AGENT)
+    system.run("systemctl", "start", "velatura-x11")
+    _outputs(system, again=True, say=say)
+    system.run("systemctl", "restart", AGENT)
+
+
+def _conducts(system: System) -> bool:
+    """Let the player of a stage with outputs on other computers use the network; whether that is new."""
+    if not re.search(r"^host *=", system.read(STAGE / "stage.toml") or "", re.MULTILINE):
+        return False
+    _packages(system, "chrony")
+    return system.write(NETWORK, "[Service]\nRestrictAddressFamilies=AF_INET AF_INET6 AF_NETLINK\nIPAddressDeny=\n")
 
 
 def install(
@@ -90,7 +117,7 @@ def install(
         mark.touch()
     _packages(system)
     _user(system)
-    changed = [cut_off, *(system.write(path, text) for path, text in shipped(prefix).items())]
+    changed = [cut_off, _conducts(system), *(system.write(path, text) for path, text in shipped(prefix).items())]
     _folders(system)
     if not os.path.lexists(system.at(COMMAND)):
         system.run("ln", "--symbolic", str(prefix / "bin" / "velatura"), str(COMMAND))
@@ -115,9 +142,9 @@ def install(
 
 def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -> None:
     """Take everything back but the stage and the packages. ``purge``: the stage, the settings and the user, too."""
-    for unit in (TARGET, *SERVICES):
+    for unit in (TARGET, AGENT, *SERVICES):
         system.run("systemctl", "disable", "--now", "--quiet", unit, may_fail=True)
-    for path in (*shipped(prefix), X_OUTPUTS, PLAYER_OPTIONS):
+    for path in (*shipped(prefix), NETWORK, X_OUTPUTS, PLAYER_OPTIONS):
         system.remove(path)
     if system.at(COMMAND).is_symlink():
         system.remove(COMMAND)
@@ -156,9 +183,9 @@ def check(system: System, prefix: Path) -> None:
         )
 
 
-def _packages(system: System) -> None:
+def _packages(system: System, *more: str) -> None:
     cards = system.look("sh", "-c", "cat /sys/class/drm/card*/device/vendor") or ""
-    wanted = (*PACKAGES, *((AMD,) if "0x1002" in cards else ()))
+    wanted = (*PACKAGES, *more, *((AMD,) if "0x1002" in cards else ()))
     listed = system.look("dpkg-query", "--show", "--showformat", "${Package} ${db:Status-Status}\n") or ""
     there = {line.split()[0] for line in listed.splitlines() if line.endswith(" installed")}
     # Debian 13 calls some libraries with 64-bit times by another name, and provides the old one.

@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -30,17 +31,19 @@ PORT: Final = 7449
 _NEVER_S: Final = -1e9
 
 
-def keep(keys: Path, name: str | None, say: Callable[[str], object], cancel: threading.Event) -> dict[str, Any]:
-    """An agent on this computer until ``cancel``; without a membership in ``keys`` it first shows a code and joins.
+def keep(
+    keys: Path, name: str | None, show: Callable[[str], AbstractContextManager[None]], cancel: threading.Event
+) -> dict[str, Any]:
+    """An agent on this computer until ``cancel``; without a membership in ``keys`` it first joins by a code, which
+    ``show`` shows meanwhile.
 
     Raises as ``Joining`` and ``member_link``.
     """
     own = membership(keys)
     while own is None and not cancel.is_set():
-        with Joining(keys, name or socket.gethostname().split(".")[0].lower()) as joining:
-            say(f"Code of this computer: {joining.code}")
-            with contextlib.suppress(WorkError):
-                own = joining.wait()
+        joining = Joining(keys, name or socket.gethostname().split(".")[0].lower())
+        with joining, show(f"Code of this computer: {joining.code}"), contextlib.suppress(WorkError):
+            own = joining.wait()
     if own is None:
         return {}
     clock = HostClock()
@@ -51,7 +54,6 @@ def keep(keys: Path, name: str | None, say: Callable[[str], object], cancel: thr
 
     with member_link(own) as link:
         agent = Agent(link, own.name, keys.with_name("bundles"), clock, screen)
-        say(f"This computer is {own.name} of {own.house}.")
         agent.run(cancel)
     return {"name": own.name}
 

@@ -168,3 +168,25 @@ def test_a_program_that_fails_ends_it_with_what_it_said(debian: Path) -> None:
     with pytest.raises(WorkError, match="no such program"):
         system.run("velatura-is-no-such-program")
     system.run("false", may_fail=True)
+
+
+def test_a_computer_with_outputs_of_another_stage_runs_the_agent_and_nothing_else(debian: Path) -> None:
+    system = Recorded(debian, FRESH)
+    steps.install_player(system, say=system.told.append, prefix=PREFIX)
+    assert "systemctl mask --quiet --now velatura-player velatura-controller" in system.ran
+    assert "systemctl enable --quiet velatura.target velatura-agent" in system.ran
+    assert any(line.startswith("apt-get install") and "chrony" in line for line in system.ran)
+    assert (debian / "etc/systemd/system/velatura-agent.service").exists()
+    assert not (debian / "etc/velatura/controller.env").exists()
+
+
+def test_the_player_of_a_stage_with_other_computers_may_use_the_network(debian: Path) -> None:
+    network = debian / "etc/systemd/system/velatura-player.service.d/network.conf"
+    stage = debian / "var/lib/velatura/stage/stage.toml"
+    stage.parent.mkdir(parents=True)
+    stage.write_text('[[display.outputs]]\nname = "P1"\n')
+    installed(debian, FRESH)
+    assert not network.exists()
+    stage.write_text('[[display.outputs]]\nname = "P1"\nhost = "left"\n')
+    assert "systemctl restart velatura-controller velatura-player" in installed(debian, THERE).ran
+    assert "AF_INET" in network.read_text()
