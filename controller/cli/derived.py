@@ -193,11 +193,21 @@ def _token(made: Any) -> Shown:
     return made, str(made["token"])
 
 
+def _house(now: Any) -> Shown:
+    lines = [
+        f"{one['name']:<24} {one['state']['state'] if one['linked'] and one['state'] else 'no connection':<14} "
+        f"{one['state']['playing'] if one['state'] else ''}"
+        for one in now["stages"]
+    ]
+    return now, "\n".join(map(printable, lines)) or "There are none yet."
+
+
 TEXTS: Final[Mapping[str, Callable[[Any], Shown]]] = {
     "appearances": _appearances,
     "lamp-history": _lamps,
     "changes": _changes,
     "diagnostics": _diagnosed,
     "add-token": _token,
+    "house-state": _house,
 }
 """How an answer is shown, by the operation's name; one that is not here is shown by its kind of answer."""

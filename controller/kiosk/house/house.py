@@ -32,7 +32,7 @@ from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventLevel
 from controller.stage.link.joining import admit
 from controller.stage.link.membership import Authority
-from controller.stage.link.session import PORT, house_link
+from controller.stage.link.session import EVERYWHERE, PORT, house_link
 from hal.errors import CodedError
 
 FOLDER: Final = "keys/house-authority"
@@ -92,7 +92,7 @@ class _Stage:
 class House:
     """``operations.house.Stagehouse``; a context manager. ``record``: adds to the event log of this kiosk."""
 
-    def __init__(self, stage: Path, settings: HouseSettings, record: Record, *, host: str = "[::]") -> None:
+    def __init__(self, stage: Path, settings: HouseSettings, record: Record, *, host: str = EVERYWHERE) -> None:
         """Raises UsageError("house-keys-damaged"), WorkError("link-not-opened")."""
         self._stage, self._settings, self._record, self._host = stage, settings, record, host
         self._authority = Authority(stage / FOLDER, settings.name)

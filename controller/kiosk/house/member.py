@@ -23,7 +23,7 @@ from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
 from controller.stage.link.membership import Membership, leave, membership
-from controller.stage.link.session import Link, member_link
+from controller.stage.link.session import EVERYWHERE, Link, member_link
 from hal.errors import CodedError
 
 PAUSE_S: Final = 2.0
@@ -65,7 +65,7 @@ class MadeBackup:
 class Member:
     """This stage's side. Use as a context manager; it follows a membership that begins or ends meanwhile."""
 
-    def __init__(self, kiosk: Kiosk, stage: Path, *, host: str = "[::]", **joining: Any) -> None:
+    def __init__(self, kiosk: Kiosk, stage: Path, *, host: str = EVERYWHERE, **joining: Any) -> None:
         """``host`` and ``joining``: as of ``Joining``."""
         self._kiosk, self._folder = kiosk, stage / MEMBERSHIP
         self._host, self._joining = host, joining
@@ -116,10 +116,13 @@ class Member:
         self._follow()
 
     def _follow(self) -> None:
-        with self._lock, contextlib.suppress(CodedError):
-            there = membership(self._folder)
-            if there is not None and self._running is None:
-                self._running = _Reports(self._kiosk, there)
+        with self._lock:
+            try:
+                there = membership(self._folder)
+                if there is not None and self._running is None:
+                    self._running = _Reports(self._kiosk, there)
+            except CodedError as error:
+                self._kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
 
     def _end_code(self) -> None:
         if self._open_code is not None:

@@ -23,8 +23,9 @@ from spake2 import SPAKE2_A, SPAKE2_B, SPAKEError
 
 from controller.core.errors import UsageError, WorkError
 from controller.stage.link.membership import AUTHORITY, Authority, Member, Membership, checked_name, join, requested
-from controller.stage.link.session import Link, packed, unpacked
-from hal.errors import CodedError
+from controller.stage.link.session import EVERYWHERE, Link, packed, unpacked
+from hal.errors import CodedError, DeviceError
+from hal.links import host_and_port
 
 T = TypeVar("T")
 PORT: Final = 7448
@@ -60,7 +61,7 @@ class Joining:
     """The side of the computer that joins; a context manager. ``code`` is to be shown to the person."""
 
     def __init__(
-        self, folder: Path, name: str, *, host: str = "[::]", port: int = PORT, valid_s: float = VALID_S
+        self, folder: Path, name: str, *, host: str = EVERYWHERE, port: int = PORT, valid_s: float = VALID_S
     ) -> None:
         """``folder``: of the membership to come.
 
@@ -143,9 +144,14 @@ def admit(authority: Authority, address: str, code: str, endpoints: tuple[str, .
     ``endpoints``: where the house can be reached. Raises UsageError("join-code-wrong", "house-name-taken",
     "house-name-wrong"), WorkError("join-no-answer", "join-code-refused", "join-code-expired").
     """
-    host, port = _host_and_port(address)
+    try:
+        host, port = host_and_port(address.strip(), PORT)
+    except DeviceError as error:
+        raise UsageError("join-address-wrong", what=f"{address[:80]} is no address of a computer.",
+                         remedy="Type its name or its number: stage.local, 192.168.1.20.") from error  # fmt: skip
     side = SPAKE2_A(_password(code), idA=b"velatura house", idB=b"velatura member")
-    reach = {"endpoints": [f"tcp/{host}:{port}"], "timeout_ms": 2000, "exit_on_failure": True}
+    place = f"[{host}]" if ":" in host else host
+    reach = {"endpoints": [f"tcp/{place}:{port}"], "timeout_ms": 2000, "exit_on_failure": True}
     try:
         link = Link({"connect": reach, "listen": {"endpoints": []}}, "tcp")
     except WorkError as error:
@@ -169,17 +175,6 @@ def admit(authority: Authority, address: str, code: str, endpoints: tuple[str, .
             authority.remove(asked.name)
             raise
     return authority.members[asked.name]
-
-
-def _host_and_port(address: str) -> tuple[str, int]:
-    found = re.fullmatch(r"(\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9.-]+)(?::(\d{1,5}))?", address.strip())
-    if found is None or int(found[2] or 1) > 65535:
-        raise UsageError(
-            "join-address-wrong",
-            what=f"{address[:80]} is no address of a computer.",
-            remedy="Type its name or its number, as it is shown with the code: stage.local, 192.168.1.20.",
-        )
-    return found[1], int(found[2] or PORT)
 
 
 def _password(code: str) -> bytes:

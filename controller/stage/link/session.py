@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import threading
 import time
 from collections import deque
@@ -27,6 +28,7 @@ from hal.errors import CodedError
 
 T = TypeVar("T")
 PORT: Final = 7447
+EVERYWHERE: Final = "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"  # noqa: S104 - TLS, or a code, guards it
 MOST_BYTES: Final = 8 << 20
 """Of one message; what is larger is sent in parts."""
 BEAT_S: Final = 1.0
@@ -242,7 +244,7 @@ def _files(folder: Path, side: str) -> dict[str, Any]:
     }
 
 
-def house_link(authority: Authority, *, host: str = "[::]", port: int = PORT) -> Link:
+def house_link(authority: Authority, *, host: str = EVERYWHERE, port: int = PORT) -> Link:
     """The house's side. Open it again when members were added or removed: it is for those of now.
 
     Raises WorkError("link-not-opened").

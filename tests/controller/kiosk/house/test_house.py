@@ -6,24 +6,39 @@ import contextlib
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from controller.core.errors import UsageError, WorkError
+from controller.cli.kiosk_process import serve
+from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.house.house import House, HouseSettings, house_settings
 from controller.kiosk.house.member import Member
 from controller.kiosk.operations import house as operations
 from controller.kiosk.operations.dispatch import CALLER
 from controller.kiosk.state import DriftCheck
 from controller.kiosk.store import archive
+from controller.run.progress import Silent
+from hal.notices import Level
 from tests.controller.kiosk.vase import vase
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, Served, csrf, served
 from tests.ports import free_port
 from tests.waiting import wait_for
+
+
+class Reports(Silent):
+    """Keeps the texts."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.texts.append(text)
 
 
 class Museum:
@@ -229,6 +244,24 @@ def test_a_wrong_house_toml_names_the_key(tmp_path: Path, text: str, says: str) 
     with pytest.raises(UsageError, match=says) as caught:
         house_settings(tmp_path)
     assert caught.value.code == "house-toml-wrong"
+
+
+@pytest.mark.slow
+def test_a_wrong_house_toml_keeps_no_stage_dark(tmp_path: Path) -> None:
+    stage, cancel, heard = vase(tmp_path / "stage"), threading.Event(), Reports()
+    (stage / "house.toml").write_text("name = 3")
+    work = threading.Thread(
+        target=serve, daemon=True,
+        kwargs={"stage": stage, "panel": None, "leave_lit": False, "setup": False, "reporter": heard, "cancel": cancel},
+    )  # fmt: skip
+    work.start()
+    wait_for(lambda: any("is running" in text for text in heard.texts))
+    assert any("house.toml can't be used: name" in text for text in heard.texts)
+    with pytest.raises(VelaturaError) as caught:
+        call_kiosk(stage, "house")
+    assert caught.value.code == "house-toml-wrong"
+    cancel.set()
+    work.join(60)
 
 
 @pytest.mark.slow

@@ -279,6 +279,13 @@ def test_a_code_ends_after_three_wrong_ones_after_its_use_and_with_its_time(hous
     assert caught.value.code == "join-no-answer"
 
 
+@pytest.mark.parametrize("typed", ["", "a b", "a/b", "x:0", "x:70000", "[::1", "http://x"])
+def test_what_is_no_address_is_refused(house: House, typed: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        admit(house.authority, typed, "1234-5678", house.endpoints)
+    assert caught.value.code == "join-address-wrong"
+
+
 def test_two_members_have_two_names(house: House) -> None:
     house.joined("left")
     with pytest.raises(UsageError) as caught:
