@@ -53,7 +53,7 @@ class DeviceTransport:
         Raises DeviceRefused where the device has no room, or the transport no windows.
         """
         if not isinstance(transport, WindowTransport):
-            raise DeviceRefused("this calibration has no phase maps, and the graphics processor needs them")
+            raise DeviceRefused("the graphics processor needs phase maps, and one view alone")
         self._held = Held(device)
         self._band_bytes = band_bytes or device.most_bytes
         try:
