@@ -1,9 +1,10 @@
 from __future__ import annotations
 
-import contextlib
+import ctypes
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -182,6 +183,46 @@ def test_a_service_says_since_when_there_was_none(clocks: Clocks) -> None:
     assert clocks.log.add(beginning(clocks.log)).text == "The kiosk is starting."
 
 
-def test_asking_the_kernel_gives_an_answer() -> None:
-    with contextlib.suppress(OSError):
-        assert synchronised() in (True, False)
+class Timex(ctypes.Structure):
+    """The beginning of the kernel's struct, as adjtimex(2) has it, and room for the rest."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint), ("offset", ctypes.c_long), ("freq", ctypes.c_long), ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long), ("status", ctypes.c_int), ("rest", ctypes.c_long * 26),
+    )  # fmt: skip
+
+
+STA_PLL, STA_UNSYNC, STA_NANO = 0x1, 0x40, 0x2000
+
+
+@pytest.mark.parametrize(
+    ("state", "status", "expected"),
+    [
+        (0, STA_PLL | STA_NANO, True),
+        (0, 0, True),
+        (5, STA_UNSYNC, False),
+        (0, STA_UNSYNC | STA_PLL, False),
+        (-1, 0, False),
+    ],
+)
+def test_the_kernel_says_whether_the_clock_is_synchronised(
+    monkeypatch: pytest.MonkeyPatch, state: int, status: int, expected: bool
+) -> None:
+    class Library:
+        def adjtimex(self, buffer: Any) -> int:
+            told = Timex.from_buffer(buffer._obj)
+            assert told.modes == 0, "it only asks"
+            told.offset = told.freq = told.maxerror = told.esterror = STA_UNSYNC ^ status
+            told.status = status
+            return state
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Library())
+    assert synchronised() is expected
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
+    assert synchronised() is False
+
+
+def test_this_computers_kernel_is_understood() -> None:
+    told = Timex()
+    state = ctypes.CDLL(None).adjtimex(ctypes.byref(told))
+    assert synchronised() is (state >= 0 and not told.status & STA_UNSYNC)

@@ -163,6 +163,8 @@ HOSTILE: dict[str, Callable[[tarfile.TarFile], object]] = {
     "a size below zero": add_negative,
     "a mark that is none": lambda packed: None,
 }
+NO_PLAIN_NAME = ("leads out", "leads out deeper", "absolute", "absolute below a part")
+"""Refused for their names alone, before anything else is asked."""
 
 
 @pytest.mark.parametrize("how", HOSTILE)
@@ -177,7 +179,8 @@ def test_a_hostile_archive_is_refused_and_nothing_is_touched(stage: Path, tmp_pa
         HOSTILE[how](packed)
 
     file = tarred(tmp_path / "hostile.tar.gz", fill, mark)
-    with pytest.raises(UsageError, match="not a backup"):
+    why = "is no plain name" if how in NO_PLAIN_NAME else "not a backup"
+    with pytest.raises(UsageError, match=why):
         archive.restore(stage, file)
     file.unlink()
     assert sorted(tmp_path.rglob("*")) == before
