@@ -46,10 +46,11 @@ def study(root: Path, name: str) -> StoredStudy:
 
 
 def _stages(root: Path, name: str) -> str:
-    """Of which size and seeds an experiment's results are."""
+    """Of which size, room and seeds an experiment's results are."""
     kept = study(root, name)
     several = "s" * (len(kept.seeds) > 1)
-    return f"size {kept.results[0].facts['size']}, seed{several} {', '.join(map(str, kept.seeds))}"
+    facts = kept.results[0].facts
+    return f"size {facts['size']}, room {facts['room']}, seed{several} {', '.join(map(str, kept.seeds))}"
 
 
 def _times(root: Path, asked: str) -> str:

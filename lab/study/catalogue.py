@@ -41,7 +41,8 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
 )
 
 _ALL: Final = (
-    Scene("painted", "a painted vase and bust, three projectors"),
+    # What users have; the pale shells are about optics alone, and stand in the dark.
+    Scene("painted", "a painted vase and bust, three projectors", settings={"room": "room"}),
     Scene("curved", "a pale curved shell, three projectors", same_object),
     Scene(
         "grazing",

@@ -181,7 +181,7 @@ def _steps(
 ) -> Sequence[Step]:  # fmt: skip
     """Calibrate, photograph dots where needed, and run each experiment; skip what is done already."""
     stage = opened(rig, run, checked, dots=any(experiment.dots for experiment in experiments))
-    conditions = {"scene": scene.title, "size": size, "seed": seed}
+    conditions = {"scene": scene.title, "size": size, "room": scene.room, "seed": seed}
     return [
         *stage.calibrating,
         *(
@@ -235,7 +235,7 @@ def prepare_scene(out: Path, scene: Scene, *, size: str, seed: int) -> Path:
 
     Raises UsageError("study-folder-taken") for another size or seed, and WorkError if the bench refuses.
     """
-    stage, wanted = out / "stage", {"scene": scene.name, "size": size, "seed": seed}
+    stage, wanted = out / "stage", {"scene": scene.name, "size": size, "room": scene.room, "seed": seed}
     if stage.exists():
         try:
             known = json.loads((stage / MARK).read_bytes())

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from docs.figures import FIGURES, ROOT, STUDY, differing
+from docs.figures import FIGURES, MARK, ROOT, STUDY, differing, documents
+from lab.study.catalogue import EXPERIMENTS
 from lab.study.output import words
 
 
@@ -44,6 +45,22 @@ def test_a_marked_figure_that_is_not_the_measured_one_is_found_and_put_right(cop
     ((path, why, text),) = differing(copy)
     assert (path, text) == (readme, right)
     assert "not the measured one" in why
+
+
+def test_measured_errors_in_a_document_stand_below_the_size_room_and_seeds_of_their_stages(copy: Path) -> None:
+    stages = {"appearances-stages": ("nearer", "its-exposure", "error"), "residual-stages": ("residual-",)}
+    for name, starts in stages.items():
+        assert re.fullmatch(r"size \w+, room \w+, seeds? [\d, ]+", FIGURES[name].value(copy))
+        for path in documents(copy):
+            marks = [mark[1] for mark in MARK.finditer(path.read_text())]
+            measured = [n for n, mark in enumerate(marks) if mark.startswith(starts) and mark != name]
+            assert not measured or name in marks[: measured[0]], f"{path.name} does not say of which stages"
+
+
+def test_every_page_of_the_study_names_the_room(copy: Path) -> None:
+    for one in EXPERIMENTS:
+        (stage,) = re.findall(r"^Stage: .*$", (copy / STUDY / f"{one.name}.md").read_text(), re.MULTILINE)
+        assert re.search(r"; size \w+; room \w+; ", stage), one.name
 
 
 def test_two_documents_that_tell_different_numbers_of_the_same_thing_are_found(copy: Path) -> None:

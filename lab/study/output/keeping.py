@@ -158,14 +158,14 @@ def read_study(path: Path) -> StoredStudy:
 def with_seed(kept: StoredStudy | None, new: StoredResult) -> StoredStudy:
     """``kept`` with another seed's result, or that of the same seed instead.
 
-    Results of another size, or of another version of the experiment's code, say nothing beside the new one: they go.
+    Results of another size or room, or of another version of the experiment's code, say nothing beside the new one.
     """
     same = [] if kept is None else [one for one in kept.results if one.seed != new.seed and _alike(one, new)]
     return StoredStudy(tuple(sorted([*same, new], key=lambda one: one.seed)))
 
 
 def _alike(one: StoredResult, other: StoredResult) -> bool:
-    return all(one.facts.get(key) == other.facts.get(key) for key in ("size", "code"))
+    return all(one.facts.get(key) == other.facts.get(key) for key in ("size", "room", "code"))
 
 
 @contextlib.contextmanager

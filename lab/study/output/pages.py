@@ -100,12 +100,13 @@ def index_page(rows: Sequence[tuple[Experiment, StoredStudy | None]]) -> str:
     lines = []
     for experiment, kept in rows:
         if kept is None:
-            lines.append((experiment.title, experiment.paper, "not done", "", ""))
+            lines.append((experiment.title, experiment.paper, "not done", "", "", ""))
             continue
+        facts = kept.results[0].facts
         lines.append((
             f"[{experiment.title}]({experiment.name}.md)", experiment.paper,
             _counted(kept) + ("" if up_to_date(experiment, kept) else "; earlier version"),
-            str(kept.results[0].facts.get("size", "")), ", ".join(map(str, kept.seeds)),
+            str(facts.get("size", "")), str(facts.get("room", "")), ", ".join(map(str, kept.seeds)),
         ))  # fmt: skip
     missed = [
         f"- [{experiment.title}]({experiment.name}.md): {one.asked}: {_reached(one)}."
@@ -126,7 +127,7 @@ def index_page(rows: Sequence[tuple[Experiment, StoredStudy | None]]) -> str:
     parts = [
         "# The paper's experiments, repeated",
         head,
-        markdown(("experiment", "after", "criteria", "size", "seeds"), lines),
+        markdown(("experiment", "after", "criteria", "size", "room", "seeds"), lines),
     ]
     if missed:
         parts += ["## Missed criteria", "\n".join(missed)]
@@ -148,7 +149,13 @@ def _reached(one: JudgedCriterion) -> str:
 
 
 def _facts(kept: StoredStudy) -> str:
-    words = {"scene": "Stage: {}", "size": "size {}", "photographs": "{} photographs", "seconds": "{} s of work"}
+    words = {
+        "scene": "Stage: {}",
+        "size": "size {}",
+        "room": "room {}",
+        "photographs": "{} photographs",
+        "seconds": "{} s of work",
+    }
     facts = kept.results[0].facts
     phrases = [text.format(facts[key]) for key, text in words.items() if key in facts]
     if "seed" in facts:

@@ -14,6 +14,8 @@ from controller.core.arrays import Float64
 from controller.core.storage import write_atomically
 from controller.optics.calibrate.mesh import ply_bytes
 
+DARK = "dark"
+
 
 @dataclass(frozen=True, slots=True)
 class Scene:
@@ -27,6 +29,11 @@ class Scene:
     title: str
     write_object: Callable[[Path, int], None] | None = None
     settings: Mapping[str, Any] = ()  # type: ignore[assignment]
+
+    @property
+    def room(self) -> str:
+        """The stage's light, by its name in stage.toml; without a word of the scene there is nothing around it."""
+        return str(dict(self.settings).get("room", DARK))
 
 
 def same_object(path: Path, seed: int) -> None:

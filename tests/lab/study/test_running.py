@@ -33,7 +33,7 @@ def test_an_experiment_without_a_stage_is_done_and_gets_its_page(
     for module in (catalogue, study_services):
         monkeypatch.setattr(module, "EXPERIMENTS", (toy,))
     index = run(tmp_path)
-    assert "[A toy](toy.md) | Beyond | 0 of 1 hold, 1 open | small | 3 |" in index.read_text()
+    assert "[A toy](toy.md) | Beyond | 0 of 1 hold, 1 open | small |  | 3 |" in index.read_text()
     assert "size small; 0 s of work; seed 3" in (index.parent / "toy.md").read_text()
 
 

@@ -19,7 +19,7 @@ from controller.optics.solve.result.metrics import visible_object
 from controller.optics.transport import build_transport
 from controller.stage.report.pictures import crop_around
 from lab.study.experiments.frequency.planned import blurs, predicted
-from lab.study.experiments.frequency.waves import Waves, kept_contrast, make_waves
+from lab.study.experiments.frequency.waves import AGREES, COUNTS, Stripes, Waves, kept_contrast, make_waves, stripes
 from lab.study.experiments.placement.experiment import STANDS, planned_object
 from lab.study.experiments.residual import brightest_first
 from lab.study.output.drawing import LabelledPicture, Line, plotted, screen, strip
@@ -76,12 +76,15 @@ def rising_sinusoid(subject: Subject) -> Result:
             pictures[way] = subject.light.photograph(f"base-{len(pictures)}", made, white=wanted.white)
             contrast[way] = kept_contrast(pictures[way], wanted, waves)
     limit = {name: last_kept(waves.frequency, kept) for name, kept in contrast.items()}
+    shown = {name: stripes(picture, wanted, waves) for name, picture in pictures.items()}
+    right = {name: one.limit(waves.frequency) for name, one in shown.items()}
     blur = blurs(subject)
+    by_contrast = _criteria(limit, len(every), blur, predicted(subject, wanted, waves, order))
     return Result(
-        _criteria(limit, len(every), blur, predicted(subject, wanted, waves, order)),
+        (*_of_stripes(right, len(every)), *by_contrast),
         (_ratio_table(limit, len(every), blur), _limits(subject, wanted, waves, limit), _blur_table(blur),
-         _table(waves, contrast)),
-        _figures(subject, wanted, waves, pictures, contrast, limit),
+         _table(waves, contrast), _stripes_table(waves, shown, right)),
+        (*_figures(subject, wanted, waves, pictures, contrast, limit), *_stripes_figures(subject, waves, shown, right)),
     )  # fmt: skip
 
 
@@ -152,24 +155,68 @@ def _criteria(
     limit: dict[str, float], count: int, blur: dict[str, float], planned: tuple[float, float]
 ) -> tuple[Criterion, ...]:
     first, every = limit[_by(1, FAINT)], limit[_by(count, FAINT)]
-    high, lower, low = limit[HIGH], limit[LOWER], limit[LOW]
-    keeps = f"keeps F_{count}, within 10 %"
     finer = tuple(
         (f"F_{count} / F_1 at least {ASKED}, at {contrast:.0%} contrast", b / a >= ASKED, f"{b / a:.2f}")
         for contrast, (a, b) in _ratios(limit, count).items()
         if _sharp(blur)
     )
-    rows = (
-        *finer,
-        (f"a base high-passed at F_1 {keeps}", high >= 0.9 * every, f"{high / every:.2f} of it"),
-        (f"a base high-passed at F_1 / 4 {keeps}", lower >= 0.9 * every, f"{lower / every:.2f} of it"),
-        ("a base low-passed at F_1 falls to F_1, within 15 %", low <= 1.15 * first, f"{low / first:.2f} of it"),
-    )
     as_planned = tuple(
         (f"{name} {PLANNED}", abs(planned_px / found - 1) <= PREDICTED, f"{planned_px / found:.2f} of it")
         for name, planned_px, found in (("F_1", planned[0], first), (f"F_{count}", planned[1], every))
     )
-    return tuple(Criterion(asked, reached, holds) for asked, holds, reached in (*rows, *as_planned))
+    return tuple(Criterion(asked, reached, holds) for asked, holds, reached in (*finer, *as_planned))
+
+
+def _of_stripes(right: dict[str, float], count: int) -> tuple[Criterion, ...]:
+    """By thresholded photographs: contrast that the scale loses by construction (eqs 5 and 6) does not count."""
+    first, every = right[_by(1, FAINT)], right[_by(count, FAINT)]
+    keeps = f"keeps F_{count}, within 10 %, by stripes"
+    rows = (
+        (f"F_{count} is above F_1, by stripes", every > first, f"{every / first:.2f} of it"),
+        (f"a base high-passed at F_1 {keeps}", right[HIGH] >= 0.9 * every, f"{right[HIGH] / every:.2f} of it"),
+        (f"a base high-passed at F_1 / 4 {keeps}", right[LOWER] >= 0.9 * every, f"{right[LOWER] / every:.2f} of it"),
+        ("a base low-passed at F_1 falls to F_1, within 15 %, by stripes", right[LOW] <= 1.15 * first,
+         f"{right[LOW] / first:.2f} of it"),
+    )  # fmt: skip
+    return tuple(Criterion(asked, reached, holds) for asked, holds, reached in rows)
+
+
+def _stripes_table(waves: Waves, shown: dict[str, Stripes], right: dict[str, float]) -> ResultTable:
+    rows = tuple(
+        (name, float(f * waves.pitch_px), float(one.agree[k]), float(one.count[k]), right[name] * waves.pitch_px)
+        for name, one in shown.items()
+        for k, f in enumerate(waves.frequency)
+        if np.isfinite(one.agree[k])
+    )
+    title = (
+        f"Stripes of photographs, thresholded at their local mean: right where {AGREES:.0%} of the pixels agree with "
+        f"the target's, and their number within {COUNTS:.0%}"
+    )
+    columns = ("way", "cycles a projector pixel", "pixels that agree", "stripes, of the target's", "right up to")
+    return ResultTable("stripes", title, columns, rows)
+
+
+def _stripes_figures(
+    subject: Subject, waves: Waves, shown: dict[str, Stripes], right: dict[str, float]
+) -> tuple[Figure, ...]:
+    whole = crop_around(subject.mask)
+    faint = [name for name in shown if name not in (_by(1, BOLD), NARROWER, LOWER)]
+    panels = [
+        LabelledPicture(
+            name, np.repeat(np.uint8(255) * shown[name].picture[whole.rows, whole.columns, None], 3, axis=2)
+        )
+        for name in faint
+    ]
+    lines = [Line(f"{name}: {right[name] * waves.pitch_px:.2f}", waves.frequency * waves.pitch_px, shown[name].agree)
+             for name in faint]  # fmt: skip
+    agreement = plotted(
+        lines, x="cycles per pixel of one projector", y="share of pixels that agree",
+        marks={"right": ("y", AGREES), "one projector's pixels end": ("x", 0.5)}, y_range=(0.4, 1.05),
+    )  # fmt: skip
+    return (
+        Figure("agreement", "Share of the thresholded photograph's pixels that agree with the target's.", agreement),
+        Figure("stripes", "The photographs, thresholded at their local mean.", strip(panels, columns=3)),
+    )
 
 
 def _table(waves: Waves, contrast: dict[str, Float64]) -> ResultTable:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask
-from controller.optics.plan.figures import FAINT, MEAN
+from controller.optics.plan.figures import FAINT, MEAN, last_kept
 from controller.optics.solve.targets.values import Target, through_camera
 from controller.stage.report.pictures import crop_around
 from lab.study.subject.subject import ReachableTarget, Subject
@@ -18,6 +19,8 @@ LOWEST, HIGHEST = 0.15, 1.25
 MIDDLE = 0.6
 """Of the object's width: farther out the surface turns away, its pixels are narrower and would blur the figure."""
 GREEN = 1
+AGREES, COUNTS = 0.8, 0.1
+"""Stripes are right where this share of pixels agrees with the target's, and their number does within this part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,3 +89,45 @@ def _amplitude(values: FloatImage, waves: Waves, inside: Mask) -> float:
     x = (x - x.mean()) / max(float(np.ptp(x)), 1.0)
     parts = np.stack([np.cos(phase), np.sin(phase), np.ones_like(x), x, x * x, x**3], axis=1)
     return float(np.linalg.lstsq(parts, values.astype(np.float64), rcond=None)[0][0])
+
+
+@dataclass(frozen=True, slots=True)
+class Stripes:
+    """A photograph beside its target, both black and white after a threshold at their local mean, by band.
+
+    ``agree`` (bands,) share of pixels that agree: by chance a half; ``count`` (bands,) edges of stripes along the rows,
+    over the target's; NaN where too little is seen. Of what is thresholded (rows, columns): ``picture``
+    """
+
+    agree: Float64
+    count: Float64
+    picture: Mask
+
+    def limit(self, frequency: Float64) -> float:
+        """Up to which of the bands' frequencies stripes are right; beyond it they alias or are lost."""
+        is_right = np.abs(self.count - 1) <= COUNTS
+        return last_kept(frequency, np.where(np.isnan(self.count) | is_right, self.agree, 0.0), share=AGREES)
+
+
+def stripes(picture: FloatImage, wanted: ReachableTarget, waves: Waves) -> Stripes:
+    """What a thresholded photograph shows, as the paper's figure does: right stripes need no contrast."""
+    seen = waves.band >= 0
+    ours, theirs = (_above_mean(image[..., GREEN], wanted.mask, waves) for image in (picture, wanted.radiance))
+    agree, count = (np.full(waves.frequency.size, np.nan) for _ in range(2))
+    for number in range(waves.frequency.size):
+        inside = (waves.band == number) & wanted.mask
+        if inside.sum() < 200:
+            continue
+        agree[number] = np.mean(ours[inside] == theirs[inside])
+        beside = inside[:, 1:] & inside[:, :-1]
+        edges, expected = (np.sum((one[:, 1:] != one[:, :-1]) & beside) for one in (ours, theirs))
+        count[number] = edges / max(int(expected), 1)
+    return Stripes(agree, count, np.asarray(ours & seen))
+
+
+def _above_mean(values: FloatImage, mask: Mask, waves: Waves) -> Mask:
+    """Where an image (rows, columns) is above its mean along the row, over a wavelength of the lowest frequency."""
+    size = (2 * round(0.5 / float(waves.frequency[0])) + 1, 1)
+    weight = cv2.blur(mask.astype(np.float64), size)
+    total = cv2.blur(np.where(mask, values, 0).astype(np.float64), size)
+    return np.asarray(values > total / np.maximum(weight, 1e-9))

@@ -32,7 +32,7 @@ from lab.study.values import Cell, Criterion, Experiment, Result, ResultTable
 TIMINGS: Final = Path(controller.__file__).resolve().parents[1] / "lab" / "timings" / "README.md"
 REPEATS: Final = 9
 PAPER_PX: Final = 1400 * 1050
-TWO_HOURS_S: Final = 7200.0
+AN_HOUR_S, TWO_HOURS_S = 3600.0, 7200.0
 
 
 PHOTOGRAPHS: Final = (StepKind.BLACK, StepKind.LIGHT, StepKind.CODES)
@@ -56,8 +56,11 @@ class TimedStage:
 
     @property
     def judged(self) -> bool:
-        """How long an emulated camera takes says nothing about a real one: no criterion on its photographs."""
-        return self.paper_s is not None and not set(self.steps) & set(PHOTOGRAPHS)
+        """Whether a fault could miss the paper's time.
+
+        No plausible one could miss its hours, of which we take seconds; an emulated camera's time says nothing.
+        """
+        return self.paper_s is not None and self.paper_s < AN_HOUR_S and not set(self.steps) & set(PHOTOGRAPHS)
 
 
 TRANSPORT: Final = "light transport, built"
@@ -224,14 +227,15 @@ The calibration's seconds are wall times from this run's journal. The bench, whi
 the machine with it, and the load at that time was not recorded. The later stages were repeated for this table with
 compiled code: the least of nine for the new appearance, one for the others, as wall time and processor time. The paper
 calibrated with a real camera and 256 dots a projector, on eight cores of 3 GHz. An emulated camera does not show how
-long a real one takes, so photographs and total are not judged. The paper avoids a full solve for
+long a real one takes, so photographs and total are not judged, nor what took the paper an hour: that could not be
+missed. The paper avoids a full solve for
 each new appearance and gives no time for one."""
 
 TIMES = Experiment(
     name="times",
     title="Times",
     paper="Paper 5",
-    shows="every stage takes no longer than the paper's, on two cores.",
+    shows="the stages that could be slower than the paper's are not, on two cores.",
     scene="painted",
     run=times,
     cost_s=20.0,

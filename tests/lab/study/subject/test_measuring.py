@@ -8,7 +8,7 @@ import pytest
 from controller.optics.plan.figures import last_kept
 from controller.optics.solve.result.metrics import sharpness
 from lab.study.experiments.frequency.experiment import bases
-from lab.study.experiments.frequency.waves import kept_contrast, make_waves
+from lab.study.experiments.frequency.waves import kept_contrast, make_waves, stripes
 from lab.study.subject.measuring import normalised_residual, quality, region_means, sharpness_map, unbounded_inverse
 from lab.study.subject.subject import ReachableTarget
 from tests.lab.study.array_stage import CAMERA, array_subject
@@ -85,6 +85,25 @@ def test_contrast_is_what_is_left_of_the_wave_in_phase() -> None:
     assert np.nanmax(np.abs(kept_contrast(mean + 0.6 * (radiance - mean), wanted, waves) - 0.6)) < 0.02
     assert np.nanmax(np.abs(kept_contrast(np.full_like(radiance, mean), wanted, waves))) < 0.02
     assert waves.pitch_px == pytest.approx(3.0, abs=0.05)
+
+
+def test_stripes_are_right_without_contrast_and_wrong_where_they_alias_or_are_lost() -> None:
+    subject = array_subject(1)
+    waves = make_waves(subject, 0)
+    wanted = ReachableTarget(waves.target.image, subject.mask, 1.0)
+    detail = waves.target.image - np.float32(0.5)
+    slope = np.linspace(0.7, 1.3, CAMERA[1], dtype=np.float32)[None, :, None]
+    faint = stripes((np.float32(0.5) + 0.1 * detail) * slope, wanted, waves)
+    assert np.nanmin(faint.agree) > 0.9
+    assert faint.limit(waves.frequency) == waves.frequency[-1], "a tenth of the contrast, and uneven light"
+
+    finer = waves.band >= len(waves.frequency) // 2
+    aliased = np.repeat((0.5 + 0.1 * np.cos(0.6 * waves.phase))[..., None], 3, axis=2).astype(np.float32)
+    middle = float(waves.frequency[len(waves.frequency) // 2])
+    for lost in (aliased, np.full_like(aliased, 0.5), 0.5 - 0.1 * detail):
+        shown = stripes(np.where(finer[..., None], lost, waves.target.image), wanted, waves)
+        assert 0.8 * middle < shown.limit(waves.frequency) <= middle
+    assert not stripes(aliased, wanted, waves).picture[waves.band < 0].any()
 
 
 def test_the_limit_lies_between_the_bands_round_the_half() -> None:
