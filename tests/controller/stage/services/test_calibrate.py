@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from controller.bundle.signing import generate_key
@@ -13,14 +14,17 @@ from controller.core.errors import UsageError
 from controller.core.storage import exclusive
 from controller.demo import demo
 from controller.run.journal import Journal
-from controller.run.progress import Silent
+from controller.run.progress import Reporter, Silent
 from controller.run.step_id import StepId
-from controller.stage.services.calibrate import AppearanceOrder, make_appearances
+from controller.stage.artefacts.names import write_json
+from controller.stage.artefacts.projectors import Light
+from controller.stage.artefacts.views import view_folders
+from controller.stage.services.calibrate import AppearanceOrder, calibrate, make_appearances
 from controller.stage.services.play import PlayRequest, play
 from controller.stage.sessions.calibrations import KEY_FILE, finished_calibration, output_sizes, signing_key
-from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import LOCK
-from controller.stage.sessions.session import OwnSession
+from controller.stage.sessions.session import OwnSession, StageWork
 
 
 @pytest.fixture
@@ -146,3 +150,68 @@ def test_playing_without_a_bundle_is_refused_before_any_device_is_opened(stage: 
         )
     assert refused.value.code == "nothing-installed"
     assert not (stage / "runs").exists()
+
+
+class Alone(OwnSession):
+    """Photographs nothing: notes the work that it is given, and puts a whole calibration there."""
+
+    def run(self, checked: Checked, work: StageWork, *, reporter: Reporter, cancel: threading.Event) -> Path:
+        assert work.place is not None
+        assert not work.views
+        name, folder = work.place
+        (folder / "captures").mkdir(parents=True)
+        described(folder, name)
+        return folder
+
+
+def described(folder: Path, name: str) -> None:
+    """The white of a projector in a folder: a picture that depends on the view's name."""
+    write_json(folder / "geometry.json", {"projectors": {"left": {}, "right": {}}})
+    white = np.random.default_rng(len(name)).random((8, 12, 3), np.float32)
+    for projector in ("left", "right"):
+        Light(np.zeros((3, 256)), np.eye(3), white, np.zeros_like(white), np.eye(3)).write(folder, projector)
+
+
+def photographed(stage: Path, view: str) -> None:
+    calibrate(session=Alone(stage), reporter=Silent(), cancel=threading.Event(), view=view)
+
+
+@pytest.fixture
+def calibrated(stage: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr("controller.stage.services.calibrate.join_geometry", lambda *_: False)
+    monkeypatch.setattr("controller.stage.services.calibrate.photographs_sentence", lambda *_: "")
+    folder = run(stage, "20261129-120000-calibrate", "calibrated")
+    described(folder, "camera")
+    return folder
+
+
+def test_a_place_to_which_the_only_camera_was_carried_is_added_to_the_newest_calibration(
+    stage: Path, calibrated: Path
+) -> None:
+    photographed(stage, "from the left")
+    assert view_folders(calibrated) == {"camera": calibrated, "from the left": calibrated / "views" / "from the left"}
+
+
+def test_a_view_that_is_whole_is_replaced_by_the_new_one_only_at_the_end(stage: Path, calibrated: Path) -> None:
+    photographed(stage, "side")
+    (calibrated / "views" / "side" / "old").touch()
+    photographed(stage, "side")
+    assert list(view_folders(calibrated)) == ["camera", "side"]
+    assert [path.name for path in (calibrated / "views").iterdir()] == ["side"]
+    assert not (calibrated / "views" / "side" / "old").exists()
+
+
+@pytest.mark.parametrize(("view", "code"), [("camera", "view-is-first"), ("../other", "view-unknown")])
+def test_a_view_that_can_not_be_added_is_refused_before_anything_is_photographed(
+    stage: Path, calibrated: Path, view: str, code: str
+) -> None:
+    with pytest.raises(UsageError) as error:
+        photographed(stage, view)
+    assert error.value.code == code
+    assert not (calibrated / "views").exists()
+
+
+def test_without_a_calibration_no_view_is_added(stage: Path) -> None:
+    with pytest.raises(UsageError) as error:
+        photographed(stage, "side")
+    assert error.value.code == "not-calibrated"
