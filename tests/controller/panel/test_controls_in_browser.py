@@ -206,6 +206,31 @@ def test_a_scene_is_looked_at_on_the_object_computed_and_played(fresh: Served, b
         assert ("compute-scene", ("gold", "gold")) in kiosk_of(fresh).asked
 
 
+def test_a_mesh_is_laid_by_places_on_both_and_blinks(fresh: Served, browser: Browser) -> None:
+    with tab(browser, fresh.address) as page:
+        enter(page, "otto")
+        page.goto("/appearances/new")
+        page.get_by_role("link", name="Lay a mesh on the object").click()
+        page.get_by_role("link", name="bust.glb").click()
+        page.get_by_role("link", name="Turn right").click()
+        mesh, view = page.locator("#by-points .overlay").all()
+        for side in (mesh, view):
+            expect(side.locator("img")).not_to_have_js_property("naturalWidth", 0)
+        lay = page.get_by_role("button", name="Lay it by these points")
+        for n in range(4):
+            for side in (mesh, view):
+                expect(lay).to_be_disabled()
+                side.click(position={"x": 20 + 60 * (n % 2), "y": 20 + 40 * (n // 2)})
+        assert not violations(page)
+        lay.click()
+        expect(page.get_by_text("The mesh lies on the object.")).to_be_visible()
+        expect(page.get_by_text("They differ by 0.12 mm")).to_be_visible()
+        page.get_by_role("button", name="Blink").click()
+        expect(page.locator("#laid .over")).to_have_class("over blinks")
+        _, (name, side_number, points) = kiosk_of(fresh).asked[-1]
+        assert (name, side_number, len(json.loads(points))) == ("bust.glb", 1, 4)
+
+
 def test_pictures_are_compared_by_a_line_and_a_report_opens_in_its_page(fresh: Served, browser: Browser) -> None:
     kiosk = kiosk_of(fresh)
     kiosk.compare()
