@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.errors import UsageError
+from controller.core.errors import UsageError, WorkError
 from controller.play.control.notify import log
 from controller.stage.hosts.bundles import PART_BYTES, Offer, message
 from controller.stage.hosts.clock import HostClock
@@ -162,14 +162,18 @@ class Remote:
 
     def needs(self, request: Mapping[str, Any]) -> bool:
         """Whether it has come after this was agreed on, and can be asked for it now."""
-        return self.there and not self.behind and self._asked_at != request["at"]
+        return self.there and self._asked_at != request["at"] and self._has_its_bundle(request)
+
+    def _has_its_bundle(self, request: Mapping[str, Any]) -> bool:
+        """Another bundle may be loaded since the request was agreed on."""
+        return "bundle" not in request or (not self.behind and request["bundle"] == str(self._wanted))
 
     # -- what is sent
 
     def ask(self, request: Mapping[str, Any], *, within_s: float) -> dict[str, Any]:
-        request = dict(request)
-        if "bundle" in request:
-            request["bundle"] = self._has
+        if not self._has_its_bundle(request):
+            raise WorkError("hosts-behind", what=f"{self.progress} of the bundle.", remedy="Wait until it is there.")
+        request = {**request, **({"bundle": self._has} if "bundle" in request else {})}
         self._asked_at = request.get("at", self._asked_at)
         try:
             asked = Asked(self._screen, request, within_s)
