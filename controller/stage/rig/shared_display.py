@@ -174,6 +174,3 @@ def frames_digest(frames: Mapping[str, ByteImage]) -> str:
         digest.update(f"{output} {frames[output].shape} ".encode())
         digest.update(np.ascontiguousarray(frames[output]).tobytes())
     return digest.hexdigest()
-
-
-__all__ = ["Seat", "SharedDisplay", "frames_digest"]

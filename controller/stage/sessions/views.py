@@ -214,5 +214,3 @@ class _Named:
 
 _LAST: Final = ("dark-after", "take-over")
 """Kinds of steps that concern all views."""
-
-__all__ = ["MakeSteps", "OtherViews"]
