@@ -89,7 +89,7 @@ def _imported(path: Path) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """``state``: killed, survived or equivalent; ``why``: the test that failed, or the reason."""
+    """``state``: killed, survived, equivalent or untried; ``why``: the test that failed, or the reason."""
 
     place: str
     before: str
@@ -203,7 +203,7 @@ class Campaign:
         trial = Trial(self.tree, limits)
         for job in sorted(items)[:count]:
             change, result = items[job].mutations[0], done.get(job)
-            if result is None or (again and self._result(change, result).state == "survived"):
+            if result is None or (again and self._result(change, result).state in ("survived", "untried")):
                 result = trial.of(change)
                 self._session.set_result(job, result)
             yield self._result(change, result)
@@ -211,7 +211,9 @@ class Campaign:
     def _result(self, change: MutationSpec, result: WorkResult) -> Result:
         before, _, after = (result.diff or "").partition("\n")
         path = change.module_path.as_posix()
-        state = "killed" if result.is_killed else "survived"
+        # One that no test file ended for in time says nothing; --again tries it once more.
+        untried = not result.is_killed and (result.output or "").startswith("0 test files")
+        state = "killed" if result.is_killed else "untried" if untried else "survived"
         reason = self._equivalent.get((path, before, after))
         if reason is not None and not result.is_killed:
             return Result(f"{path}:{change.start_pos[0]}", before, after, "equivalent", reason)
