@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -259,10 +260,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _compile_named() -> int:
     """Compile the modules whose names come on standard input, one a line, and answer each with a line."""
+    code = 0
     for line in sys.stdin:
-        compile_module(line.strip())
-        print("compiled", flush=True)  # noqa: T201
-    return 0
+        try:
+            compile_module(line.strip())
+        except Exception:  # noqa: BLE001 - one module that fails does not stop those after it
+            traceback.print_exc()
+            print("failed", flush=True)  # noqa: T201
+            code = 1
+        else:
+            print("compiled", flush=True)  # noqa: T201
+    return code
 
 
 def _compile_all() -> int:

@@ -116,6 +116,11 @@ def test_a_module_that_does_not_exist_fails_and_says_so_in_its_exit_code(tmp_pat
     assert _compile(tmp_path, "controller.nothing").returncode != 0
 
 
+def test_a_module_that_fails_does_not_stop_those_after_it(tmp_path: Path) -> None:
+    answers = _compile(tmp_path, "controller.nothing\ncontroller.optics.transport.planes").stdout
+    assert answers.split() == ["failed", "compiled"]
+
+
 @pytest.fixture
 def table_of_a_missing_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     table = tmp_path / "kernels.json"
