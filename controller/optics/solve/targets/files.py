@@ -11,6 +11,7 @@ from controller.core import channels
 from controller.core.arrays import FloatImage
 from controller.core.colour import SPACES, ColourSpace, Primaries, Unsuitable, mixed
 from controller.core.errors import UsageError
+from controller.core.files import MOST_PIXELS
 from controller.core.pictures import KINDS, read_picture_file
 from controller.optics.capture.linear_files import exr_chromaticities, read_exr
 from controller.optics.solve.targets.values import Target
@@ -97,7 +98,7 @@ def unreadable(path: Path, why: Unsuitable) -> UsageError:
     return UsageError(
         "target-unreadable",
         what=f"{path.name} can't be used as a target: {why}.",
-        remedy=f"Give an EXR, {KINDS} picture as seen from the camera.",
+        remedy=f"Give an EXR, {KINDS} picture of at most {MOST_PIXELS // 1_000_000} million pixels.",
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,7 +22,7 @@ from controller.core.arrays import FloatImage, Mask
 from controller.core.colour import linear_to_srgb, srgb_to_linear
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry, Pinhole
-from controller.optics.solve.targets.files import load_target, shipped_photograph
+from controller.optics.solve.targets.files import load_target, read_large_picture, shipped_photograph
 from controller.optics.solve.targets.patterns import CheckerboardLook, PatternLook, checkerboard, replace_pattern
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.values import Target, in_box, through_camera
@@ -287,6 +289,19 @@ def test_a_file_cut_short_and_a_missing_one_are_unreadable(tmp_path: Path, name:
         with pytest.raises(UsageError) as refused:
             load_target(path, (80, 60))
         assert refused.value.code == "target-unreadable"
+
+
+def test_a_picture_of_200_million_pixels_is_refused_with_the_size_that_is_possible(tmp_path: Path) -> None:
+    whole = cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()
+    header = b"IHDR" + struct.pack(">IIBBBBB", 16_000, 12_500, 8, 2, 0, 0, 0)
+    (tmp_path / "large.png").write_bytes(
+        whole[:8] + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + whole[33:]
+    )
+    with pytest.raises(UsageError) as refused:
+        read_large_picture(tmp_path / "large.png", least_px=(1400, 1050))
+    assert refused.value.code == "target-unreadable"
+    assert "more than 128 million pixels" in refused.value.what
+    assert "128 million pixels" in refused.value.remedy
 
 
 def test_the_photograph_that_comes_with_the_installation_is_scikit_images() -> None:
