@@ -18,6 +18,7 @@ EXTRAS: Final = {
     "building": "show control by OSC and sACN, dousers by sACN",
     "gpio": "keys on GPIO lines",
     "cluster": "solve on many machines (--scheduler)",
+    "link": "a house of stages, and outputs of several computers",
     "ndi": "live targets by NDI",
     "gpu": "solve on a graphics processor",
 }
@@ -33,6 +34,7 @@ _MODULES: Final = {
     "building": "pythonosc sacn",
     "gpio": "gpiod",
     "cluster": "dask distributed",
+    "link": "cryptography spake2 zenoh",
     "ndi": "cyndilib",
     "gpu": "wgpu",
 }

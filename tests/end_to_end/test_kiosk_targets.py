@@ -148,6 +148,7 @@ def test_in_a_browser_an_upload_is_fitted_and_judged_and_a_bad_appearance_stays_
             "What the object will look like, calculated",
             "Map of what can't be reached",
         ):
+            expect(page.get_by_alt_text(alt)).to_be_visible(timeout=LONG_MS)
             expect(page.get_by_alt_text(alt)).not_to_have_js_property("naturalWidth", 0)
         page.get_by_label("Name", exact=True).fill("phone")
         page.get_by_role("button", name="Compute").click()

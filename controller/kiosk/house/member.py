@@ -91,7 +91,7 @@ class Member:
                 raise UsageError(
                     "house-joined-already",
                     what=f"This stage belongs to the house {there.house} already.",
-                    remedy="Leave that house first: velatura kiosk house leave.",
+                    remedy="Leave that house first, with `velatura kiosk house leave`.",
                 )
             self._end_code()
             opened = self._open_code = Joining(self._folder, name, host=self._host, **self._joining)

@@ -26,7 +26,7 @@ from hal.toml_lines import KeyPath
 
 BUILDING: Final = "building.toml"
 OWN: Final = frozenset({
-    FILE, f"{FILE}.before", "schedule.toml", BUILDING, "bench.toml", "profiles", "tapes", "run", "runs",
+    FILE, f"{FILE}.before", "schedule.toml", "house.toml", BUILDING, "bench.toml", "profiles", "tapes", "run", "runs",
     "appearances", "bundles", "bundles-without", "lamps.json", "lamps-copy.json", "kiosk", "keys",
 })  # fmt: skip
 """What Velatura itself keeps in a stage's folder (docs/architecture.md): no file with such a name comes with a backup

@@ -23,7 +23,7 @@ NAMES = {
     "OpenEXR": "openexr", "PIL": "pillow", "StreamDeck": "streamdeck", "argon2": "argon2-cffi", "hid": "hidapi",
     "cv2": "opencv-contrib-python-headless", "multipart": "python-multipart", "nacl": "pynacl", "serial": "pyserial",
     "prometheus_client": "prometheus-client", "python_multipart": "python-multipart",
-    "usb": "pyusb", "pythonosc": "python-osc",
+    "usb": "pyusb", "pythonosc": "python-osc", "zenoh": "eclipse-zenoh",
 }  # fmt: skip
 """The distribution of a module, where it is called otherwise."""
 INDIRECT = {

@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
@@ -211,22 +209,6 @@ def test_a_plane_with_measured_sides_is_metric_and_turned_right(tilt_deg: tuple[
         pose = placed["cam_from_world"].matrix()
         assert np.degrees(np.linalg.norm(cv2.Rodrigues(pose[:, :3] @ own.rotation.T)[0])) < 0.5
         assert np.linalg.norm(pose[:, 3] - own.translation_m) < 0.015
-
-
-@pytest.mark.slow
-@settings(max_examples=3)
-@given(tilt=st.tuples(st.floats(-30, 30), st.floats(-30, 30)), away_m=st.floats(0.6, 3), seed=st.integers(0, 99))
-def test_any_plane_lies_as_its_sides_were_measured(tilt: tuple[float, float], away_m: float, seed: int) -> None:
-    points = points_of(panel(tilt, (0, 0, away_m)))
-    some = np.random.default_rng(seed).random(CAMERA[::-1]) < 0.7
-    found = shape_of(stage_of(points, [some]), "plane", sides(points)).reconstruction
-    assert found is not None
-    known = np.isfinite(found.geometry.points_m[..., 2])
-    np.testing.assert_array_equal(known, np.isfinite(found.geometry.normals).all(axis=2))
-    assert np.ptp(found.geometry.normals[known], axis=0).max() < 1e-5, "one plane has one normal"
-    off_m = np.linalg.norm(found.geometry.points_m - points, axis=2)[known]
-    assert off_m.max() < 0.01 * away_m
-    assert np.median(found.sigma_m[known]) < 0.01 * away_m
 
 
 def test_a_plane_says_how_little_is_certain_without_measured_sides() -> None:

@@ -144,5 +144,5 @@ def test_memory_that_was_given_back_is_no_longer_counted(device: Device) -> None
 
 
 def test_a_calibration_without_phase_maps_is_refused_in_words(device: Device) -> None:
-    with pytest.raises(DeviceRefused, match="no phase maps"):
+    with pytest.raises(DeviceRefused, match="needs phase maps"):
         DeviceTransport(device, build_transport(plane_calibration()))
