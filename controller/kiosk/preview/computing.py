@@ -39,7 +39,7 @@ from controller.stage.report.pictures import to_screen
 from controller.stage.steps.appearance.solving import options_of, solved_base
 from hal.runtime.compute import free_bytes
 
-NICENESS: Final = 10
+NICENESS: Final = 5
 """What plays, and what is being calibrated, goes before previews."""
 JUDGED_PX: Final = 960
 """About the longer side of what is judged and drawn: every so-many-th pixel of the camera."""
