@@ -95,9 +95,8 @@ class Joining:
         with self._lock:
             outcome = self._outcome or _expired()
             self._over.set()
-        if self._over.is_set() and isinstance(outcome, CodedError):
+        if isinstance(outcome, CodedError):
             raise outcome
-        assert isinstance(outcome, Membership)
         return outcome
 
     def _hello(self, hello: _Hello) -> _Hello:
