@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,11 +19,11 @@ from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.stage.hosts.bundles import Arrivals, Offer
 from controller.stage.hosts.clock import HostClock
-from controller.stage.hosts.remote import BEAT, BEAT_S, Asked, Report, key, placed_rows
+from controller.stage.hosts.remote import Asked, Report, key, placed_rows
 from controller.stage.hosts.screen import Screen, Setup
 from controller.stage.link.joining import Joining, admit
 from controller.stage.link.membership import Authority, membership
-from controller.stage.link.session import Link, member_link
+from controller.stage.link.session import BEAT, BEAT_S, Link, member_link
 
 PORT: Final = 7449
 """Of the conductor, for the agents."""
@@ -85,17 +84,13 @@ class Agent:
         self._pictures: dict[tuple[str, str], Any] = {}
         self._heard_s = _NEVER_S
         self._lock, self._bundles_lock = threading.Lock(), threading.Lock()
-        answer = partial(self._answer, link)
-        answer("prepare", dict[str, Setup], self._prepare)
-        answer("ask", Asked, self._ask)
-        answer("rows", bytes, self._rows)
-        answer("offer", Offer, self._offered)
-        answer("part", bytes, self._part)
-        link.subscribe(BEAT, float, self._beat)
+        link.answer(key(name, "prepare"), dict[str, Setup], self._prepare)
+        link.answer(key(name, "ask"), Asked, self._ask)
+        link.answer(key(name, "rows"), bytes, self._rows)
+        link.answer(key(name, "offer"), Offer, self._offered)
+        link.answer(key(name, "part"), bytes, self._part)
+        link.subscribe(BEAT, bytes, self._beat)
         link.appear(key(name, "there"))
-
-    def _answer(self, link: Link, word: str, kind: type[Any], answers: Callable[[Any], Any]) -> None:
-        link.answer(key(self._name, word), kind, answers)
 
     def run(self, ended: threading.Event) -> None:
         """Until ``ended``; then the players show black and end."""
@@ -112,7 +107,7 @@ class Agent:
             states = {name: one.step(one.setup.keep_s - silent_s) for name, one in self._screens.items()}
         self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states))
 
-    def _beat(self, _: float) -> None:
+    def _beat(self, _: bytes) -> None:
         self._heard_s = time.monotonic()
 
     def _prepare(self, setups: dict[str, Setup]) -> None:

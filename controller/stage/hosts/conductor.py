@@ -354,7 +354,7 @@ def _players(
 ) -> list[Screen | Remote]:
     link = None
     if any(host for host, _ in setups):
-        link = stack.enter_context(opened_link(options.keys, clock, options.port))
+        link = stack.enter_context(opened_link(options.keys, options.port))
     players: list[Screen | Remote] = []
     for number, ((host, screen), setup) in enumerate(setups.items()):
         if link is not None and host:

@@ -18,14 +18,11 @@ import numpy.typing as npt
 from controller.core.errors import UsageError, WorkError
 from controller.play.control.notify import log
 from controller.stage.hosts.bundles import PART_BYTES, Offer, message
-from controller.stage.hosts.clock import HostClock
 from controller.stage.hosts.screen import Pictures, Setup, State
 from controller.stage.link.membership import Authority
 from controller.stage.link.session import Link, house_link
 from hal.errors import CodedError
 
-BEAT: Final = "all/beat"
-BEAT_S: Final = 0.5
 _ROWS_BYTES: Final = 4 << 20
 """Of pixels in one message, before they are packed."""
 
@@ -84,26 +81,14 @@ _OFFER_S: Final = 60.0
 _AGAIN_S: Final = 1.0
 
 
-@contextlib.contextmanager
-def opened_link(keys: Path | None, clock: HostClock, port: int) -> Iterator[Link]:
-    """The link to the other computers, with the conductor's beat. Raises UsageError("hosts-without-keys")."""
+def opened_link(keys: Path | None, port: int) -> Link:
+    """The link to the other computers. Raises UsageError("hosts-without-keys")."""
     if keys is None:
         raise UsageError(
             "hosts-without-keys", what="An output is on another computer, but the stage has no keys for a link.",
             remedy="Let that computer join first.",
         )  # fmt: skip
-    ended = threading.Event()
-    with house_link(Authority(keys, "players"), port=port) as link:
-
-        def beat() -> None:
-            while not ended.wait(BEAT_S):
-                link.publish(BEAT, clock.now_s(), urgent=True)
-
-        threading.Thread(target=beat, daemon=True).start()
-        try:
-            yield link
-        finally:
-            ended.set()
+    return house_link(Authority(keys, "players"), port=port)
 
 
 class Remote:

@@ -31,10 +31,10 @@ PORT: Final = 7447
 EVERYWHERE: Final = "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"  # noqa: S104 - TLS, or a code, guards it
 MOST_BYTES: Final = 8 << 20
 """Of one message; what is larger is sent in parts."""
-BEAT_S: Final = 1.0
+BEAT: Final = "all/beat"
+BEAT_S: Final = 0.5
 ALONE_S: Final = 4.0
 """A member that has heard no beat of its house for so long connects again."""
-_BEAT: Final = "all/beat"
 CLOSING_S: Final = 2.0
 _MOST_HANDLERS: Final = 8
 _RETRY: Final = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 1.5}
@@ -99,7 +99,7 @@ class Link:
         self._session = self._opened()
         self._heard_s = time.monotonic()
         if endpoints:
-            self.subscribe(_BEAT, bytes, lambda _: self._hear())
+            self.subscribe(BEAT, bytes, lambda _: self._hear())
         beats = self._follow if endpoints else self._beat if "access_control" in config else None
         if beats is not None:
             threading.Thread(target=beats, name="link", daemon=True).start()
@@ -120,7 +120,7 @@ class Link:
 
     def _beat(self) -> None:
         while not self._ended.wait(BEAT_S):
-            self.publish(_BEAT, b"")
+            self.publish(BEAT, b"", urgent=True)
 
     def _hear(self) -> None:
         self._heard_s = time.monotonic()
