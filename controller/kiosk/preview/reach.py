@@ -116,7 +116,7 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
     pictures = {name: folder / file for name, file in FILES.items()}
     _, less, less_share = with_less_light(
-        light.transport, wanted, light.black, share=options.share, drive=light.drive, indirect=light.indirect
+        light.transport, wanted, light.black, drive=light.drive, exposure=aim.exposure, indirect=light.indirect
     )
     return Reach(
         share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step),
@@ -143,9 +143,8 @@ def _wanted(light: PreviewLight, target: Path) -> Target:
         small = Path(scratch) / "target.png"
         # Made small before its colours become light: on a whole picture that alone takes a second.
         picture = target.read_bytes()
-        if png_size(picture) != light.camera_px:
-            picture = fitted(picture, light.camera_px)
-        small.write_bytes(fitted(picture, (columns, rows), "stretch"))
+        of_view = png_size(picture) == light.camera_px
+        small.write_bytes(fitted(picture, (columns, rows), "stretch" if of_view else "fit"))
         return load_target(small, (columns, rows))
 
 

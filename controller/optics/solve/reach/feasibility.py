@@ -6,7 +6,6 @@ Direct and indirect light count together (``expose_target``).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -186,24 +185,23 @@ HARDLY_ANY: Final = 0.99
 
 def with_less_light(
     transport: LightTransport, target: Target, black: FloatImage, *,
-    share: float, drive: DriveLevels, indirect: ReflectedLight | None = None,
+    drive: DriveLevels, exposure: float, indirect: ReflectedLight | None = None,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Whether more of a target is in reach with less light than its exposure, or that by ``share`` where it has none.
+    """Whether more of a target is in reach with less light than its ``exposure``.
 
     Gives the share of its pixels in reach at its light; the share of this light at which hardly any is too bright, 1
     where none is; and the share of its pixels in reach then. Raises what ``choose_exposure`` raises.
     """
-    exposed = partial(exposures, transport, target.image, black, drive=drive, indirect=indirect)
     asked = drive.mask & target.mask
-    wanted = exposed(share)[0] if target.exposure is None else target.exposure
     # the share is one of all of the object's pixels
-    most = exposed(float(1 - (1 - HARDLY_ANY) * asked.sum() / max(1, drive.mask.sum())))[0]
+    share = float(1 - (1 - HARDLY_ANY) * asked.sum() / max(1, drive.mask.sum()))
+    most = exposures(transport, target.image, black, share, drive=drive, indirect=indirect)[0]
     shares = []
-    for level in (wanted, min(most, wanted)):
+    for level in (exposure, min(most, exposure)):
         direct = direct_part(drive.reach, np.float32(level) * target.image, black, indirect)
         reachable = feasibility(transport, direct, black, drive=drive).reachable
         shares.append(float(reachable[asked].mean()) if asked.any() else 0.0)
-    return shares[0], min(most / wanted, 1.0), shares[1]
+    return shares[0], min(most / exposure, 1.0), shares[1]
 
 
 def direct_part(

@@ -15,7 +15,7 @@ from controller.core import channels
 from controller.core.arrays import moved_to_file
 from controller.optics.calibrate.photometry.reflectance import reflectance_everywhere
 from controller.optics.solve.reach.drive_levels import DriveLevels
-from controller.optics.solve.reach.feasibility import with_less_light
+from controller.optics.solve.reach.feasibility import exposures, with_less_light
 from controller.optics.solve.targets.files import read_large_picture
 from controller.optics.solve.targets.registration import Registration, register
 from controller.optics.solve.targets.restoration import RestorationLook, restored, without_margin
@@ -65,10 +65,14 @@ class Restoration:
     def figures(self, share: float) -> dict[str, Any]:
         """As of ``Registered``. ``share``: see ``SolveOptions``"""
         (target, registration), light = self.made, self._calibrated.light
+        drive, exposure = light.drive or DriveLevels(light.transport), target.exposure
+        if exposure is None:
+            exposure, _ = exposures(
+                light.transport, target.image, light.black, share, drive=drive, indirect=light.indirect
+            )
         share, less, then_share = with_less_light(
-            light.transport, target, light.black,
-            share=share, drive=light.drive or DriveLevels(light.transport), indirect=light.indirect,
-        )  # fmt: skip
+            light.transport, target, light.black, drive=drive, exposure=exposure, indirect=light.indirect
+        )
         residual = registration.residual_px[np.isfinite(registration.residual_px)]
         middle, most = np.percentile(residual, (50, 95)) if residual.size else (None, None)
         matched = float(registration.matched.sum() / max(1, registration.inside.sum()))

@@ -35,6 +35,9 @@ from hal.notices import Level
 MORE_DELAY_S = 0.1
 CHECK_LAMPS_EVERY_S = 30.0
 """Time between two checks of the lamps: at most this much work is lost when a lamp fails."""
+LAST_CHECK_S: Final = 3.0
+"""For the last check of the lamps where a series ends early. One that is lit answers at once. A dead one holds nothing
+up: what is not confirmed is only photographed again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,7 @@ def photograph_series(rig: Rig, context: Context) -> Iterator[PhotographSeries]:
     except BaseException:
         # With its own time limit, and without an error: the caller reports the error that ended the series.
         with contextlib.suppress(DeviceError):
-            series.check_lamps(in_seconds(sum(guard.answer_s for guard in rig.guards)))
+            series.check_lamps(in_seconds(LAST_CHECK_S))
         raise
 
 

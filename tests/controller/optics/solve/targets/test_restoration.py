@@ -292,8 +292,8 @@ def test_the_light_is_named_at_which_hardly_anything_is_too_bright() -> None:
     mask = np.zeros(transport.camera_shape, np.bool_)
     mask[:, 20:60] = True
     image = np.asarray(np.where(mask[..., None], slope, 0) * np.ones(3), np.float32)
-    target, drive = Target(image, mask, exposure=2.0), DriveLevels(transport)
-    share, less, then_share = with_less_light(transport, target, black, share=0.9, drive=drive)
+    target, drive = Target(image, mask), DriveLevels(transport)
+    share, less, then_share = with_less_light(transport, target, black, drive=drive, exposure=2.0)
 
     def shown(exposure: float) -> float:
         return float(feasibility(transport, exposure * image, black).reachable[mask].mean())
