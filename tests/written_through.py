@@ -27,8 +27,9 @@ needs_strace = pytest.mark.skipif(shutil.which("strace") is None, reason="needs 
 def left_over(module: str, arguments: Sequence[str], root: Path, folder: Path) -> dict[str, list[str]]:
     """Run a module that writes ``begin NAME`` and ``end NAME`` to its output around each piece of work.
 
-    Returns for each piece what a power cut at its end could take back below ``folder``: bytes of a file, or its name
-    in its folder, that are not synced. What is removed may come back; locks and SQLite's shared memory are made again.
+    Returns for each piece what a power cut could take back below ``folder``: at its end, bytes of a file, or its name
+    in its folder, that are not synced; and before, what went into or out of a folder whose new place was not. What is
+    removed may come back; locks and SQLite's shared memory are made again.
     """
     trace = folder / "trace"
     command = ["strace", "-f", "--seccomp-bpf", "-y", "-s", "4096", "-e", f"trace={SEEN}", "-o", str(trace)]
@@ -39,8 +40,9 @@ def left_over(module: str, arguments: Sequence[str], root: Path, folder: Path) -
         pytest.skip("this computer does not let strace watch")
     assert done.returncode == 0, done.stderr
     found: dict[str, list[str]] = {}
-    unsynced, names = set[Path](), set[Path]()
+    unsynced, names, early = set[Path](), set[Path](), set[Path]()
     begun: dict[str, str] = {}
+    moved = set[Path]()
     for line in trace.read_text(errors="replace").splitlines():
         thread = line.split(maxsplit=1)[0]
         if line.endswith(" <unfinished ...>"):
@@ -53,17 +55,27 @@ def left_over(module: str, arguments: Sequence[str], root: Path, folder: Path) -
         call, rest = match.groups()
         if call == "write" and (mark := re.search(rf'"({BEGIN}|{END})(.*?)\\n"', rest)):
             if mark[1] == END:
-                left = {one for one in unsynced | names if one.is_relative_to(folder) and not REMADE.search(one.name)}
-                found[mark[2]] = sorted(str(path.relative_to(folder)) for path in left)
-            unsynced, names = set(), set()
+                left = {one for one in unsynced | names | early if one.is_relative_to(folder)}
+                found[mark[2]] = sorted(str(one.relative_to(folder)) for one in left if not REMADE.search(one.name))
+            unsynced, names, early = set(), set(), set()
+            moved.clear()
         else:
+            if call.startswith("rename"):
+                source, target = _named(rest)
+                for place in moved & names - {source}:
+                    early |= {one for one in (source, target) if one.is_relative_to(place)}
+                moved.add(target)
             _note(unsynced, names, call, rest)
     return found
 
 
+def _named(rest: str) -> list[Path]:
+    return [Path(base or "/", name) for base, name in NAME.findall(rest)]
+
+
 def _note(unsynced: set[Path], names: set[Path], call: str, rest: str) -> None:
     """One call: ``unsynced`` files whose bytes, and ``names`` which, a power cut could take back."""
-    named = [Path(base or "/", name) for base, name in NAME.findall(rest)]
+    named = _named(rest)
     opened = [Path(name) for name in DESCRIPTOR.findall(rest)]
     if call in ("fsync", "fdatasync"):
         unsynced -= set(opened[:1])
