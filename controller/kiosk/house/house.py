@@ -5,6 +5,7 @@ one place for the backups of all. Its settings are ``house.toml`` in the folder 
 from __future__ import annotations
 
 import contextlib
+import shutil
 import socket
 import threading
 import time
@@ -22,10 +23,9 @@ from pydantic import BaseModel, Field, ValidationError
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import read_text
-from controller.core.storage import sha256_of
 from controller.kiosk.backup import OURS
 from controller.kiosk.backup import Folder as BackupFolder
-from controller.kiosk.house.member import PART_BYTES, MadeBackup, Order, Report
+from controller.kiosk.house.member import Order, Report
 from controller.kiosk.operations.dispatch import CALLER
 from controller.kiosk.operations.house import HOUSE_FILE, HouseEvent, HouseNow, StageNow
 from controller.kiosk.panel_address import own_addresses
@@ -33,6 +33,7 @@ from controller.kiosk.state import EventLevel
 from controller.stage.link.joining import admit
 from controller.stage.link.membership import Authority
 from controller.stage.link.session import EVERYWHERE, PORT, house_link
+from controller.stage.link.transfer import Arrivals, Offer
 from hal.errors import CodedError
 
 FOLDER: Final = "keys/house-authority"
@@ -283,21 +284,16 @@ class House:
                             remedy="Plug the disk in, mount it, or correct house.toml.")  # fmt: skip
         folder = root / name
         folder.mkdir(mode=0o700, exist_ok=True)
-        made = self._link.ask(f"member/{name}/backup", b"", MadeBackup, within_s=_BACKUP_S)
-        part = folder / ".fetched.part"
+        made = self._link.ask(f"member/{name}/backup", b"", Offer, within_s=_BACKUP_S)
+        coming = folder / ".coming"
         try:
-            with part.open("wb") as file:
-                while file.tell() < made.size:
-                    data = self._link.ask(f"member/{name}/part", file.tell(), bytes)
-                    if not 0 < len(data) <= PART_BYTES:
-                        raise WorkError("backup-differs", what="The stage sent no part of its backup.",
-                                        remedy="It is tried again.")  # fmt: skip
-                    file.write(data)
-            if sha256_of(part) != made.sha256:
-                raise WorkError("backup-differs", what="The backup changed on its way.", remedy="It is tried again.")
+            arrivals = Arrivals(coming, lambda file: None)  # it is checked where it is stored
+            for number in arrivals.offered(made):
+                arrivals.part(self._link.ask(f"member/{name}/part", number, bytes))
+            arrivals.offered(made)
             day = f"{datetime.fromtimestamp(time.time()):%Y%m%d}"
-            stored = BackupFolder(folder, self._stage).store(part, day, self._settings.keep)
+            stored = BackupFolder(folder, self._stage).store(arrivals.path(made.name), day, self._settings.keep)
         finally:
-            part.unlink(missing_ok=True)
+            shutil.rmtree(coming, ignore_errors=True)
         self._record(stored.code, f"{name}: {stored.what}", "info")
         return folder / f"velatura-{day}.tar.gz"

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
-from controller.core.storage import sha256_of
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.dispatch import local_values
 from controller.kiosk.operations.house import MEMBERSHIP, Invitation
@@ -24,12 +23,12 @@ from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
 from controller.stage.link.membership import Membership, leave, membership
 from controller.stage.link.session import EVERYWHERE, Link, member_link
+from controller.stage.link.transfer import Offer
 from hal.errors import CodedError
 
 PAUSE_S: Final = 2.0
 """Between two states, at least."""
 AGAIN_S: Final = 30.0
-PART_BYTES: Final = 1 << 20
 MOST_EVENTS: Final = 200
 PICTURE_PX: Final = 160
 _VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb}
@@ -52,14 +51,6 @@ class Order:
     verb: str
     who: str
     values: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class MadeBackup:
-    """The backup that a stage made for the house, which reads it in parts of at most ``PART_BYTES``."""
-
-    size: int
-    sha256: str
 
 
 class Member:
@@ -143,7 +134,7 @@ class _Reports:
         self._key = f"member/{member.name}"
         self._link: Link = member_link(member)
         self._changed, self._ended = threading.Event(), threading.Event()
-        self._backup: Path | None = None
+        self._backup: tuple[Path, Offer] | None = None
         self._backing_up = threading.Lock()
         self._unsubscribe = kiosk.subscribe(self._changed.set)
         for name, answer in (("report", self._whole), ("picture", self._picture), ("backup", self._make_backup)):
@@ -159,8 +150,7 @@ class _Reports:
         self._ended.set()
         self._changed.set()
         self._link.close()
-        if self._backup is not None:
-            self._backup.unlink(missing_ok=True)
+        self._forget_backup()
 
     def _publish(self) -> None:
         last, sent_s, number = None, 0.0, 0
@@ -211,20 +201,24 @@ class _Reports:
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
 
-    def _make_backup(self, _: bytes) -> MadeBackup:
+    def _make_backup(self, _: bytes) -> Offer:
         job = self._kiosk.snapshot().job
         if job is not None and not job.ended:
             raise WorkError("backup-busy", what="A job runs on this stage.", remedy="Try again when it is done.")
         with self._backing_up:
-            if self._backup is not None:
-                self._backup.unlink(missing_ok=True)
-            self._backup = self._kiosk.backup()
-            return MadeBackup(self._backup.stat().st_size, sha256_of(self._backup))
+            self._forget_backup()
+            file = self._kiosk.backup()
+            self._backup = file, Offer.of(file)
+            return self._backup[1]
 
-    def _part(self, offset: int) -> bytes:
+    def _part(self, number: int) -> bytes:
         with self._backing_up:
-            if self._backup is None or not 0 <= offset < self._backup.stat().st_size:
+            if self._backup is None or not 0 <= number < len(self._backup[1].parts):
                 raise UsageError("backup-part-unknown", what="There is no such part.", remedy="Make the backup again.")
-            with self._backup.open("rb") as file:
-                file.seek(offset)
-                return file.read(PART_BYTES)
+            file, offer = self._backup
+            return offer.part(file, number)
+
+    def _forget_backup(self) -> None:
+        if self._backup is not None:
+            self._backup[0].unlink(missing_ok=True)
+            self._backup = None

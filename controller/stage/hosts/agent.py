@@ -17,13 +17,13 @@ from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
-from controller.stage.hosts.bundles import Arrivals, Offer
 from controller.stage.hosts.clock import HostClock
 from controller.stage.hosts.remote import Asked, Report, key, placed_rows
 from controller.stage.hosts.screen import Screen, Setup
 from controller.stage.link.joining import Joining, admit
 from controller.stage.link.membership import Authority, membership
 from controller.stage.link.session import BEAT, BEAT_S, Link, member_link
+from controller.stage.link.transfer import Arrivals
 
 PORT: Final = 7449
 """Of the conductor, for the agents."""
@@ -83,12 +83,11 @@ class Agent:
         self._bundles = Arrivals(folder, self._check)
         self._pictures: dict[tuple[str, str], Any] = {}
         self._heard_s = _NEVER_S
-        self._lock, self._bundles_lock = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
         link.answer(key(name, "prepare"), dict[str, Setup], self._prepare)
         link.answer(key(name, "ask"), Asked, self._ask)
         link.answer(key(name, "rows"), bytes, self._rows)
-        link.answer(key(name, "offer"), Offer, self._offered)
-        link.answer(key(name, "part"), bytes, self._part)
+        self._bundles.listen(link, key(name, "bundle"))
         link.subscribe(BEAT, bytes, self._beat)
         link.appear(key(name, "there"))
 
@@ -133,14 +132,6 @@ class Agent:
         except ValueError as error:
             raise WorkError("link-message-wrong", what="A picture came damaged.", remedy="It is sent again.") from error
         self._screen(screen).put({output: self._pictures[screen, output]})
-
-    def _offered(self, offer: Offer) -> tuple[int, ...]:
-        with self._bundles_lock:
-            return self._bundles.offered(offer)
-
-    def _part(self, data: bytes) -> None:
-        with self._bundles_lock:
-            self._bundles.part(data)
 
     def _check(self, bundle: Path) -> None:
         for screen in self._screens.values():

@@ -8,7 +8,6 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,10 +16,10 @@ import numpy.typing as npt
 
 from controller.core.errors import UsageError, WorkError
 from controller.play.control.notify import log
-from controller.stage.hosts.bundles import PART_BYTES, Offer, message
 from controller.stage.hosts.screen import Pictures, Setup, State
 from controller.stage.link.membership import Authority
 from controller.stage.link.session import Link, house_link
+from controller.stage.link.transfer import send
 from hal.errors import CodedError
 
 _ROWS_BYTES: Final = 4 << 20
@@ -77,7 +76,6 @@ def placed_rows(message: bytes, pictures: dict[tuple[str, str], npt.NDArray[np.u
 SILENT_S: Final = 3.0
 _START_S: Final = 25.0
 _PART_S: Final = 10.0
-_OFFER_S: Final = 60.0
 _AGAIN_S: Final = 1.0
 
 
@@ -197,26 +195,14 @@ class Remote:
             while self.behind and self.there:
                 assert self._wanted is not None
                 path = self._wanted
+
+                def wanted(share: float, path: Path = path) -> bool:
+                    self._share = share
+                    return path == self._wanted
+
                 try:
-                    offer = _offer_of(path, path.stat().st_mtime_ns)
-                    missing = self._link.ask(key(self.host, "offer"), offer, tuple[int, ...], within_s=_OFFER_S)
-                    if not missing and path == self._wanted:
-                        self._has = offer.name
-                    self._send(path, offer, missing)
+                    name = send(self._link, key(self.host, "bundle"), path, wanted)
+                    if path == self._wanted:
+                        self._has = name
                 except (CodedError, OSError):
                     time.sleep(_AGAIN_S)
-
-    def _send(self, path: Path, offer: Offer, missing: tuple[int, ...]) -> None:
-        with path.open("rb") as file:
-            for done, number in enumerate(missing, len(offer.parts) - len(missing)):
-                if path != self._wanted:
-                    return
-                self._share = done / len(offer.parts)
-                file.seek(number * PART_BYTES)
-                part = message(offer.name, number, file.read(PART_BYTES))
-                self._link.ask(key(self.host, "part"), part, type(None), within_s=_PART_S)
-
-
-@lru_cache(maxsize=2)
-def _offer_of(path: Path, changed_ns: int) -> Offer:
-    return Offer.of(path)

@@ -180,7 +180,7 @@ def test_a_removed_stage_is_gone_and_plays_on(museum: Museum) -> None:
 def test_the_backups_of_all_stages_are_in_one_place(museum: Museum, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = museum.folder / "vase" / "stage"
     monkeypatch.setattr(museum.kiosks["vase"], "backup", lambda **_: archive.backup(stage))
-    monkeypatch.setattr("controller.kiosk.house.member.PART_BYTES", 1000)
+    monkeypatch.setattr("controller.stage.link.transfer.PART_BYTES", 1000)
     file = museum.house.fetch_backup("vase")
     archive.check_backup(file)
     assert file.parent == museum.folder / "backups" / "vase"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.stage.hosts.bundles import PART_BYTES, Arrivals, Offer, message
 from controller.stage.hosts.clock import HostClock, Tracking, tracking
 from controller.stage.hosts.conductor import Skew
+from controller.stage.link.transfer import PART_BYTES, Arrivals, Offer
 from hal.deadline import in_seconds
 from hal.errors import CodedError, DeviceError
 from plugins.display.player import PlayerDisplay
@@ -83,8 +83,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def parts(path: Path, offer: Offer) -> list[bytes]:
-    data = path.read_bytes()
-    return [message(offer.name, n, data[n * PART_BYTES : (n + 1) * PART_BYTES]) for n in range(len(offer.parts))]
+    return [offer.part(path, number) for number in range(len(offer.parts))]
 
 
 def test_a_bundle_comes_in_parts_and_after_a_cut_only_the_rest(tmp_path: Path, file: Path) -> None:
@@ -100,7 +99,7 @@ def test_a_bundle_comes_in_parts_and_after_a_cut_only_the_rest(tmp_path: Path, f
     assert arrivals.offered(offer) == (1, 3)
     with pytest.raises(CodedError) as caught:
         arrivals.path(offer.name)
-    assert caught.value.code == "bundle-not-here"
+    assert caught.value.code == "file-not-here"
     arrivals.part(sent[3])
     arrivals.part(sent[1])
     assert checked == []
@@ -116,7 +115,7 @@ def test_a_part_that_is_damaged_or_of_another_bundle_is_refused(tmp_path: Path, 
     with pytest.raises(CodedError, match="damaged"):
         arrivals.part(sent[0])
     arrivals.offered(offer)
-    for wrong in (sent[0][:-1] + b"\0", b"\1" + sent[0][1:], message(offer.name, 9, b""), sent[0][:20]):
+    for wrong in (sent[0][:-1] + b"\0", b"\1" + sent[0][1:], sent[0][:32] + bytes((0, 0, 0, 9)), sent[0][:20]):
         with pytest.raises(CodedError, match="damaged"):
             arrivals.part(wrong)
     assert arrivals.offered(offer) == (0, 1, 2, 3)
