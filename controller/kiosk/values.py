@@ -58,7 +58,8 @@ class Reach:
     """How much of a target the projectors can make. Shares of the visible object, 0..1: ``share`` in reach;
     ``too_bright`` for their light; ``too_dark`` for the room and the other projectors; ``too_colourful``. The rest is
     not lit, or not in the picture. ``pictures`` of the object: "target", "result" (what it will look like), "map".
-    ``light``: with so much of the light that the picture has by the settings, ``light_share`` of it is in reach.
+    ``light``: with so much of the light that the picture has by the settings, ``light_share`` of it is in reach;
+    ``held_back``: so many times as bright white could be without the darkest tenth of the object.
     ``coarse``: it was calculated on every so-many-th pixel of the camera, 1: on all.
     """
 
@@ -70,6 +71,7 @@ class Reach:
     coarse: int = 1
     light: float = 1.0
     light_share: float = 0.0
+    held_back: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +128,8 @@ class Achieved:
     """How close the photograph of an appearance is to its target: ``delta_e`` and ``delta_e_p95`` median and 95th
     percentile of the colour difference (CIEDE2000) on the whole visible object, ``rmse`` of the target's white,
     ``sharpness`` 0..1. ``in_reach``: the median where the target can be reached, which is ``in_reach_share`` of the
-    object; None in photographs of an older version, whose ``delta_e`` is of the part in reach.
+    object; None in photographs of an older version, whose ``delta_e`` is of the part in reach. ``aimed``: the median
+    from the target that was bent into what the stage can make, None without one; ``held_back`` as of ``Reach``.
     """
 
     run: str
@@ -137,6 +140,8 @@ class Achieved:
     sharpness: float
     in_reach: float | None = None
     in_reach_share: float | None = None
+    aimed: float | None = None
+    held_back: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

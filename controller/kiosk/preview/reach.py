@@ -120,7 +120,7 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     )
     return Reach(
         share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step),
-        light=less, light_share=less_share,
+        light=less, light_share=less_share, held_back=float(aim.figures["held_back"] or 1),
     )  # fmt: skip
 
 

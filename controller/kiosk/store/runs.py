@@ -134,7 +134,11 @@ def _achieved(row: Compared) -> Achieved:
     if row.whole is not None:
         found = row.pixels.get("in_reach", {})
         inside, share = found.get("delta_e00_median"), 1 - found.get("left_out_share", 1.0)
-    return Achieved(row.run, row.photographed_unix_s, median, p95, row.rmse, row.sharpness_lambda, inside, share)
+    aimed = None if row.adapted is None else row.adapted.get("delta_e00_median")
+    return Achieved(
+        row.run, row.photographed_unix_s, median, p95, row.rmse, row.sharpness_lambda, inside, share, aimed,
+        row.held_back,
+    )  # fmt: skip
 
 
 def _errors(stage: Path) -> dict[str, float]:

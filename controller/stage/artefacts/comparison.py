@@ -34,7 +34,8 @@ class Compared:
     (paper 6, eq. 9), all over the reachable pixels of the object; ``reachable_share`` of its pixels, if it is known;
     ``window_px`` the side of the resolution map's windows, camera pixels; ``refined`` what refining it achieved;
     ``pixels`` the differences by sets of pixels, ``ghosting`` the object's own pattern in it, ``adapted`` how near it
-    is to its adapted target (docs/reference/report.md); None in runs from before they were measured
+    is to its adapted target, ``held_back`` how many times as bright white could be without the darkest small part of
+    the object (docs/reference/report.md); None in runs from before they were measured
     """
 
     run: str
@@ -52,6 +53,7 @@ class Compared:
     pixels: Any = None
     ghosting: Any = None
     adapted: Any = None
+    held_back: Any = None
 
     @property
     def whole(self) -> tuple[float, float] | None:

@@ -177,7 +177,7 @@ def _row(run: Path, one: Compared, zone: tzinfo | None) -> PictureRow:
     known = [(label, form.format(value(one))) for label, value, form in _FIGURES]
     if one.reachable_share is not None:
         known.append(("within reach", f"{100 * one.reachable_share:.1f} % of the object"))
-    known.extend(judged_rows({"pixels": one.pixels, "ghosting": one.ghosting, "adapted": one.adapted}))
+    known.extend(judged_rows(asdict(one)))
     known.extend(refined_row(one.refined))
     known.append(
         ("photographed", datetime.fromtimestamp(one.photographed_unix_s, UTC).astimezone(zone).strftime(MOMENT))

@@ -16,6 +16,7 @@ import jinja2
 from controller.core.arrays import ByteImage
 from controller.core.plotting import font_file
 from controller.core.storage import write_atomically
+from controller.optics.solve.reach.feasibility import HELD_BACK, SMALL_PART
 from controller.optics.solve.result.metrics import as_rows
 from controller.stage.artefacts.names import REPORT_FIGURES, REPORT_PAGE
 from controller.stage.artefacts.solved import of_asked
@@ -123,7 +124,7 @@ def refined_row(figures: Any) -> tuple[tuple[str, str], ...]:
 
 
 def judged_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """An appearance's error by sets of pixels, its ghosting, and the error of its adapted target, where known."""
+    """An appearance's error by sets of pixels and of its adapted target, its ghosting, and what keeps it dark."""
     rows = as_rows(figures["pixels"]) if figures["pixels"] is not None else []
     if (ghost := figures["ghosting"]) is not None:
         both = ghost["both"]
@@ -131,6 +132,10 @@ def judged_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     if (adapted := figures["adapted"]) is not None:
         rows.append(("adapted target, median / 95 %", f"{adapted['delta_e00_median']:.2f} / "
                      f"{adapted['delta_e00_p95']:.2f}; {100 * adapted['reachable_share']:.1f} % in reach"))  # fmt: skip
+    if (held_back := figures["held_back"]) is not None and held_back > HELD_BACK:
+        rows.append(
+            ("white", f"could be {held_back:.2f} times as bright without the darkest {SMALL_PART:.0%} of the object")
+        )
     return tuple(rows)
 
 

@@ -143,8 +143,10 @@ def test_the_headline_counts_the_whole_object_and_not_only_what_was_in_reach(tmp
         name: {"delta_e00_median": median, "delta_e00_p95": 20.0, "left_out_share": left}
         for name, (median, left) in sets.items()
     }
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"pixels": pixels}))
+    beside = {"pixels": pixels, "adapted": {"delta_e00_median": 0.4}, "held_back": 1.3}
+    path.write_text(json.dumps(json.loads(path.read_text()) | beside))
     (newest,) = runs.comparisons(tmp_path, ["marble"])[0].history
     assert (newest.delta_e, newest.delta_e_p95, newest.in_reach) == (8.5, 20.0, 0.66)
     assert newest.in_reach_share == pytest.approx(0.45)
+    assert (newest.aimed, newest.held_back) == (0.4, 1.3), "beside what was aimed at, and why white is no brighter"
     assert [one.delta_e for one in runs.grades(tmp_path, 8.0)] == [8.5]

@@ -197,7 +197,7 @@ class MemoryKiosk(MemoryWork):
 
     def reach(self, target: Path) -> Reach:
         pictures = {name: self._drawn(name, 200 - 60 * at) for at, name in enumerate(("target", "result", "map"))}
-        return Reach(0.45, 0.3, 0.15, 0.05, pictures)
+        return Reach(0.45, 0.3, 0.15, 0.05, pictures, held_back=1.23)
 
     def computed(self, target: Path) -> Computed:
         return Computed(0.9, 4.1, 0.5, 0.45, 0.4, "processor", {"result": self._drawn("computed", 120)})
@@ -261,7 +261,9 @@ class MemoryKiosk(MemoryWork):
         def finish(run: str) -> None:
             for one in names:
                 before = self._comparisons[one].history if one in self._comparisons else ()
-                now = Achieved(run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81, 0.66, 0.45)
+                now = Achieved(
+                    run, BORN + 86400 * len(before), 1.25 + len(before), 3.5, 0.012, 0.81, 0.66, 0.45, 0.41, 1.23
+                )
                 kinds = ("before", "target", "achieved", "error", "resolution")
                 pictures = {kind: self._drawn(kind, 60 + 30 * at) for at, kind in enumerate(kinds)}
                 self._comparisons[one] = Comparison(one, (now, *before), pictures)

@@ -24,6 +24,8 @@ FORGIVEN_DRIVE: Final = 2e-3
 """So much drive beyond black and white still counts as in reach."""
 SMALL_PART: Final = 0.1
 """Of the object: a part so small that decides how bright all is, is named."""
+HELD_BACK: Final = 1.05
+"""From so many times as bright on, as all could be without that part."""
 MOST_BEYOND: Final = 6e4
 """float16 ends at 65504."""
 

@@ -103,7 +103,7 @@ def _compare(
 
 
 def judged(calibration: Calibration, reflectance: FloatImage, solved: Solved, picture: FloatImage) -> dict[str, Any]:
-    """What a photograph (rows, columns, 3) says beyond the pixels in reach: ``pixels``, ``ghosting``, ``adapted``.
+    """What a photograph (rows, columns, 3) says beyond the pixels in reach, and the solve's ``held_back``.
 
     Raises what ``solve.metrics.compare`` raises.
     """
@@ -116,7 +116,8 @@ def judged(calibration: Calibration, reflectance: FloatImage, solved: Solved, pi
         found = compare(picture, solved.target, matrix, white, reached)
         adapted = {"delta_e00_median": found.delta_e00_median, "delta_e00_p95": found.delta_e00_p95,
                    "reachable_share": float(reached.sum() / max(int(lit.sum()), 1))}  # fmt: skip
-    return {"pixels": as_table(sets), "ghosting": None if ghost is None else asdict(ghost), "adapted": adapted}
+    return {"pixels": as_table(sets), "ghosting": None if ghost is None else asdict(ghost), "adapted": adapted,
+            "held_back": solved.figures.get("held_back")}  # fmt: skip
 
 
 def _number(value: object) -> float | None:

@@ -18,7 +18,7 @@ from controller.optics.solve.appearance import Base, BaseChoice, base_image, sol
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
-from controller.optics.solve.reach.feasibility import SMALL_PART
+from controller.optics.solve.reach.feasibility import HELD_BACK, SMALL_PART
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.targets.values import Target
@@ -35,8 +35,6 @@ from hal.runtime.compute import free_bytes
 BASE = StepId(StepKind.BASE)
 MOSTLY: Final = 0.5
 """A target of which less is in reach is mostly out of reach."""
-HELD_BACK: Final = 1.5
-"""So many times as bright all could be, where a small part is named that keeps it dark."""
 
 
 def options_of(table: SolveTable) -> SolveOptions:
@@ -221,7 +219,7 @@ def _limits(title: str, figures: Mapping[str, object], asked: float) -> list[str
     if isinstance(held_back, float) and held_back > HELD_BACK:
         lines.append(
             f"{title}: a small dark part of the object decides how bright all is: without it, white could be "
-            f"{held_back:.1f} times as bright. Put more light or paler paint there, or give it up with "
+            f"{held_back:.2f} times as bright. Put more light or paler paint there, or give it up with "
             f"exposure_share = {max(asked - SMALL_PART, SMALL_PART):.2g} under [solve] in stage.toml."
         )
     return lines

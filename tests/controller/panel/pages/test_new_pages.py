@@ -146,6 +146,7 @@ def test_appearances_are_photographed_and_the_results_show_the_newest_and_the_hi
     assert "No appearance has been photographed yet." in text_of(fresh, "/results", "otto")
     page = compared(fresh)
     assert page.count("Colour difference, whole object") == 2
+    assert page.count("From what was aimed at</dt><dd>0.41") == page.count("White could be 1.23 times as bright") == 2
     again = compared(fresh, name="warm wood")
     wood = again[again.index(">warm wood</h3>") :]
     assert "Colour difference, whole object</dt><dd>2.25</dd>" in wood

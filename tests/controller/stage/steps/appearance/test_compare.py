@@ -179,7 +179,8 @@ def test_what_was_asked_for_counts_and_each_set_of_pixels_is_told(stage: Stage) 
         np.asarray(1.5 * solved.target, np.float32), solved.reachable.copy(), np.ones(CAMERA, np.bool_)
     )
     requested.reachable[:, : CAMERA[1] // 2] = False
-    replace(solved, asked=requested).write(stage.calibrated.folder, "gold")
+    figures = solved.figures | {"held_back": 1.23}
+    replace(solved, asked=requested, figures=figures).write(stage.calibrated.folder, "gold")
     run = stage.run(FIRST, names=("gold",))
     (gold,) = compared_in(run)
     assert gold.delta_e00_median > 3, "the photograph shows the adapted target"
@@ -192,8 +193,9 @@ def test_what_was_asked_for_counts_and_each_set_of_pixels_is_told(stage: Stage) 
     page = (run / "report.html").read_text()
     for title in ("in reach", "all lit pixels", "whole visible object", "adapted target"):
         assert f"{title}, median / 95 %" in page
+    assert "could be 1.23 times as bright without the darkest 10% of the object" in page
     (row,) = json.loads((run / "report.json").read_text())["appearances"]
-    assert row["pixels"] == gold.pixels
+    assert (row["pixels"], row["adapted"], row["held_back"]) == (gold.pixels, gold.adapted, 1.23)
 
 
 def test_a_camera_that_goes_away_costs_only_what_was_not_photographed(stage: Stage) -> None:
