@@ -35,7 +35,7 @@ from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
-from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.indirect.indirect_light import ReflectedLight
 
 Value = TypeVar("Value")
 _RUNNING: Final = threading.Lock()
@@ -58,7 +58,7 @@ class StageData:
     image: FloatImage
     solution: Solution
     black: FloatImage
-    indirect: IndirectLight | None = None
+    indirect: ReflectedLight | None = None
 
     def digest(self) -> str:
         """A hash of the contents, so that equal stages are sent only once."""

@@ -263,6 +263,11 @@ class ViewsIndirect:
     views: tuple[IndirectLight | None, ...]
     sheet: Sheet
 
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """As of ``LightTransport.arrays``."""
+        own = {v: view for v, view in enumerate(self.views) if view is not None}
+        return {f"{v}-{name}": array for v, view in own.items() for name, array in view.arrays().items()}
+
     def forward(self, direct: FloatImage, beside: FloatImage | None = None) -> FloatImage:
         """As ``IndirectLight.forward``."""
         out = np.zeros_like(direct)

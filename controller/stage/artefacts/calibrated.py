@@ -21,7 +21,7 @@ from controller.optics.solve.targets.sheets import Places, mesh_places, on_sheet
 from controller.optics.solve.targets.values import connected, pieces
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.fit import beside, fit_indirect
-from controller.optics.transport.indirect.indirect_light import IndirectLight
+from controller.optics.transport.indirect.indirect_light import IndirectLight, ReflectedLight
 from controller.optics.transport.views import Sheet, ViewsIndirect, ViewsTransport
 from controller.stage.artefacts.calibration import read_calibration
 from controller.stage.artefacts.geometry import (
@@ -137,6 +137,11 @@ class Calibrated:
             self._indirect_known = True
         return self._indirect
 
+    @property
+    def reflected(self) -> ReflectedLight | None:
+        """``indirect`` of all views."""
+        return self.indirect
+
     def read_all(self) -> None:
         """Read what is read at its first use, so that threads may use it at the same time."""
         _ = self.transport, self.indirect
@@ -152,7 +157,7 @@ class Calibrated:
     def predicted_light(self, frames: Sequence[FloatImage]) -> FloatImage:
         """What the camera sees of linear frames (rows, columns, 3), one a projector, without the black image."""
         direct = self.transport.forward(frames)
-        return direct if self.indirect is None else direct + self.indirect.forward(direct)
+        return direct if self.reflected is None else direct + self.reflected.forward(direct)
 
     @property
     def base(self) -> Base:
@@ -172,7 +177,7 @@ class Calibrated:
     @property
     def light(self) -> StageLight:
         """All that is known of the stage's light."""
-        return StageLight(self.transport, self.calibration.black, self.indirect, self.drive)
+        return StageLight(self.transport, self.calibration.black, self.reflected, self.drive)
 
     @property
     def reflectance(self) -> FloatImage:
@@ -260,11 +265,10 @@ class AllViews(Calibrated):
         return self._transport
 
     @property
-    def light(self) -> StageLight:
+    def reflected(self) -> ReflectedLight | None:
         _ = self.gains
-        indirect = tuple(view.indirect for view in self._views)
-        known = None if all(one is None for one in indirect) else ViewsIndirect(indirect, self.sheet)
-        return StageLight(self.transport, self.calibration.black, known, self.drive)
+        own = tuple(view.indirect for view in self._views)
+        return None if all(one is None for one in own) else ViewsIndirect(own, self.sheet)
 
     @property
     def base(self) -> Base:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,6 @@ from controller.run.progress import Reporter
 from controller.run.runner import Step
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.solved import read_refining, remove_refined
-from controller.stage.artefacts.views import view_folders
 from controller.stage.rig.ambient_light import dark_after
 from controller.stage.rig.rig import Rig
 from controller.stage.sessions.check import Checked
@@ -61,15 +61,10 @@ def refine(
     Nothing is published. Raises what the devices and the steps raise, where refining was ``asked``.
     """
     folder = calibrated.folder
-    if len(view_folders(folder)) > 1:
-        # what is right from one side would be wrong from the others
-        if refinement.asked and refinement.photographs:
-            reporter.say("Appearances for several views stay as they were solved.", Level.WARNING)
-        return {}
     if refinement.photographs == 0:
         with session.locked():
-            for name in titles:
-                remove_refined(folder, name)
+            for name, of_view in itertools.product(titles, calibrated.folders):
+                remove_refined(of_view, name)
         return {}
     done = () if refinement.asked else tuple(name for name in titles if _enough(folder, name, refinement.photographs))
     left = {name: title for name, title in titles.items() if name not in done}

@@ -36,7 +36,7 @@ class StageWork:
     make_steps : its steps with the lamps on, from the devices and the run's folder
     dark : refuse a bright room, if the stage has a light sensor
     plays : as in ``sessions.open.opened_rig``
-    views : the other cameras do the same steps, each in the folder of its view
+    views : the other cameras do the same steps, each in the folder of its view; else the steps may use them
     place : the only view that is photographed, and its folder; a view of its own in an earlier run
     before : steps before the lamps are struck, if they are not lit yet
     """
@@ -152,6 +152,6 @@ def _with_others(
     """The steps of the run, among them those that start and await its other views."""
     of = rig if work.views else replace(rig, others=(), absent={})
     others = OtherViews(of, journal, work.name, work.make_steps, reporter, deadline)
-    steps = list(work.make_steps(of, journal.folder))
+    steps = list(work.make_steps(rig, journal.folder))
     alone = not of.others and not of.absent and of.view == ONLY_CAMERA
     return (steps if alone or not work.views else others.around(steps)), others

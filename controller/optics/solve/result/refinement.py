@@ -85,6 +85,10 @@ class ResultPhotograph:
     first: FloatImage
     last: FloatImage
 
+    def times(self, factor: FloatImage) -> ResultPhotograph:
+        """In other units; ``factor`` (3,)."""
+        return ResultPhotograph(*(factor * one for one in (self.radiance, self.sigma, self.first, self.last)))
+
 
 @dataclass(frozen=True, slots=True)
 class RefinedStage:

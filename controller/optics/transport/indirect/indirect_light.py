@@ -49,6 +49,8 @@ class ReflectedLight(Protocol):
 
     def direct_target(self, total: FloatImage, *, reach: FloatImage | None = None) -> FloatImage: ...
 
+    def arrays(self) -> dict[str, npt.NDArray[Any]]: ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IndirectLight:

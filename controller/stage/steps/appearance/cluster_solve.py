@@ -61,7 +61,7 @@ class ClusterSolve:
 
     def _opened(self) -> SpreadAppearances:
         base, calibration = self._calibrated.base, self._calibrated.calibration
-        indirect = self._calibrated.indirect
+        indirect = self._calibrated.reflected
         stage = StageData(self._calibrated.transport, base.image, base.solution, calibration.black, indirect)
         self._spread = SpreadAppearances(self._cluster, stage)
         return self._spread

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage, Mask, summed
+from controller.core.errors import WorkError
 from controller.optics.capture.brackets import merge_brackets
 from controller.optics.capture.profile import load_profile
 from controller.optics.solve.bounded.engine import SolveContext
@@ -32,6 +34,7 @@ from controller.optics.solve.result.refinement import (
     trusted_pixels,
     without_flicker,
 )
+from controller.run.journal import Journal
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
@@ -40,6 +43,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.projectors import IndirectFigures
 from controller.stage.artefacts.solved import (
     Refining,
+    RequestedTarget,
     Solved,
     of_asked,
     read_solved,
@@ -47,11 +51,14 @@ from controller.stage.artefacts.solved import (
     write_causes,
     write_refined,
 )
+from controller.stage.artefacts.views import view_folder
 from controller.stage.rig.rig import Rig
 from controller.stage.rig.shared_display import frames_digest
 from controller.stage.steps import costs
 from controller.stage.steps.appearance.photographing import brightest, speeds, take_bracket
 from controller.stage.steps.appearance.solving import device_frames
+from hal.deadline import Cancelled
+from hal.errors import CodedError, DeviceError
 from hal.notices import Level
 from hal.runtime.compute import free_bytes
 
@@ -59,6 +66,8 @@ WORSE: Final = "the last correction was no better"
 ENOUGH: Final = "the rest is noise"
 CONFIRMED: Final = 0.25
 """A photograph confirms a correction that reaches more than this share of what it promised."""
+
+NO_FILE: Final = "camera-no-file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +144,7 @@ def _refine(
     if number == 1:
         need = refine_peak_bytes(stage_size(calibrated.calibration))
         context.reporter.say(check_memory(need, free_bytes(), f"Refining {name}"))
-    solved = read_solved(calibrated.folder, name, calibrated.projectors)
+    solved = _solved(calibrated, name)
     if number == 1:
         state = Refining(solved.linear, None, None)
     else:
@@ -144,6 +153,27 @@ def _refine(
         refinement = _Refinement(rig, calibrated, solved, name, options, context)
         state = refinement.photograph_and_correct(state, number)
     return state.write(context.folder, name, number)
+
+
+def _solved(calibrated: Calibrated, name: str) -> Solved:
+    """The appearance as it was solved for all views, in the units of the first."""
+    views = calibrated.views()
+    solved = [read_solved(folder, name, calibrated.projectors) for folder in calibrated.folders]
+    if len(solved) == 1:
+        return solved[0]
+
+    def joined(of: Callable[[Solved], Any], *, light: bool = False) -> Any:
+        gains = [view.gain if light else None for view in views]
+        images = [of(one) if gain is None else of(one) * gain for one, gain in zip(solved, gains, strict=True)]
+        return calibrated.joined(images)
+
+    asked = RequestedTarget(
+        joined(lambda one: one.requested.target, light=True),
+        joined(lambda one: one.requested.reachable),
+        joined(lambda one: one.requested.valid),
+    )
+    target = joined(lambda one: one.target, light=True)
+    return replace(solved[0], target=target, reachable=joined(lambda one: one.reachable), asked=asked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,17 +197,14 @@ class _Refinement:
         is_last = number == self.options.last
         predicted = self._predicted(state.frames)
         mask = self.solved.reachable & self.calibrated.calibration.object_mask
-        light = predicted[mask] if mask.any() else predicted.reshape(-1, 3)
-        photograph = self._photograph(state.frames, light, number)
-        parts = self._parts(state.frames)
-        trusted = trusted_pixels(photograph, predicted, self._stage, mask, parts)
-        reason = refusal(photograph, predicted, self._stage, mask, trusted)
-        if reason is not None:
-            self.context.reporter.say(f"A photograph of {self.name} was not used: {reason}.", Level.WARNING)
+        views = self._see(state.frames, predicted, mask, number)
+        if all(view.refused for view in views):
             frames = state.best if is_last and state.best is not None else state.frames
-            return replace(state, frames=frames, photographs=(*state.photographs, {"refused": reason}))
-        causes = self._equations(state, photograph, predicted, trusted)
-        photograph = without_flicker(photograph, predicted, parts, self._stage, trusted, self._flicker)
+            refused = {"refused": "; ".join(dict.fromkeys(view.refused for view in views))}
+            return replace(state, frames=frames, photographs=(*state.photographs, refused))
+        trusted = self.calibrated.joined([view.trusted for view in views])
+        causes = self._equations(state, self._joined([view.taken for view in views]), predicted, trusted)
+        photograph = self._joined([view.steady for view in views])
         error = self._error(photograph.radiance, trusted)
         row = {"delta_e00_median": error.median, "delta_e00_p95": error.p95, "delta_e00_mean": error.mean,
                "asked_median": self._of_asked(photograph.radiance, trusted),
@@ -229,7 +256,12 @@ class _Refinement:
         """
         self.context.advance(0.4, "solving again")
         transport, black = self.calibrated.transport, self.calibrated.calibration.black
-        corrected = corrected_target(self.solved.target, seen, self._stage)
+        stage = self._stage
+        images = (self.solved.target, seen.light, seen.sigma, stage.black, stage.white)
+        corrected = self.calibrated.joined([
+            corrected_target(target, ModelError(light, sigma), RefinedStage(dark, white))
+            for target, light, sigma, dark, white in (map(view.part, images) for view in self.calibrated.views())
+        ])  # fmt: skip
         indirect = predicted - black - transport.forward(self._in_order(state.frames))
         frames = solve_again(
             self.calibrated.light,
@@ -281,26 +313,85 @@ class _Refinement:
 
     def _parts(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
         """The light of each projector in ``_predicted``."""
-        transport, indirect = self.calibrated.transport, self.calibrated.indirect
+        transport, indirect = self.calibrated.transport, self.calibrated.reflected
         direct = [transport.forward_part(n, frame) for n, frame in enumerate(self._in_order(frames))]
         return direct if indirect is None else [one + indirect.forward(one) for one in direct]
 
     def _in_order(self, frames: Mapping[str, FloatImage]) -> list[FloatImage]:
         return [frames[projector] for projector in self.calibrated.projectors]
 
-    def _photograph(self, frames: Mapping[str, FloatImage], light: FloatImage, number: int) -> ResultPhotograph:
-        """Show ``frames`` and photograph them in HDR; ``light`` (pixels, 3): about what they show."""
-        if self.context.folder != self.calibrated.folder:
-            inherit_camera(self.calibrated.folder, self.context.folder)
+    def _see(
+        self, frames: Mapping[str, FloatImage], predicted: FloatImage, mask: Mask, number: int
+    ) -> list[_SeenResult]:
+        """Show ``frames``, ``predicted`` by the transport, and photograph them with each view's camera.
+
+        A view without a photograph that can be used is not corrected. A fault of the first camera, or of a lamp, is
+        raised.
+        """
         shown = device_frames(self.calibrated.calibration, self._in_order(frames))
         presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
-        available_s, profile = self.rig.acquirer.exposures_s(), load_profile(self.context.folder)
+        names, parts, stage, views = self.calibrated.names, self._parts(frames), self._stage, []
+        rigs = {other.name: self.rig.seen_by(other) for other in self.rig.others}
+        rigs[self.rig.view if self.rig.view in names else names[0]] = self.rig
+        for name, view in zip(names, self.calibrated.views(), strict=True):
+            own_mask, own = view.part(mask), view.part(predicted)
+            trusted, steady = np.zeros_like(own_mask), ResultPhotograph(*(np.full_like(own, np.nan),) * 4)
+            try:
+                if name not in rigs:
+                    absent = self.rig.absent.get(name)
+                    what = "no camera stands there now." if absent is None else absent.what
+                    raise WorkError(NO_FILE, what=what, remedy="See to the camera, and run the same command again.")
+                light = view.own_light(predicted)[own_mask if own_mask.any() else ...].reshape(-1, 3)
+                taken = self._photograph(rigs[name], name, light, number, presented_s, frames_digest(shown))
+            except (DeviceError, WorkError) as error:
+                self._raise_if_for_all(error, rigs.get(name))
+                taken, refused = steady, error.what
+            else:
+                taken = taken if view.gain is None else taken.times(view.gain)
+                of_view = RefinedStage(view.part(stage.black), view.part(stage.white))
+                lit = [view.part(part) for part in parts]
+                found = trusted_pixels(taken, own, of_view, own_mask, lit)
+                refused = refusal(taken, own, of_view, own_mask, found) or ""
+                if not refused:
+                    trusted, steady = found, without_flicker(taken, own, lit, of_view, found, self._flicker)
+            views.append(_SeenResult(taken, steady, trusted, refused))
+            if refused:
+                where = f" from view {name}" if len(names) > 1 else ""
+                text = f"A photograph of {self.name}{where} was not used: {refused.removesuffix('.')}."
+                self.context.reporter.say(text, Level.WARNING)
+        return views
+
+    def _raise_if_for_all(self, error: CodedError, rig: Rig | None) -> None:
+        """Raise what concerns more than the camera of one view that is not the first."""
+        if isinstance(error, Cancelled) or rig is self.rig or (isinstance(error, WorkError) and error.code != NO_FILE):
+            raise error
+        self.rig.check_light(deadline=self.context.deadline)
+
+    def _joined(self, views: Sequence[ResultPhotograph]) -> ResultPhotograph:
+        """One photograph of each view's."""
+        images = ([getattr(one, part.name) for one in views] for part in fields(ResultPhotograph))
+        return ResultPhotograph(*(self.calibrated.joined(own) for own in images))
+
+    def _photograph(
+        self, rig: Rig, view: str, light: FloatImage, number: int, presented_s: float, frames: str
+    ) -> ResultPhotograph:
+        """Photograph what is shown since ``presented_s`` in HDR with the camera of a view, in its own units.
+
+        ``light`` (pixels, 3): about what it sees; ``frames``: their digest
+        """
+        n = self.calibrated.names.index(view)
+        folder = view_folder(self.context.folder, view) if n else self.context.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        if folder != self.calibrated.folders[n]:
+            inherit_camera(self.calibrated.folders[n], folder)
+        available_s, profile = rig.acquirer.exposures_s(), load_profile(folder)
         longest_s = self.options.longest_exposure_s
         wanted_s = speeds(brightest(light), available_s, longest_s, profile, light=light, shorter=2)
-        taken = take_bracket(
-            self.rig, self.context, StepKind.REFINE, f"{number}-{self.name}", (*wanted_s, wanted_s[0]),
-            shown_at_s=presented_s, of={"frames": frames_digest(shown)},
-        )  # fmt: skip
+        with Journal(folder) if n else contextlib.nullcontext(self.context.journal) as journal:
+            taken = take_bracket(
+                rig, replace(self.context, folder=folder, journal=journal), StepKind.REFINE, f"{number}-{self.name}",
+                (*wanted_s, wanted_s[0]), shown_at_s=presented_s, of={"frames": frames},
+            )  # fmt: skip
         exposures_s = [one.exposure_s for one in taken]
         images = [one.measured() for one in taken]
         noise = taken[0].profile.noise if taken[0].profile is not None else None
@@ -309,13 +400,28 @@ class _Refinement:
         return ResultPhotograph(merged.radiance, merged.sigma, first, last)
 
 
+@dataclass(frozen=True, slots=True)
+class _SeenResult:
+    """What a view's photograph of a result says, in the units of all views.
+
+    ``taken``, and ``steady``: without flicker; both NaN where there is nothing
+    ``trusted`` (rows, columns): its pixels that count; ``refused``: why none does, else ""
+    """
+
+    taken: ResultPhotograph
+    steady: ResultPhotograph
+    trusted: Mask
+    refused: str
+
+
 def _keep(calibrated: Calibrated, name: str, options: RefineOptions, context: Context) -> Sequence[Path]:
     found = Refining.read(context.folder, name, options.last, calibrated.projectors)
     figures = _figures(found, options.photographs)
     linear = [found.frames[projector] for projector in calibrated.projectors]
     frames = device_frames(calibrated.calibration, linear)
     context.reporter.say(sentence(name, figures), Level.INFO if figures["before"] is not None else Level.WARNING)
-    return write_refined(calibrated.folder, name, frames, found.frames, figures)
+    paths = [write_refined(folder, name, frames, found.frames, figures) for folder in calibrated.folders]
+    return [path for of_view in paths for path in of_view]
 
 
 def _figures(found: Refining, asked: int) -> dict[str, Any]:

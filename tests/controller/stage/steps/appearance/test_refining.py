@@ -16,6 +16,7 @@ from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.calibrate.values import Calibration
+from controller.optics.capture.acquire import Acquirer
 from controller.optics.capture.raw import develop
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.metrics import compare
@@ -23,7 +24,7 @@ from controller.optics.transport import build_transport
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import AllViews, Calibrated
 from controller.stage.artefacts.solved import (
     Refining,
     RequestedTarget,
@@ -32,7 +33,10 @@ from controller.stage.artefacts.solved import (
     read_solved,
     remove_refined,
 )
+from controller.stage.artefacts.views import view_folder
 from controller.stage.report.page import refined_row
+from controller.stage.rig.rig import RigCamera
+from controller.stage.rig.shared_display import SharedDisplay
 from controller.stage.steps.appearance import refining
 from controller.stage.steps.appearance.refining import RefineOptions, refine_steps
 from controller.stage.steps.appearance.solving import device_frames
@@ -145,6 +149,8 @@ class Told(Silent):
 class Stage:
     folder: Path
     told: Told = field(default_factory=Told)
+    calibrated: Calibrated = field(init=False)
+    second: SeeingCamera = field(init=False)
 
     def __post_init__(self) -> None:
         run = self.folder / "runs" / "20260101-100000-calibrate"
@@ -356,3 +362,84 @@ def test_what_a_round_leaves_is_read_as_it_was_written(tmp_path: Path) -> None:
         if read.best is not None and one.best is not None and read.error is not None:
             assert all(np.array_equal(read.best[name], one.best[name]) for name in NAMES)
             assert np.array_equal(read.error, error, equal_nan=True)
+
+
+UNITS = np.array([0.8, 1.25, 1.1], np.float32)
+"""A second camera's light of each colour, in that of the first."""
+
+
+class SecondCamera(SeeingCamera):
+    """It photographs from another place, with other colours."""
+
+    def seen(self, light: Light) -> FloatImage:
+        return np.asarray(UNITS * super().seen(light), np.float32)
+
+
+class TwoViews(AllViews):
+    def __init__(self, run: Path) -> None:
+        folders = {"front": run, "side": view_folder(run, "side")}
+        super().__init__(folders, NAMES)
+        self._views = [Known(folder) for folder in folders.values()]
+        known = calibration()
+        parts = tuple(replace(part, white=UNITS * part.white) for part in known.projectors)
+        self._views[1]._calibration = replace(known, projectors=parts, black=UNITS * known.black)
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Stage:
+    stage = Stage(tmp_path)
+    calibrated = TwoViews(stage.calibrated.folder)
+    (own := calibrated.folders[1]).mkdir(parents=True)
+    stage.solved.seen(lambda image: image, calibrated.gains[1]).write(own, NAME)
+    stage.calibrated = calibrated
+    stage.second = SecondCamera(display=stage.display)
+    acquirer = Acquirer(stage.display, stage.second, iso=100, aperture_f=None, settle_s=0.0)
+    other = RigCamera("side", stage.second, acquirer, SharedDisplay(stage.display).seat())
+    stage.rig = replace(stage.rig, others=(other,))
+    return stage
+
+
+def test_several_views_are_photographed_and_corrected_together(two: Stage) -> None:
+    own = two.calibrated.folders[1]
+    before = two.error()
+    figures = two.refine(1)
+    assert (len(two.camera.taken), len(two.second.taken)) == (6, 6)
+    assert len(two.display.shown) == 3, "each picture is shown once for both, and once for this test"
+    assert two.error() < 0.5 * before
+    assert figures["photographs"][0]["left_out_share"] < 0.2
+    assert read_refining(own, NAME) == figures
+    assert same(read_solved(own, NAME, NAMES), two.present())
+    np.testing.assert_allclose(read_solved(own, NAME, NAMES).target, UNITS * target(), rtol=0.03)
+
+
+def test_what_only_another_view_sees_is_corrected_too(two: Stage) -> None:
+    """Half of the first camera's picture can't be used: the second one knows what is there."""
+
+    def half(light: FloatImage) -> FloatImage:
+        spoiled = indirect(light)
+        spoiled[:, 30:62] = EXPOSURE * np.array([0.4, 0.24, 0.18], np.float32)
+        return spoiled
+
+    two.camera.lights = [half]
+    before = two.error()
+    two.refine(1)
+    reason = "something moved or stood in the picture"
+    assert two.told.said[1] == f"A photograph of {NAME} from view front was not used: {reason}."
+    assert two.error() < 0.7 * before
+
+
+def test_a_view_whose_camera_fails_stays_and_is_named(two: Stage) -> None:
+    before = two.error()
+    two.second.gone_after = 0
+    two.refine(1)
+    assert two.told.said[1:3] == [f"A photograph of {NAME} from view side was not used: The camera is gone."] * 2
+    assert two.error() < 0.7 * before
+    two.rig = replace(two.rig, others=())
+    two.refine(1, "20260103-100000-refine")
+    assert f"A photograph of {NAME} from view side was not used: no camera stands there now." in two.told.said
+
+
+def test_a_first_camera_that_fails_ends_the_refining(two: Stage) -> None:
+    two.camera.gone_after = 0
+    with pytest.raises(DeviceGone):
+        two.refine(1)
