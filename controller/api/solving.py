@@ -16,6 +16,7 @@ from controller.optics.solve import appearance
 from controller.optics.solve.appearance import Base
 from controller.optics.solve.bounded.equations import MOST_ITERATIONS, TOLERANCE, Solution, SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
+from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import expose_target, target_radiance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import LightTransport
@@ -62,7 +63,7 @@ def reachable_target(
     """
     wanted = as_light(picture)
     dark = _black(black, wanted)
-    found = expose_target(transport, wanted, dark, share=share, indirect=indirect)
+    found = expose_target(DriveLevels.of_transport(transport), wanted, dark, share=share, indirect=indirect)
     radiance, direct = (target_radiance(image, dark, 1.0) for image in (found.wanted, found.needed))
     return ReachableTarget(radiance, found.exposure, found.possible.reachable, found.possible.share, direct)
 

@@ -112,7 +112,7 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
         if key not in _kept:
             _kept.clear()  # keep one stage only: it fills a worker's memory
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
-            _kept[key] = base, DriveLevels(stage.transport)
+            _kept[key] = base, DriveLevels.of_transport(stage.transport)
         base, drive = _kept[key]
         light = StageLight(stage.transport, stage.black, stage.indirect, drive)
         engine = choose_engine("cpu", lambda note: None, options.method)

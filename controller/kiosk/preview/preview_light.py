@@ -6,9 +6,7 @@ a preview calculates the same as a computation, at fewer places.
 
 from __future__ import annotations
 
-import io
 import threading
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,20 +14,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage, load_arrays, save_arrays
+from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.stage.artefacts.outline import outline_digest
 
 if TYPE_CHECKING:
     from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.operator import SampledLight
     from controller.stage.artefacts.calibrated import Calibrated
 
 FOLDER: Final = "kiosk/preview"
 LONGEST_PX: Final = 480
 """About the longer side of what is calculated; the pictures are for a screen."""
-_UNREADABLE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
 _known: dict[str, PreviewLight] = {}
 _lock = threading.Lock()
 
@@ -40,7 +37,6 @@ class PreviewLight:
     picture, of which every ``step``-th pixel is here.
     """
 
-    transport: SampledLight
     drive: DriveLevels
     indirect: IndirectLight | None
     black: FloatImage
@@ -67,7 +63,7 @@ def preview_light(stage: Path, run: Path, names: tuple[str, ...]) -> PreviewLigh
                 file.parent.mkdir(parents=True, exist_ok=True)
                 for old in file.parent.glob("*"):
                     old.unlink(missing_ok=True)
-                write_atomically(file, _bytes(found))
+                save_arrays(file, _arrays(found))
                 write_atomically(file.with_suffix(".png"), _in_white(calibrated))
             _known.clear()
             _known[name] = found
@@ -93,28 +89,24 @@ def view_picture(stage: Path, run: Path, names: tuple[str, ...]) -> Path:
 
 def sampled(calibrated: Calibrated) -> PreviewLight:
     """The light of a whole calibration at about ``LONGEST_PX`` pixels along its longer side."""
-    from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.operator import SampledLight
 
-    whole, indirect = calibrated.transport, calibrated.indirect
-    rows, columns = whole.camera_shape
+    indirect = calibrated.indirect
+    rows, columns = calibrated.transport.camera_shape
     # Blocks of indirect light must have a whole number of samples along their side.
     side = 1 if indirect is None else indirect.side
     inside = max(1, round(side * min(1.0, LONGEST_PX / max(rows, columns))))
     step = side / inside if indirect is not None else max(1.0, max(rows, columns) / LONGEST_PX)
     at = _samples(rows, step), _samples(columns, step)
     kept = np.ix_(*at)
-    transport = SampledLight.of(whole, at)
     coarse = None if indirect is None else IndirectLight(
         indirect.factors, indirect.scale[kept], indirect.lit[kept], indirect.grid, inside,
         paint=None if indirect.paint is None else indirect.paint[:, :, at[0]][..., at[1]],
     )  # fmt: skip
     calibration = calibrated.calibration
     black = np.ascontiguousarray(calibration.black[kept])
-    return PreviewLight(
-        transport, DriveLevels(transport), coarse, black, calibration.camera_to_xyz, (columns, rows), step
-    )
+    drive = calibrated.drive.at(*at)
+    return PreviewLight(drive, coarse, black, calibration.camera_to_xyz, (columns, rows), step)
 
 
 def _samples(pixels: int, step: float) -> npt.NDArray[np.int64]:
@@ -133,39 +125,32 @@ def _in_white(calibrated: Calibrated) -> bytes:
     return png(to_screen(lit, calibration.camera_to_xyz, white=level))
 
 
-def _bytes(light: PreviewLight) -> bytes:
-    parts: dict[str, Any] = {f"transport_{name}": part for name, part in light.transport.arrays().items()}
-    if light.indirect is not None:
-        parts |= {f"indirect_{name}": part for name, part in light.indirect.arrays().items()}
-    out = io.BytesIO()
-    np.savez(out, black=light.black, camera_to_xyz=light.camera_to_xyz, camera_px=np.array(light.camera_px),
-             step=np.array(light.step), **parts)  # fmt: skip
-    return out.getvalue()
+def _arrays(light: PreviewLight) -> dict[str, npt.NDArray[Any]]:
+    own = {"black": light.black, "camera_to_xyz": light.camera_to_xyz}
+    numbers = {"camera_px": np.array(light.camera_px), "step": np.array(light.step)}
+    levels = {name: getattr(light.drive, name) for name in ("mask", "matrices", "segment_share")}
+    indirect = {} if light.indirect is None else light.indirect.arrays()
+    return own | numbers | levels | {f"indirect_{name}": part for name, part in indirect.items()}
 
 
 def _read(file: Path) -> PreviewLight | None:
-    """What an earlier service has kept; None if it is not there or damaged."""
+    """What an earlier service has kept; None if it is not there, damaged or of an earlier version."""
     from controller.optics.solve.reach.drive_levels import DriveLevels
     from controller.optics.transport.indirect.indirect_light import IndirectLight
-    from controller.optics.transport.operator import SampledLight
 
     try:
-        with np.load(file) as parts:
-            transport = SampledLight.made(
-                parts["transport_mixing"], parts["transport_lit"], parts["transport_white"],
-                tuple(map(float, parts["transport_segments"])),
+        parts = load_arrays(file)
+        drive = DriveLevels(parts["mask"], parts["matrices"], parts["segment_share"])
+        width, height = map(int, parts["camera_px"])
+        indirect = None
+        if "indirect_grid" in parts:
+            rows, columns, side = map(int, parts["indirect_grid"])
+            indirect = IndirectLight(
+                parts["indirect_factors"], parts["indirect_scale"], parts["indirect_lit"], (rows, columns), side,
+                paint=parts.get("indirect_paint"),
             )  # fmt: skip
-            indirect = None
-            if "indirect_grid" in parts:
-                rows, columns, side = map(int, parts["indirect_grid"])
-                indirect = IndirectLight(
-                    parts["indirect_factors"], parts["indirect_scale"], parts["indirect_lit"], (rows, columns), side,
-                    paint=parts.get("indirect_paint"),
-                )  # fmt: skip
-            width, height = map(int, parts["camera_px"])
-            return PreviewLight(
-                transport, DriveLevels(transport), indirect, parts["black"], parts["camera_to_xyz"], (width, height),
-                float(parts["step"]),
-            )  # fmt: skip
-    except _UNREADABLE:
+        return PreviewLight(
+            drive, indirect, parts["black"], parts["camera_to_xyz"], (width, height), float(parts["step"])
+        )
+    except (UsageError, KeyError, ValueError):
         return None

@@ -95,7 +95,6 @@ def _kept(folder: Path, about: dict[str, Any]) -> Reach | None:
 
 def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     from controller.kiosk.preview.preview_light import preview_light
-    from controller.optics.solve.appearance import StageLight
     from controller.optics.solve.reach.feasibility import with_less_light
     from controller.optics.solve.request import aim_at
     from controller.optics.solve.result.metrics import visible_object
@@ -103,10 +102,8 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
 
     light = preview_light(checked.stage.folder, run, checked.names)
     wanted = _wanted(light, target)
-    stage_light = StageLight(light.transport, light.black, light.indirect, light.drive)
-    options = options_of(checked.stage.tables.solve)
-    aim = aim_at(stage_light, wanted.image, options)
-    lit = light.transport.object_mask
+    aim = aim_at(light.drive, light.black, light.indirect, wanted.image, options_of(checked.stage.tables.solve))
+    lit = light.drive.mask
     seen = visible_object(lit)
     folder.mkdir(parents=True, exist_ok=True)
     grey, alike = _drawn(folder, light, aim, seen)
@@ -116,7 +113,7 @@ def _made(checked: Checked, run: Path, target: Path, folder: Path) -> Reach:
     share = {name: float((mask & seen).sum() / area) for name, mask in kinds.items()}
     pictures = {name: folder / file for name, file in FILES.items()}
     _, less, less_share = with_less_light(
-        light.transport, wanted, light.black, drive=light.drive, exposure=aim.exposure, indirect=light.indirect
+        light.drive, wanted, light.black, exposure=aim.exposure, indirect=light.indirect
     )
     return Reach(
         share["share"], share["too_bright"], share["too_dark"], share["too_colourful"], pictures, round(light.step),
@@ -128,7 +125,7 @@ def _wanted(light: PreviewLight, target: Path) -> Target:
     from controller.optics.solve.targets.files import load_target
     from controller.optics.solve.targets.values import Target
 
-    rows, columns = light.transport.camera_shape
+    rows, columns = light.drive.mask.shape
     if target.suffix == ".npz":
         # Rendered for these very samples, by ``scenes``.
         arrays = load_arrays(target)
@@ -178,7 +175,7 @@ def _drawn(folder: Path, of: PreviewLight, aim: Aim, seen: Mask) -> tuple[ByteIm
     from controller.optics.solve.result.metrics import colour_difference
     from controller.stage.report.pictures import to_screen
 
-    light: FloatImage = np.clip(aim.direct - of.black, 0, of.transport.reach())
+    light: FloatImage = np.clip(aim.direct - of.black, 0, of.drive.reach)
     made = light if of.indirect is None else light + of.indirect.forward(light)
     out = seen & ~aim.asked_possible.reachable
     difference = colour_difference(of.black + made, aim.asked, of.camera_to_xyz, aim.exposure, out)

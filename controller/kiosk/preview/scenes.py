@@ -118,13 +118,13 @@ def _render(checked: Checked, run: Path, kept: Path, scene: str | Path) -> None:
         write_job(work, geometry, transport.object_mask, transport.reach(),
                   scene=scene, settings=settings, view=view)  # fmt: skip
         picture = read_picture(render(blender, work, lambda share, note: None))
-    target = as_seen(picture, view, light.transport.object_mask)
+    target = as_seen(picture, view, light.drive.mask)
     save_arrays(kept, {"image": target.image, "mask": target.mask})
 
 
 def _small(camera: Pinhole, light: PreviewLight) -> Pinhole:
     """The calibrated camera with as many pixels as the preview has."""
-    rows, columns = light.transport.camera_shape
+    rows, columns = light.drive.mask.shape
     matrix = camera.matrix.copy()
     matrix[:2] /= light.step
     # Pixel centres lie at whole numbers, in the large picture and in the small one.

@@ -61,6 +61,10 @@ class StageLight:
     indirect: ReflectedLight | None = None
     drive: DriveLevels | None = None
 
+    def levels(self, folder: Path | None = None) -> DriveLevels:
+        """Of this transport; ``folder`` as of ``DriveLevels``, where they are not known already."""
+        return DriveLevels.of_transport(self.transport, folder) if self.drive is None else self.drive
+
 
 @dataclass(frozen=True, slots=True)
 class Base:
@@ -190,7 +194,7 @@ def scale_frames(
     Exact where C_t / C_b has no detail finer than one projector's pixels (paper 3.3).
     Raises UsageError("image-wrong-size", "target-not-finite").
     """
-    check_target(transport, target)
+    check_target(transport.camera_shape, target)
     light = planes_above(target, black)
     out = (engine or Processor()).scaled(transport, light, base.inverse, base.mixed, base.coverage)
     return plane_frames(out, transport.sizes)
@@ -245,7 +249,7 @@ def make_appearance(
     A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 8).
     """
     transport, black = light.transport, light.black
-    check_target(transport, target)
+    check_target(transport.camera_shape, target)
     if mode == "scale":
         assert base is not None, "a scale needs a base"
         scaled = scale_frames(transport, base, target, black, engine=context.engine)
@@ -295,7 +299,7 @@ def exposed_for_one(
     the comparison would only show that one lamp is darker than several. Raises what ``expose_target`` raises.
     """
     alone = build_transport(dataclasses.replace(calibration, projectors=(calibration.projectors[n],)))
-    return expose_target(alone, picture, calibration.black, share=share, indirect=indirect)
+    return expose_target(DriveLevels.of_transport(alone), picture, calibration.black, share=share, indirect=indirect)
 
 
 def _sampled(

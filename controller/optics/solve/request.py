@@ -39,6 +39,7 @@ from controller.optics.solve.reach.feasibility import (
     target_radiance,
 )
 from controller.optics.solve.targets.values import Target
+from controller.optics.transport.indirect.indirect_light import ReflectedLight
 
 ADVICE_FULL_SOLVE = (
     'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
@@ -47,7 +48,6 @@ ADVICE_FULL_SOLVE = (
 
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
-LET_GO: Final = np.empty((0, 0, 3), np.float32)
 FIRST_TOLERANCE: Final = 2 * APPEARANCE_TOLERANCE
 """Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
@@ -117,11 +117,10 @@ def solve_appearance(
     ``base``: only of use in the mode "scale"
 
     With ``light.indirect`` the frames leave room in the target for the light by way of other surfaces.
-    Raises what ``choose_exposure`` and ``solve_bounded`` raise.
+    Raises what ``exposures`` and ``solve_bounded`` raise.
     """
-    if light.drive is None:
-        light = replace(light, drive=DriveLevels(light.transport, context.folder))
-    aim = aim_at(light, requested.image, replace(options, exposure=requested.exposure), context.folder)
+    drive, exposed = light.levels(context.folder), replace(options, exposure=requested.exposure)
+    aim = aim_at(drive, light.black, light.indirect, requested.image, exposed, context.folder)
     valid = requested.mask
     del requested  # the picture is large, and of no more use
     began_s = time.perf_counter()
@@ -156,67 +155,41 @@ class Aim:
     figures: dict[str, float | int | str | None]
 
 
-class _ExposedPicture:
-    """A picture on its way to an aim.
-
-    All parts are as large as the camera's picture, so what is of no more use is let go before the next one is made.
-
-    ``asked``, ``wanted``: the picture at its exposure, and bent into what the stage can make
-    ``needed``: what of ``wanted`` has to come from the projectors directly, with the black image
-    ``possible``: how ``needed`` lies in what they can make
-    """
-
-    def __init__(self, light: StageLight, picture: FloatImage, options: SolveOptions, folder: Path | None) -> None:
-        exposed = expose_target(
-            light.transport, picture, light.black,
-            share=options.share, drive=light.drive, indirect=light.indirect, asked=options.exposure,
-        )  # fmt: skip
-        self._light, self._folder = light, folder
-        self._drive = light.drive or DriveLevels(light.transport, folder)
-        self.asked = self.wanted = moved_to_file(exposed.wanted, folder)
-        self.exposure, self.needed, self.possible = exposed.exposure, exposed.needed, exposed.possible
-        self.held_back = exposed.held_back
-
-    def adapt(self, strength: float) -> None:
-        """Bend ``wanted`` into what the stage can make, around what ``needed`` throws back."""
-        self.wanted = self._bent(strength)
-        self.needed = direct_part(self._drive.reach, self.wanted, self._light.black, self._light.indirect)
-
-    def _bent(self, strength: float) -> FloatImage:
-        floor = self._floor()
-        self.wanted = self.needed = LET_GO
-        bent = adapted_target(self._light.transport, self.asked, floor, strength=strength, drive=self._light.drive)
-        return moved_to_file(bent, self._folder)
-
-    def _floor(self) -> FloatImage:
-        """What is there (rows, columns, 3) without any projector's direct light, where ``needed`` is shown around."""
-        light = self._light
-        if light.indirect is None:
-            return light.black
-        return light.black + light.indirect.forward(np.clip(self.needed - light.black, 0, self._drive.reach))
-
-
-def aim_at(light: StageLight, picture: FloatImage, options: SolveOptions, folder: Path | None = None) -> Aim:
+def aim_at(
+    drive: DriveLevels,
+    black: FloatImage,
+    indirect: ReflectedLight | None,
+    picture: FloatImage,
+    options: SolveOptions,
+    folder: Path | None = None,
+) -> Aim:
     """Expose a picture, see what of it is in reach, and adapt it if asked.
 
     With indirect light all of this is asked of the direct light that the picture leaves to be made. A pixel is too
     dark, too, where more indirect light falls than is wanted. ``folder``: as of ``SolveContext``. Raises what
-    ``choose_exposure`` raises.
+    ``exposures`` raises.
     """
-    exposed = _ExposedPicture(light, picture, options, folder)
-    asked_possible = exposed.possible
+    exposed = expose_target(drive, picture, black, share=options.share, indirect=indirect, asked=options.exposure)
+    exposure, needed, possible = exposed.exposure, exposed.needed, exposed.possible
+    asked = wanted = moved_to_file(exposed.wanted, folder)
     figures: dict[str, float | int | str | None] = {
-        "exposure": exposed.exposure,
-        "reachable_share": asked_possible.share,
-        "held_back": exposed.held_back,
-    }
+        "exposure": exposure, "reachable_share": possible.share, "held_back": exposed.held_back,
+    }  # fmt: skip
+    asked_possible = possible
+    del exposed  # all parts are as large as the camera's picture: what is of no more use is let go
     if options.adapt > 0:
-        for _ in range(1 if light.indirect is None else ADAPTATIONS):
-            exposed.adapt(options.adapt)
-        exposed.possible = feasibility(light.transport, exposed.needed, light.black, drive=light.drive)
-        figures |= {"adapted_share": exposed.possible.share}
-    direct = moved_to_file(target_radiance(exposed.needed, light.black, 1.0), folder)
-    return Aim(exposed.wanted, direct, exposed.possible, exposed.asked, asked_possible, exposed.exposure, figures)
+        for _ in range(1 if indirect is None else ADAPTATIONS):
+            # what is there without any direct light of the projectors, where ``needed`` is shown around
+            floor = np.subtract(wanted, needed)
+            floor += black
+            del wanted, needed
+            wanted = moved_to_file(adapted_target(drive, asked, floor, strength=options.adapt), folder)
+            del floor
+            needed = direct_part(drive.reach, wanted, black, indirect)
+        possible = feasibility(drive, needed, black)
+        figures |= {"adapted_share": possible.share}
+    direct = moved_to_file(target_radiance(needed, black, 1.0), folder)
+    return Aim(wanted, direct, possible, asked, asked_possible, exposure, figures)
 
 
 def _solved(light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:

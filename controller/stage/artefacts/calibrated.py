@@ -171,7 +171,7 @@ class Calibrated:
     @property
     def drive(self) -> DriveLevels:
         if self._drive is None:
-            self._drive = DriveLevels(self.transport, self.folder)
+            self._drive = DriveLevels.of_transport(self.transport, self.folder)
         return self._drive
 
     @property

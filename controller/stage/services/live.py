@@ -149,9 +149,7 @@ def _ready(checked: Checked, calibrated: Calibrated, reporter: Reporter) -> Read
     black = calibrated.calibration.black
     white: FloatImage = np.ones_like(black)
     share = checked.stage.tables.solve.exposure_share
-    brightness, _ = exposures(
-        calibrated.transport, white, black, share=share, drive=calibrated.drive, indirect=calibrated.indirect
-    )
+    brightness, _ = exposures(calibrated.drive, white, black, share=share, indirect=calibrated.indirect)
     reporter.say(f"White of a target has the radiance {brightness:.7g}.")
     return Ready(maps, brightness, _in_bundle(checked, calibrated.folder.name))
 

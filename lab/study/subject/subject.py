@@ -90,7 +90,7 @@ class Subject:
     @property
     def drive(self) -> DriveLevels:
         if self._drive is None:
-            self._drive = DriveLevels(self.transport)
+            self._drive = DriveLevels.of_transport(self.transport)
         return self._drive
 
     @property
@@ -117,9 +117,9 @@ class Subject:
         ``transport``: of the projectors that are to reach it alone; else all of them. The mask is what they reach.
         """
         black = self.calibration.black
-        drive = self.drive if transport is None else DriveLevels(transport)
+        drive = self.drive if transport is None else DriveLevels.of_transport(transport)
         transport = self.transport if transport is None else transport
-        found = expose_target(transport, target.image, black, share=share, drive=drive, indirect=self.indirect)
+        found = expose_target(drive, target.image, black, share=share, indirect=self.indirect)
         mask: Mask = found.possible.reachable & target.mask
         radiance, direct = (target_radiance(image, black, 1.0) for image in (found.wanted, found.needed))
         return ReachableTarget(radiance, mask, found.exposure, direct, target.mask, target.softened)

@@ -22,6 +22,7 @@ from controller.core.colour import linear_to_srgb
 from controller.demo import DemoStage, prepare
 from controller.optics.solve.bounded.equations import SolveSettings, appearance_weights
 from controller.optics.solve.bounded.solver import solve_bounded
+from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import expose_target, target_radiance
 from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.transport import build_transport
@@ -119,7 +120,7 @@ def _alone(stage: Path, run: Path) -> tuple[float, float]:
     whole = calibrated.calibration
     one = dataclasses.replace(whole, projectors=whole.projectors[:1])
     transport = build_transport(one)
-    asked = expose_target(transport, _smooth(whole.black.shape), whole.black, share=SHARE)
+    asked = expose_target(DriveLevels.of_transport(transport), _smooth(whole.black.shape), whole.black, share=SHARE)
     radiance, direct = (target_radiance(image, whole.black, 1.0) for image in (asked.wanted, asked.needed))
     mask = asked.possible.reachable & transport.object_mask
     settings = SolveSettings(weights=appearance_weights(radiance, mask, asked.exposure))

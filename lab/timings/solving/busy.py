@@ -20,12 +20,14 @@ SOLVE: Final = """
 import sys, time
 from lab.timings.tools.synthetic import synthetic_calibration, synthetic_target
 from controller.optics.solve.appearance import base_image, solve_base
-from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
 from controller.optics.transport import build_transport
 calibration = synthetic_calibration(sys.argv[1])
 transport = build_transport(calibration)
 reflectance = synthetic_target(transport.camera_shape)
-target = target_radiance(reflectance, calibration.black, choose_exposure(transport, reflectance, calibration.black))
+exposure, _ = exposures(DriveLevels.of_transport(transport), reflectance, calibration.black)
+target = target_radiance(reflectance, calibration.black, exposure)
 solve_base(transport, target, calibration.black)
 for _ in sys.stdin:
     began = time.perf_counter()

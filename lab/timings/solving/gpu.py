@@ -26,7 +26,8 @@ from controller.optics.solve.bounded.equations import Solution, SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.gpu.device import Device, adapters
 from controller.optics.solve.gpu.engine import GpuEngine
-from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
 from controller.optics.transport import LightTransport
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import projectors_of
@@ -82,7 +83,8 @@ class Stage:
 
     def target(self) -> FloatImage:
         reflectance = synthetic_target(self.transport.camera_shape)
-        return target_radiance(reflectance, self.black, choose_exposure(self.transport, reflectance, self.black))
+        exposure, _ = exposures(DriveLevels.of_transport(self.transport), reflectance, self.black)
+        return target_radiance(reflectance, self.black, exposure)
 
     def solved(self, engine: Engine, wanted: FloatImage, sweeps: int | None = None) -> Solution:
         """As it stops by itself, or after so many sweeps."""

@@ -28,7 +28,8 @@ from controller.optics.solve.bounded.regions import (
     solve_regions,
 )
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
 from controller.optics.transport import LightTransport, build_transport
 from hal.runtime.compute import usable_cpus
 from lab.timings import Row, Timing, at_least, at_most
@@ -67,7 +68,8 @@ def _unmixed(calibration: Calibration) -> Calibration:
 
 def _target(transport: LightTransport, black: FloatImage) -> FloatImage:
     reflectance = synthetic_target(transport.camera_shape)
-    return target_radiance(reflectance, black, choose_exposure(transport, reflectance, black))
+    exposure, _ = exposures(DriveLevels.of_transport(transport), reflectance, black)
+    return target_radiance(reflectance, black, exposure)
 
 
 def _times(calibration: Calibration, kind: str, gap: float, *, paper: bool) -> list[Row]:

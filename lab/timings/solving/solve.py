@@ -12,7 +12,8 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import Base, base_image, scale_frames, solve_base
-from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.scaling.interactive import interactive
 from controller.optics.transport import LightTransport, build_transport
@@ -47,7 +48,7 @@ def measure(size: str) -> list[Row]:
     rows = [at_most("light transport, build", build_s, None, unit="s", how="once, compiling included")]
     rows += _products(transport, paper=paper)
     reflectance = synthetic_target(transport.camera_shape)
-    exposure = choose_exposure(transport, reflectance, calibration.black)
+    exposure, _ = exposures(DriveLevels.of_transport(transport), reflectance, calibration.black)
     target = target_radiance(reflectance, calibration.black, exposure)
     rows += _solve(transport, calibration, target, paper=paper)
     return rows

@@ -10,7 +10,8 @@ from controller.core.arrays import ByteImage, FloatImage
 from controller.optics.calibrate.values import Radiometry
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.reach.feasibility import choose_exposure, target_radiance
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.transport import build_transport
 from controller.stage.steps.appearance.solving import device_frames
@@ -38,7 +39,7 @@ def compensation_frames(size: str, appearances: int) -> list[dict[str, ByteImage
     found = []
     for number in range(appearances):
         target = _turned(synthetic_target(shape), number)
-        exposure = choose_exposure(transport, target, calibration.black)
+        exposure, _ = exposures(DriveLevels.of_transport(transport), target, calibration.black)
         wanted = target_radiance(target, calibration.black, exposure)
         solution = solve_bounded(transport, wanted, calibration.black, SolveSettings(most_iterations=MOST_ITERATIONS))
         if uhd:

@@ -18,9 +18,9 @@ from controller.optics.solve.bounded.equations import DEFAULT_SETTINGS, Solution
 from controller.optics.transport import LightTransport
 
 
-def check_target(transport: LightTransport, target: FloatImage) -> None:
+def check_target(camera_shape: tuple[int, ...], target: FloatImage) -> None:
     """Raise UsageError "image-wrong-size" or "target-not-finite" unless ``target`` can be a camera image here."""
-    check_image("target", target, (*transport.camera_shape, 3))
+    check_image("target", target, (*camera_shape, 3))
 
 
 def solve_bounded(
@@ -47,7 +47,7 @@ def solve_bounded(
 
 def check_input(given: SolveInput) -> None:
     """Raise UsageError "image-wrong-size", "target-not-finite" or "solve-arguments" for what can't be solved."""
-    check_target(given.transport, given.target)
+    check_target(given.transport.camera_shape, given.target)
     black, weights, start = given.black, given.weights, given.start
     if black.shape != given.target.shape or not all_finite(black):
         raise _wrong("the black image is not finite or does not have the target's size")

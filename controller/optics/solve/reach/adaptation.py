@@ -28,12 +28,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from numba import prange
 
-from controller.core.arrays import Float64, FloatImage, Mask, strips
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.core.jit import compiled
 from controller.optics.solve.bounded.solver import check_target
 from controller.optics.solve.reach.drive_levels import Colour, DriveLevels, levels_at
-from controller.optics.transport import LightTransport
 
 CELL: Final = 0.012
 """Side of a cell, relative to the picture's longer side."""
@@ -104,15 +103,13 @@ class SmoothLimits:
 
     def _on_pixels(self, values: FloatImage) -> FloatImage:
         """Values of cells, interpolated over those that hold a pixel of the object."""
-        columns, rows = (np.arange(n, dtype=np.float32) for n in self.mask.shape[::-1])
-        across, down = (((at - (self.side - 1) / 2) / self.side).astype(np.float32) for at in (columns, rows))
-        soft = [cv2.GaussianBlur(image, (0, 0), SOFT_CELLS) for image in (values, self.cells.astype(np.float32))]
-        found = np.empty(self.mask.shape, np.float32)
-        for part in strips(len(found)):
-            at = np.meshgrid(across, down[part])
-            value, share = (cv2.remap(one, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in soft)
-            found[part] = np.where(self.mask[part], value / np.maximum(share, np.float32(1e-3)), 0)
-        return found
+        soft = (cv2.GaussianBlur(image, (0, 0), SOFT_CELLS) for image in (values, self.cells.astype(np.float32)))
+        rows, columns = self.mask.shape
+        value, share = (
+            cv2.resize(one, None, fx=self.side, fy=self.side, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+            for one in soft
+        )
+        return np.where(self.mask, value / np.maximum(share, np.float32(1e-3)), np.float32(0))
 
 
 def _around(mask: Mask, side: int) -> tuple[slice, slice]:
@@ -195,14 +192,7 @@ FORGIVEN: Final = 1e-3
 LEAST: Final = np.float32(1e-12)
 
 
-def adapted_target(
-    transport: LightTransport,
-    wanted: FloatImage,
-    floor: FloatImage,
-    *,
-    strength: float = 1.0,
-    drive: DriveLevels | None = None,
-) -> FloatImage:
+def adapted_target(drive: DriveLevels, wanted: FloatImage, floor: FloatImage, *, strength: float = 1.0) -> FloatImage:
     """``wanted`` (rows, columns, 3) radiance, bent into what the stage can make without showing its own pattern.
 
     Parameters
@@ -210,7 +200,6 @@ def adapted_target(
     wanted, floor : (rows, columns, 3) radiance. ``floor`` is what is there without any projector's direct light: the
         black image, and what other surfaces throw back
     strength : from 0 (leave it, to be cut off) to 1
-    drive : of this transport, where already known
 
     Returns the target, float32; what lies beside the object stays as it is. Where nothing is lacking, it is ``wanted``.
     Raises UsageError "image-wrong-size", "target-not-finite" or "adapt-strength".
@@ -221,9 +210,8 @@ def adapted_target(
             what=f"A target can't be adapted with strength {strength}.",
             remedy="Give a strength from 0 (too bright or too dark parts are cut off) to 1.",
         )
-    check_target(transport, wanted)
-    check_target(transport, floor)
-    drive = DriveLevels(transport) if drive is None else drive
+    check_target(drive.mask.shape, wanted)
+    check_target(drive.mask.shape, floor)
     if strength == 0 or not drive.mask.any():
         return np.asarray(wanted, np.float32)
     target = _Bent(np.asarray(wanted, np.float32), np.asarray(floor, np.float32), drive, SmoothLimits.on(drive.mask))

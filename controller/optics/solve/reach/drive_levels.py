@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
+import numpy.typing as npt
 from numba import prange
 
 from controller.core.arrays import FloatImage, Mask, array_in_file
@@ -16,8 +19,10 @@ from controller.optics.transport import LightTransport
 ALL: Final = slice(None)
 Colour = tuple[np.float32, np.float32, np.float32]
 NO_SEGMENTS: Final = np.zeros((0, 0), np.float32)
+Places = npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True, eq=False)
 class DriveLevels:
     """Turns light at a camera pixel into the colour that all projectors would show alike to make it.
 
@@ -26,37 +31,49 @@ class DriveLevels:
     primaries of the projectors differ, a little more can be reached by unequal frames.) White segments make part of
     what the three colours have in common: levels are those of the colours' own light.
 
-    ``matrices`` (3, 3, rows, columns): B; ``segment_share`` (rows, columns): what white segments are of all light,
-    0 x 0 where no projector has one
+    ``mask`` (rows, columns): the object; ``matrices`` (3, 3, rows, columns): B
+    ``segment_share`` (rows, columns): what white segments are of all light, 0 x 0 where no projector has one
+    ``folder``: for nameless files of what need not stay in memory; None: it stays there
     """
 
-    def __init__(self, transport: LightTransport, folder: Path | None = None) -> None:
-        """``folder``: for a nameless file of what need not stay in memory; None: it stays there."""
-        self.mask: Mask = transport.object_mask
+    mask: Mask
+    matrices: FloatImage
+    segment_share: FloatImage
+    folder: Path | None = None
+
+    @classmethod
+    def of_transport(cls, transport: LightTransport, folder: Path | None = None) -> Self:
+        """Of all pixels of a stage's camera."""
         pixels = sum(rows * columns for rows, columns in transport.sizes)
         ones = np.ones((3, pixels), np.float32)
         shape = (3, 3, *transport.camera_shape)
-        self.matrices = array_in_file(folder, shape)
-        self.matrices[:] = 0
-        self._folder = folder
+        matrices = array_in_file(folder, shape)
+        matrices[:] = 0
         segment, total = np.zeros(transport.camera_shape, np.float32), np.zeros(transport.camera_shape, np.float32)
         for n in range(len(transport.sizes)):
             mixing = transport.mixing_of(n)
             white = transport.forward_planes(ones, projectors=(n, n + 1))
             for channel in range(3):
                 for colour in range(3):
-                    self.matrices[channel, colour] += mixing[channel, colour] * white[channel]
+                    matrices[channel, colour] += mixing[channel, colour] * white[channel]
             if transport.segments:
                 segment += np.float32(transport.segment(n)) * white.sum(axis=0)
                 total += white.sum(axis=0)
         # projectors of one kind stand together: where they differ, the mean by their light
         share = np.divide(segment, total, out=segment, where=total > 0) if transport.segments else NO_SEGMENTS
-        self.segment_share: FloatImage = share
+        return cls(transport.object_mask, matrices, share, folder)
+
+    def at(self, rows: Places, columns: Places) -> Self:
+        """Of the camera's pixels in some rows and columns alone."""
+        kept = np.ix_(rows, columns)
+        share = self.segment_share[kept] if self.segment_share.size else NO_SEGMENTS
+        matrices = np.ascontiguousarray(self.matrices[:, :, kept[0], kept[1]])
+        return dataclasses.replace(self, mask=self.mask[kept], matrices=matrices, segment_share=share, folder=None)
 
     @cached_property
     def reach(self) -> FloatImage:
         """The light with every projector at white, (rows, columns, 3)."""
-        found = array_in_file(self._folder, (*self.mask.shape, 3))
+        found = array_in_file(self.folder, (*self.mask.shape, 3))
         np.sum(self.matrices, axis=1, out=np.moveaxis(found, -1, 0))
         return found
 

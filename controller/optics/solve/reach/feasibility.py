@@ -17,7 +17,6 @@ from controller.core.errors import UsageError, WorkError
 from controller.optics.solve.bounded.solver import check_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.targets.values import Target
-from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import ReflectedLight
 
 FORGIVEN_DRIVE: Final = 2e-3
@@ -56,20 +55,14 @@ class Feasibility:
 
 
 def feasibility(
-    transport: LightTransport,
-    target: FloatImage,
-    black: FloatImage,
-    *,
-    margin: float = FORGIVEN_DRIVE,
-    drive: DriveLevels | None = None,
+    drive: DriveLevels, target: FloatImage, black: FloatImage, *, margin: float = FORGIVEN_DRIVE
 ) -> Feasibility:
     """Compare ``target`` (rows, columns, 3), linear radiance, with the light that the projectors can make.
 
-    ``margin``: so much drive beyond [0, 1] is forgiven; ``drive`` of this transport, where already known.
+    ``margin``: so much drive beyond [0, 1] is forgiven
     """
-    check_target(transport, target)
-    drive = DriveLevels(transport) if drive is None else drive
     mask = drive.mask
+    check_target(mask.shape, target)
     beyond, reachable = np.empty(target.shape, np.float16), np.empty(mask.shape, np.bool_)
     for rows in strips(len(target)):
         needed = drive.of(target[rows] - black[rows], rows)
@@ -80,37 +73,36 @@ def feasibility(
     return Feasibility(beyond, reachable, share)
 
 
-def choose_exposure(
-    transport: LightTransport,
-    target: FloatImage,
+def exposures(
+    drive: DriveLevels,
+    picture: FloatImage,
     black: FloatImage,
-    *,
     share: float = 0.95,
-    drive: DriveLevels | None = None,
-) -> float:
-    """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x target.
-
-    ``target`` (rows, columns, 3): reflectance-like, 0 to 1. No channel of a pixel may need more than all its light;
-    pixels too dark or too saturated for the stage do not affect the exposure: another one would not help them.
-
-    Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the target is black.
-    """
-    return _exposure_and_next(transport, target, black, share, drive)[0]
-
-
-def _exposure_and_next(
-    transport: LightTransport, target: FloatImage, black: FloatImage, share: float, drive: DriveLevels | None
+    *,
+    indirect: ReflectedLight | None = None,
 ) -> tuple[float, float]:
-    """As ``choose_exposure``, and the exposure at which ``SMALL_PART`` less of the object could be that bright."""
-    check_target(transport, target)
+    """The largest exposure at which ``share`` of the object's pixels can be made as bright as exposure x picture.
+
+    The second one is that at which ``SMALL_PART`` less of the object could be as bright.
+
+    ``picture`` (rows, columns, 3): reflectance-like, 0 to 1. No channel of a pixel may need more than all its light;
+    pixels too dark or too saturated for the stage do not affect the exposure: another one would not help them.
+    ``indirect``: a part of the picture's light comes by way of other surfaces
+
+    Raises UsageError("share-out-of-range"), WorkError("no-light") when there is no light or the picture is black.
+    """
+    check_target(drive.mask.shape, picture)
     if not 0 < share <= 1:
         raise UsageError(
             "share-out-of-range",
             what=f"A share of {share} reachable pixels is not possible.",
             remedy="Give a share above 0 and up to 1, for example 0.95.",
         )
-    drive = DriveLevels(transport) if drive is None else drive
-    most = np.concatenate([_most(drive, target[rows], black[rows], rows) for rows in strips(len(target))])
+    if indirect is not None:
+        # while none of it is out of reach, direct light is in proportion to the picture
+        picture = indirect.direct_target(picture)
+        np.maximum(picture, 0, out=picture)
+    most = np.concatenate([_most(drive, picture[rows], black[rows], rows) for rows in strips(len(picture))])
     most.sort()
     # The pixel that bounds the exposure: at most (1 - share) of all pixels may need less.
     bounds = (int(np.floor((1 - one) * most.size)) for one in (share, share - SMALL_PART))
@@ -156,12 +148,11 @@ class ExposedTarget:
 
 
 def expose_target(
-    transport: LightTransport,
+    drive: DriveLevels,
     picture: FloatImage,
     black: FloatImage,
     *,
     share: float,
-    drive: DriveLevels | None = None,
     indirect: ReflectedLight | None = None,
     asked: float | None = None,
 ) -> ExposedTarget:
@@ -170,15 +161,14 @@ def expose_target(
     ``asked``: the exposure, instead of that by ``share``.
 
     With ``indirect`` light a pixel is too dark, too, where more of it falls than is wanted. Raises what
-    ``choose_exposure`` raises.
+    ``exposures`` raises.
     """
-    drive = DriveLevels(transport) if drive is None else drive
     found = following = asked or 0.0
     if asked is None:
-        found, following = exposures(transport, picture, black, share, drive=drive, indirect=indirect)
+        found, following = exposures(drive, picture, black, share, indirect=indirect)
     wanted = np.float32(found) * picture
     needed = direct_part(drive.reach, wanted, black, indirect)
-    possible = feasibility(transport, needed, black, drive=drive)
+    possible = feasibility(drive, needed, black)
     return ExposedTarget(found, wanted, needed, possible, following / found)
 
 
@@ -186,22 +176,21 @@ HARDLY_ANY: Final = 0.99
 
 
 def with_less_light(
-    transport: LightTransport, target: Target, black: FloatImage, *,
-    drive: DriveLevels, exposure: float, indirect: ReflectedLight | None = None,
-) -> tuple[float, float, float]:  # fmt: skip
+    drive: DriveLevels, target: Target, black: FloatImage, *, exposure: float, indirect: ReflectedLight | None = None
+) -> tuple[float, float, float]:
     """Whether more of a target is in reach with less light than its ``exposure``.
 
     Gives the share of its pixels in reach at its light; the share of this light at which hardly any is too bright, 1
-    where none is; and the share of its pixels in reach then. Raises what ``choose_exposure`` raises.
+    where none is; and the share of its pixels in reach then. Raises what ``exposures`` raises.
     """
     asked = drive.mask & target.mask
     # the share is one of all of the object's pixels
     share = float(1 - (1 - HARDLY_ANY) * asked.sum() / max(1, drive.mask.sum()))
-    most = exposures(transport, target.image, black, share, drive=drive, indirect=indirect)[0]
+    most = exposures(drive, target.image, black, share, indirect=indirect)[0]
     shares = []
     for level in (exposure, min(most, exposure)):
         direct = direct_part(drive.reach, np.float32(level) * target.image, black, indirect)
-        reachable = feasibility(transport, direct, black, drive=drive).reachable
+        reachable = feasibility(drive, direct, black).reachable
         shares.append(float(reachable[asked].mean()) if asked.any() else 0.0)
     return shares[0], min(most / exposure, 1.0), shares[1]
 
@@ -216,26 +205,3 @@ def direct_part(
     if indirect is None:
         return wanted
     return black + indirect.direct_target(wanted - black, reach=reach)
-
-
-def exposures(
-    transport: LightTransport,
-    picture: FloatImage,
-    black: FloatImage,
-    share: float,
-    *,
-    drive: DriveLevels,
-    indirect: ReflectedLight | None = None,
-) -> tuple[float, float]:
-    """As ``choose_exposure``, where a part of the picture's light comes by way of other surfaces.
-
-    The second one is that at which ``SMALL_PART`` less of the object could be as bright. As direct light is linear in
-    the picture while none of it is out of reach, both are taken apart once.
-    """
-    first = _exposure_and_next(transport, picture, black, share, drive)
-    if indirect is None:
-        return first
-    check_target(transport, picture)
-    direct = indirect.direct_target(np.float32(first[0]) * picture) / np.float32(first[0])
-    needed = np.where(transport.object_mask[..., None], np.maximum(direct, 0), picture).astype(np.float32)
-    return _exposure_and_next(transport, needed, black, share, drive)

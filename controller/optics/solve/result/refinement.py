@@ -377,7 +377,7 @@ def solve_again(
     Raises as ``solve_bounded``.
     """
     wanted = target_radiance(target, light.black, 1.0)
-    possible = feasibility(light.transport, target, light.black, drive=light.drive)
+    possible = feasibility(light.levels(), target, light.black)
     weights = appearance_weights(wanted, possible.reachable, exposure)
     radiance = target_radiance(aimed, light.black, 1.0)
     return solve_bounded(light.transport, radiance, light.black, replace(settings, weights=weights), context).frames

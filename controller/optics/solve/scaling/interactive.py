@@ -195,7 +195,7 @@ def interactive(
     ``black`` (rows, columns, 3); one radiometry a projector. Raises UsageError("response-not-rising"), and as
     ``check_target`` for ``black``.
     """
-    check_target(transport, black)
+    check_target(transport.camera_shape, black)
     maps = scaling_maps(StageLight(transport, black, indirect), base, radiometries)
     return Interactive(maps, transport.camera_shape)
 

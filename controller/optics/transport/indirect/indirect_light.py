@@ -27,8 +27,8 @@ from controller.optics.transport.indirect.blocks import between, down, down_adjo
 from controller.optics.transport.indirect.surface_light import SurfaceLight
 
 ROUNDS: Final = 30
-CONVERGED: Final = 1e-5
-"""Relative change of the direct light, at which it is known."""
+CONVERGED: Final = 1e-4
+"""Relative change of the direct light, at which it is known: the next one is a tenth of it."""
 LEAST_VOLUME: Final = 0.02
 """Determinant of I + D: three colours that a paint makes nearly one are no nearer to one than this."""
 LARGEST: Final = 1e4
@@ -223,7 +223,7 @@ def approach(
     unpainted: FloatImage,
     first: int,
 ) -> FloatImage:
-    """Let ``direct`` (rows, columns, 3) be what is left of ``total`` beside other light; 0 where it is not ``lit``.
+    """Let ``direct`` (rows, columns, 3) be what is left of ``total`` beside other light, where it is ``lit``.
 
     ``scale``, ``lit``: of ``IndirectLight``; ``blocks`` (rows of blocks, columns of blocks, 3): light that falls on
     blocks of ``side`` pixels; ``spread`` like ``direct``: light that comes out beside where it fell; none with 0 rows;
@@ -236,19 +236,20 @@ def approach(
     changed = np.zeros(rows, np.float32)
     for y in prange(rows):
         above, below, down_share = between(first + y, side, blocks.shape[0])
+        falling = np.empty(blocks.shape[1:], np.float32)
+        for block in range(blocks.shape[1]):
+            for c in range(3):
+                falling[block, c] = mixed(blocks[above, block, c], blocks[below, block, c], down_share)
         largest = np.float32(0)
         left = np.zeros(3, np.float32)
         for x in range(columns):
+            if not lit[y, x]:
+                continue
+            before, after, share = between(x, side, blocks.shape[1])
             for c in range(3):
-                left[c] = 0
-            if lit[y, x]:
-                before, after, share = between(x, side, blocks.shape[1])
-                for c in range(3):
-                    upper = mixed(blocks[above, before, c], blocks[above, after, c], share)
-                    lower = mixed(blocks[below, before, c], blocks[below, after, c], share)
-                    left[c] = total[y, x, c] - scale[y, x, c] * mixed(upper, lower, down_share)
-                    if spread.shape[0]:
-                        left[c] -= spread[y, x, c]
+                left[c] = total[y, x, c] - scale[y, x, c] * mixed(falling[before, c], falling[after, c], share)
+                if spread.shape[0]:
+                    left[c] -= spread[y, x, c]
             for c in range(3):
                 found = left[c]
                 if unpainted.shape[2]:

@@ -14,7 +14,6 @@ from controller.config.models import SolveTable
 from controller.core import channels
 from controller.core.arrays import moved_to_file
 from controller.optics.calibrate.photometry.reflectance import reflectance_everywhere
-from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import exposures, with_less_light
 from controller.optics.solve.targets.files import read_large_picture
 from controller.optics.solve.targets.registration import Registration, register
@@ -65,13 +64,11 @@ class Restoration:
     def figures(self, share: float) -> dict[str, Any]:
         """As of ``Registered``. ``share``: see ``SolveOptions``"""
         (target, registration), light = self.made, self._calibrated.light
-        drive, exposure = light.drive or DriveLevels(light.transport), target.exposure
+        drive, exposure = light.levels(), target.exposure
         if exposure is None:
-            exposure, _ = exposures(
-                light.transport, target.image, light.black, share, drive=drive, indirect=light.indirect
-            )
+            exposure, _ = exposures(drive, target.image, light.black, share, indirect=light.indirect)
         share, less, then_share = with_less_light(
-            light.transport, target, light.black, drive=drive, exposure=exposure, indirect=light.indirect
+            drive, target, light.black, exposure=exposure, indirect=light.indirect
         )
         residual = registration.residual_px[np.isfinite(registration.residual_px)]
         middle, most = np.percentile(residual, (50, 95)) if residual.size else (None, None)

@@ -17,12 +17,12 @@ from tests.controller.optics.solve.conftest import plane_calibration
 
 STAGE = plane_calibration(projector=(40, 52), camera=(120, 160), spill=0.0)
 TRANSPORT = build_transport(STAGE)
-DRIVE = DriveLevels(TRANSPORT)
+DRIVE = DriveLevels.of_transport(TRANSPORT)
 REACH = TRANSPORT.reach()
 
 
 def adapted(wanted: FloatImage, floor: FloatImage = STAGE.black, *, strength: float = 1.0) -> FloatImage:
-    return adapted_target(TRANSPORT, wanted, floor, strength=strength, drive=DRIVE)
+    return adapted_target(DRIVE, wanted, floor, strength=strength)
 
 
 def shown(target: FloatImage, floor: FloatImage = STAGE.black) -> FloatImage:
@@ -64,14 +64,14 @@ def test_a_shadow_or_dark_paint_pulls_down_nothing_around(light: float) -> None:
         part.white[shadow] *= np.float32(light)
     transport = build_transport(shape)
     wanted = np.full_like(shape.black, 0.6 * float(np.median(REACH)))
-    bent = adapted_target(transport, wanted, shape.black)
+    bent = adapted_target(DriveLevels.of_transport(transport), wanted, shape.black)
     np.testing.assert_array_equal(bent, wanted)
 
 
 def test_a_highlight_out_of_reach_keeps_all_in_reach_as_it_is() -> None:
     wanted = highlight(2.0)
     bent = adapted(wanted)
-    in_reach = feasibility(TRANSPORT, wanted, STAGE.black, drive=DRIVE).reachable
+    in_reach = feasibility(DRIVE, wanted, STAGE.black).reachable
     assert 0.3 < in_reach.mean() < 0.98
     np.testing.assert_array_equal(bent[in_reach], wanted[in_reach])
 
@@ -130,7 +130,7 @@ def test_any_target_stays_finite_and_comes_nearer_to_what_can_be_shown(
     np.testing.assert_array_equal(bent[outside], wanted[outside])
     lacking = [
         float(np.maximum(found.too_bright, found.too_dark)[np.isfinite(found.too_bright)].mean())
-        for found in (feasibility(TRANSPORT, one, STAGE.black, drive=DRIVE) for one in (wanted, bent))
+        for found in (feasibility(DRIVE, one, STAGE.black) for one in (wanted, bent))
     ]
     assert lacking[1] <= lacking[0] * (1 + 1e-4) + 1e-6
 

@@ -24,6 +24,7 @@ from controller.optics.solve.appearance import (
     scale_frames,
     solve_base,
 )
+from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import feasibility
 from controller.optics.transport import LightTransport, build_transport
 
@@ -101,7 +102,7 @@ def test_a_full_solve_keeps_what_clipping_spoils_in_a_scale(stage: Stage) -> Non
 
     def missed(brightness: float, mode: Mode) -> float:
         target = scaled(base, calibration.black, brightness * smooth_scale(transport.camera_shape))
-        reachable = feasibility(transport, target, calibration.black).reachable
+        reachable = feasibility(DriveLevels.of_transport(transport), target, calibration.black).reachable
         found = make_appearance(StageLight(transport, calibration.black), base, target, mode=mode)
         error = np.abs(transport.forward(found.frames) + calibration.black - target)[reachable]
         return float(np.percentile(error, 95))

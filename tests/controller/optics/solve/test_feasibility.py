@@ -12,16 +12,21 @@ from hypothesis import strategies as st
 
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
+from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import (
     Feasibility,
-    choose_exposure,
     expose_target,
+    exposures,
     feasibility,
     target_radiance,
 )
 from controller.optics.transport import build_transport
 
 Stage = Callable[..., Calibration]
+
+
+def drive_of(calibration: Calibration) -> DriveLevels:
+    return DriveLevels.of_transport(build_transport(calibration))
 
 
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
@@ -31,10 +36,11 @@ def test_at_the_chosen_exposure_the_stated_share_is_bright_enough_and_no_brighte
 ) -> None:
     calibration = stage(seed)
     transport = build_transport(calibration)
+    drive = DriveLevels.of_transport(transport)
     target = np.random.default_rng(seed).random((*transport.camera_shape, 3)).astype(np.float32)
-    exposure = choose_exposure(transport, target, calibration.black, share=share)
+    exposure = exposures(drive, target, calibration.black, share)[0]
     within, beyond = (
-        feasibility(transport, target_radiance(target, calibration.black, e), calibration.black, margin=1e-6)
+        feasibility(drive, target_radiance(target, calibration.black, e), calibration.black, margin=1e-6)
         for e in (exposure, exposure * 1.02)
     )
 
@@ -54,13 +60,14 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
     """Through T itself: the same colour on all projectors is driven by just that colour, crosstalk and all."""
     calibration = stage()
     transport = build_transport(calibration)
+    drive = DriveLevels.of_transport(transport)
     frames = [np.broadcast_to(np.array(colour, np.float32), (*size, 3)).copy() for size in transport.sizes]
     light = transport.forward(frames)
     mask = transport.object_mask
-    found = feasibility(transport, light + calibration.black, calibration.black)
+    found = feasibility(drive, light + calibration.black, calibration.black)
     assert found.reachable[mask].all()
     full = transport.forward([np.ones_like(frame) for frame in frames])
-    beyond = feasibility(transport, light + 1.01 * full + calibration.black, calibration.black)
+    beyond = feasibility(drive, light + 1.01 * full + calibration.black, calibration.black)
     np.testing.assert_allclose(
         beyond.too_bright[mask], np.array(colour) + 0.01 + np.zeros((int(mask.sum()), 3)), atol=1e-3
     )
@@ -69,8 +76,9 @@ def test_what_all_projectors_make_together_is_within_reach_and_a_little_more_is_
 def test_a_colour_purer_than_the_projectors_primaries_is_out_of_reach(stage: Stage) -> None:
     calibration = stage()
     transport = build_transport(calibration)
+    drive = DriveLevels.of_transport(transport)
     red = transport.reach() * np.array([0.5, 0, 0], np.float32)
-    found = feasibility(transport, red + calibration.black, calibration.black)
+    found = feasibility(drive, red + calibration.black, calibration.black)
     assert not found.reachable.any()
     assert (found.too_dark[transport.object_mask].max(axis=1) > 0).all()
 
@@ -78,11 +86,12 @@ def test_a_colour_purer_than_the_projectors_primaries_is_out_of_reach(stage: Sta
 def test_the_feasibility_map_says_what_is_missing_and_what_is_too_much(stage: Stage) -> None:
     calibration = stage()
     transport = build_transport(calibration)
+    drive = DriveLevels.of_transport(transport)
     reach = transport.reach()
     target = calibration.black + 0.5 * reach
     target[30, 40] = calibration.black[30, 40] + 1.25 * reach[30, 40]
     target[31, 41] = calibration.black[31, 41] - 0.1 * reach[31, 41]
-    result = feasibility(transport, target, calibration.black)
+    result = feasibility(drive, target, calibration.black)
     np.testing.assert_allclose(result.too_bright[30, 40], 0.25, rtol=1e-3)
     np.testing.assert_allclose(result.too_dark[31, 41], 0.1, rtol=1e-3)
     assert not result.reachable[30, 40]
@@ -99,14 +108,14 @@ def test_a_radiance_is_never_below_the_black_image(stage: Stage) -> None:
 def test_a_black_target_has_no_exposure(stage: Stage) -> None:
     calibration = stage()
     with pytest.raises(WorkError) as failed:
-        choose_exposure(build_transport(calibration), np.zeros_like(calibration.black), calibration.black)
+        exposures(drive_of(calibration), np.zeros_like(calibration.black), calibration.black)
     assert failed.value.code == "no-light"
 
 
 def test_a_share_outside_zero_to_one_is_refused(stage: Stage) -> None:
     calibration = stage()
     with pytest.raises(UsageError) as refused:
-        choose_exposure(build_transport(calibration), calibration.black, calibration.black, share=0)
+        exposures(drive_of(calibration), calibration.black, calibration.black, share=0)
     assert refused.value.code == "share-out-of-range"
 
 
@@ -116,9 +125,10 @@ def test_pixels_without_light_in_a_channel_do_not_bear_on_the_exposure(stage: St
     for part in dark:
         part.white[10:20, 10:20, 2] = 0
     transport = build_transport(dataclasses.replace(calibration, projectors=tuple(dark)))
+    drive = DriveLevels.of_transport(transport)
     target = np.full((*transport.camera_shape, 3), 0.5, np.float32)
-    exposure = choose_exposure(transport, target, calibration.black)
-    found = feasibility(transport, target_radiance(target, calibration.black, exposure), calibration.black)
+    exposure = exposures(drive, target, calibration.black)[0]
+    found = feasibility(drive, target_radiance(target, calibration.black, exposure), calibration.black)
     assert 0 < exposure < np.inf
     assert not found.reachable[10:20, 10:20].any()
     assert found.share > 0.9
@@ -132,5 +142,6 @@ def test_a_small_dark_part_that_decides_the_exposure_is_told(stage: Stage, dark:
         part.white[:] = part.white.mean(axis=(0, 1))
         part.white[:, :columns] *= 0.2
     transport = build_transport(calibration)
-    found = expose_target(transport, np.ones_like(calibration.black), calibration.black, share=0.9)
+    drive = DriveLevels.of_transport(transport)
+    found = expose_target(drive, np.ones_like(calibration.black), calibration.black, share=0.9)
     assert found.held_back == pytest.approx(held_back, rel=0.1)

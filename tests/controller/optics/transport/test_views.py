@@ -133,7 +133,7 @@ def test_views_that_contradict_each_other_meet_by_their_shares() -> None:
 
 def test_each_views_own_mixing_counts_in_what_can_be_reached() -> None:
     joint = ViewsTransport.of(views())
-    drive, white = DriveLevels(joint), joint.reach()
+    drive, white = DriveLevels.of_transport(joint), joint.reach()
     seen = drive.of(white)[joint.object_mask]
     np.testing.assert_allclose(seen[np.isfinite(seen).all(axis=1)], 1, atol=2e-3)
 

@@ -99,7 +99,7 @@ def test_a_solve_knows_that_saturated_colours_are_darker(stage: Stage) -> None:
 def test_what_is_in_reach_ends_where_the_projectors_do(stage: Stage) -> None:
     calibration = with_segment(stage(), 0.25)
     transport = build_transport(calibration)
-    drive = DriveLevels(transport)
+    drive = DriveLevels.of_transport(transport)
     inside = drive.mask
     levels = np.broadcast_to(np.array([0.9, 0.4, 0.2], np.float32), (*inside.shape, 3))
     own = np.asarray(calibration.projectors[0].radiometry.emitted(levels), np.float32)
@@ -107,7 +107,7 @@ def test_what_is_in_reach_ends_where_the_projectors_do(stage: Stage) -> None:
     np.testing.assert_allclose(drive.light(levels)[inside], transport.forward(frames)[inside], rtol=2e-3, atol=1e-6)
     np.testing.assert_allclose(drive.of(drive.light(levels))[inside], levels[inside], atol=1e-4)
     pure = np.broadcast_to(np.array([1.0, 0.0, 0.0], np.float32), levels.shape)
-    without = DriveLevels(dataclasses.replace(transport, segments=()))
+    without = DriveLevels.of_transport(dataclasses.replace(transport, segments=()))
     np.testing.assert_allclose(drive.of(without.light(pure))[inside].max(axis=1), 1 / 0.75, rtol=1e-3)
 
 
@@ -118,7 +118,7 @@ def test_where_a_colour_is_never_seen_no_level_makes_it(stage: Stage) -> None:
         white = part.white.copy()
         white[20:40, 20:40, 0] = 0
         parts.append(dataclasses.replace(part, white=white))
-    drive = DriveLevels(build_transport(dataclasses.replace(calibration, projectors=tuple(parts))))
+    drive = DriveLevels.of_transport(build_transport(dataclasses.replace(calibration, projectors=tuple(parts))))
     levels = drive.of(np.full((*drive.mask.shape, 3), 0.1, np.float32))
     dark = np.zeros_like(drive.mask)
     dark[22:38, 22:38] = True

@@ -292,11 +292,11 @@ def test_the_light_is_named_at_which_hardly_anything_is_too_bright() -> None:
     mask = np.zeros(transport.camera_shape, np.bool_)
     mask[:, 20:60] = True
     image = np.asarray(np.where(mask[..., None], slope, 0) * np.ones(3), np.float32)
-    target, drive = Target(image, mask), DriveLevels(transport)
-    share, less, then_share = with_less_light(transport, target, black, drive=drive, exposure=2.0)
+    target, drive = Target(image, mask), DriveLevels.of_transport(transport)
+    share, less, then_share = with_less_light(drive, target, black, exposure=2.0)
 
     def shown(exposure: float) -> float:
-        return float(feasibility(transport, exposure * image, black).reachable[mask].mean())
+        return float(feasibility(drive, exposure * image, black).reachable[mask].mean())
 
     assert share == pytest.approx(shown(2.0))
     assert then_share == pytest.approx(shown(2.0 * less))
