@@ -12,6 +12,7 @@ from typing import Final, get_args
 from controller.config.models import SolveTable
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.errors import UsageError
+from controller.core.storage import sha256_of
 from controller.optics.calibrate.values import Calibration
 from controller.optics.capture.patterns import Pattern, PatternKind, plan_patterns
 from controller.optics.solve.appearance import Base, BaseChoice, base_image, solve_base
@@ -25,6 +26,7 @@ from controller.optics.solve.targets.values import Target
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.grade import FIGURES
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.outline import outline_digest
 from controller.stage.artefacts.solved import RequestedTarget, Solved, SolvedBase
@@ -86,6 +88,10 @@ def solve_steps(
     """
     outline = outline_digest(calibrated.folder)
     drawn = {"outline": outline} if outline else {}
+    if len(calibrated.names) > 1:
+        # one that is added or photographed again later
+        graded = [folder / FIGURES for folder in calibrated.folders[1:]]
+        drawn["views"] = " ".join((*calibrated.names, *(sha256_of(file) for file in graded if file.exists())))
     steps = [
         Step(
             BASE,

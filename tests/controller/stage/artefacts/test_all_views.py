@@ -106,6 +106,22 @@ def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_pa
     np.testing.assert_allclose(again.base.image, calibrated.base.image)
 
 
+def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None:
+    names, calibrated = two_views(tmp_path)
+    one, folder = Calibrated(tmp_path, names), view_folder(tmp_path, "right")
+    for of, sizes in ((one, [CAMERAS["left"]]), (calibrated, list(CAMERAS.values()))):
+        grey = [np.full((*size, 3), 0.4, np.float32) for size in sizes]
+        target = Target(of.joined(grey), of.joined([np.ones(size, np.bool_) for size in sizes]))
+        with Journal(tmp_path) as journal:
+            request = AppearanceRequest("look", "Look", lambda target=target: target, {})
+            steps = solve_steps(of, [request], SolveOptions(0.9, 0.001, "full"), ())
+            Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
+    assert is_solved(folder, "look")
+    replaced = [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())]
+    (folder / "verification.json").write_text("{}")
+    assert [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())] != replaced
+
+
 def test_one_view_is_read_as_ever(tmp_path: Path) -> None:
     names = write_synthetic_run(tmp_path, projector=PROJECTOR, camera=CAMERAS["left"])
     assert type(all_views(tmp_path, names)) is Calibrated
