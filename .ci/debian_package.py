@@ -59,6 +59,12 @@ else
   echo 'To make this computer a kiosk, type: velatura kiosk install'
 fi
 """
+_PREINST: Final = f"""#!/bin/sh
+set -e
+# The program that an update has put there is of another package: none of its files may stay among those of this one.
+if [ "$1" = upgrade ] && [ -e /{PREFIX}/.update ]; then rm -rf /{PREFIX}/lib /{PREFIX}/.update; fi
+rm -f /{PREFIX}.package /{PREFIX}.trial
+"""
 _PRERM: Final = f"""#!/bin/sh
 set -e
 [ "$1" = remove ] || exit 0
@@ -69,7 +75,7 @@ fi
 _POSTRM: Final = f"""#!/bin/sh
 set -e
 # Byte code that a program of root made beside ours.
-if [ "$1" = remove ] || [ "$1" = purge ]; then rm -rf /{PREFIX}; fi
+if [ "$1" = remove ] || [ "$1" = purge ]; then rm -rf /{PREFIX} /{PREFIX}.*; fi
 """
 
 
@@ -238,7 +244,7 @@ def _control(tree: Path, suite: str, version: str) -> None:
         packages=", ".join(PACKAGES),
     )  # fmt: skip
     (folder / "control").write_text(fields)
-    for name, text in (("postinst", _POSTINST), ("prerm", _PRERM), ("postrm", _POSTRM)):
+    for name, text in (("preinst", _PREINST), ("postinst", _POSTINST), ("prerm", _PRERM), ("postrm", _POSTRM)):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
     for place, folders, files in os.walk(tree):

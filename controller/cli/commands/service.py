@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -175,6 +177,9 @@ def install(
     player: Annotated[
         bool, typer.Option("--player", help="Only outputs of a stage that another computer runs.")
     ] = False,
+    trust: Annotated[
+        list[Path] | None, typer.Option(help="Take updates signed by this public key (.pub); can be repeated.")
+    ] = None,
 ) -> None:
     """Make this computer a kiosk, and start it. As root, on Debian 12 or 13: user, services, X server and panel."""
     from controller.kiosk.install import restored, steps
@@ -182,6 +187,8 @@ def install(
 
     _require_root(dry_run)
     system = System(console.say, dry=dry_run)
+    for key in trust or ():
+        steps.trust(system, key)
     if backup is not None:
         restored.restore(system, backup.absolute(), ask=lambda text: str(typer.prompt(text)), say=console.say)
     elif player:
@@ -192,6 +199,43 @@ def install(
     if backup is not None:
         text = "The backup is in place. `velatura kiosk changes` and `velatura doctor` tell what is different here."
     console.show_result({"installed": not dry_run}, "Nothing was changed." if dry_run else text)
+
+
+def update(
+    package: Annotated[
+        Path | None, typer.Argument(help="A signed package; without one, what is offered is done.", dir_okay=False)
+    ] = None,
+    dry_run: DryRun = False,
+    sign: Annotated[
+        Path | None, typer.Option(help="Only sign this package, with a key made by `velatura bundle key`.")
+    ] = None,
+) -> None:
+    """Replace this version by that of a package, as root. It comes back if the kiosk is not as well as before."""
+    from controller.bundle.signing import load_signing_key
+    from controller.core.kiosk_places import STAGE
+    from controller.core.storage import stream_atomically
+    from controller.kiosk.api.control import call_kiosk
+    from controller.kiosk.install import steps, update
+    from controller.kiosk.install.system import System
+
+    system = System(console.say)
+    if package is not None and sign is not None:
+        update.sign_package(package, load_signing_key(sign), package)
+        console.show_result({"signed": package})
+        return
+    _require_root(dry_run)
+    if package is not None:
+        update.check_package(package, system.at(steps.TRUSTED))
+    if package is None:
+        if not dry_run:
+            update.Updates(system, status=lambda: dict(call_kiosk(STAGE, "status"))).run()
+        console.show_result(dataclasses.asdict(update.outcome(system)))
+    elif dry_run:
+        console.show_result(update.changes(system, package))
+    else:
+        with package.open("rb") as content:
+            stream_atomically(update.OFFERED, lambda file: shutil.copyfileobj(content, file))
+        console.show_result({"offered": package}, "`journalctl -fu velatura-update` tells what becomes of it.")
 
 
 def uninstall(

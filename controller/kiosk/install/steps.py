@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import firmware_configs
+from controller.bundle.signing import load_public_key
 from controller.core.errors import UsageError
 from controller.core.kiosk_places import PLAYER_OPTIONS, RUNTIME, STAGE, STATE, USER
 from controller.kiosk.install.system import System
@@ -20,6 +21,8 @@ from controller.kiosk.panel_address import FIRST_LOGIN, addresses
 from controller.play.control.launch import PlayerSettings
 
 CONFIGURATION: Final = Path("/etc/velatura")
+TRUSTED: Final = CONFIGURATION / "update-keys"
+"""Public keys (*.pub) of those whose updates this computer takes."""
 CERTIFICATE: Final = CONFIGURATION / "panel.crt"
 KEY: Final = CONFIGURATION / "panel.key"
 CONTROLLER_OPTIONS: Final = CONFIGURATION / "controller.env"
@@ -66,6 +69,7 @@ SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 AGENT: Final = "velatura-agent"
 NETWORK: Final = Path("/etc/systemd/system/velatura-player.service.d/network.conf")
 TARGET: Final = "velatura.target"
+UPDATES: Final = "velatura-update.path"
 DEBIAN: Final = {"bookworm": "12", "trixie": "13"}
 PYTHON: Final = {"bookworm": "3.11", "trixie": "3.13"}
 """Of each Debian."""
@@ -126,7 +130,7 @@ def install(
         system.run("systemctl", "daemon-reload")
         system.run("udevadm", "control", "--reload", may_fail=True)
         system.run("udevadm", "trigger", may_fail=True)
-    system.run("systemctl", "enable", "--quiet", TARGET)
+    system.run("systemctl", "enable", "--quiet", TARGET, UPDATES)
     system.run("systemctl", "restart" if cut_off else "start", "velatura-x11")
     _outputs(system, again=outputs_again, say=say)
     if restart or any(changed):
@@ -140,9 +144,16 @@ def install(
         mark.unlink()
 
 
+def trust(system: System, key: Path) -> None:
+    """Take updates that this public key has signed. Raises UsageError("key-unreadable")."""
+    load_public_key(key)
+    system.folder(TRUSTED)
+    system.write(TRUSTED / key.name, key.read_text())
+
+
 def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -> None:
     """Take everything back but the stage and the packages. ``purge``: the stage, the settings and the user, too."""
-    for unit in (TARGET, AGENT, *SERVICES):
+    for unit in (TARGET, AGENT, UPDATES, *SERVICES):
         system.run("systemctl", "disable", "--now", "--quiet", unit, may_fail=True)
     for path in (*shipped(prefix), NETWORK, X_OUTPUTS, PLAYER_OPTIONS):
         system.remove(path)

@@ -70,7 +70,7 @@ def test_it_makes_user_packages_units_and_the_outputs_that_are_there(
     assert any(line.startswith("useradd --system") for line in ran)
     (packages,) = (line for line in ran if line.startswith("apt-get install"))
     assert set(steps.PACKAGES) <= set(packages.split())
-    assert "systemctl enable --quiet velatura.target" in ran
+    assert "systemctl enable --quiet velatura.target velatura-update.path" in ran
     assert '"1400x1050_59.98"' in (debian / "etc/X11/xorg.conf.d/20-velatura-outputs.conf").read_text()
     assert "--name vase.local" in (debian / "etc/velatura/controller.env").read_text()
     options = (debian / "var/lib/velatura/player.options").read_text().split("\n")[:-1]
