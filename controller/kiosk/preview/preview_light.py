@@ -126,9 +126,10 @@ def _in_white(calibrated: Calibrated) -> bytes:
 
 
 def _arrays(light: PreviewLight) -> dict[str, npt.NDArray[Any]]:
-    own = {"black": light.black, "camera_to_xyz": light.camera_to_xyz}
+    own: dict[str, npt.NDArray[Any]] = {"black": light.black, "camera_to_xyz": light.camera_to_xyz}
     numbers = {"camera_px": np.array(light.camera_px), "step": np.array(light.step)}
-    levels = {name: getattr(light.drive, name) for name in ("mask", "matrices", "segment_share")}
+    drive = light.drive
+    levels = {"mask": drive.mask, "matrices": drive.matrices, "segment_share": drive.segment_share}
     indirect = {} if light.indirect is None else light.indirect.arrays()
     return own | numbers | levels | {f"indirect_{name}": part for name, part in indirect.items()}
 

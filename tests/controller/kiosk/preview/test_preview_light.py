@@ -64,9 +64,12 @@ def test_what_a_preview_needs_is_kept_and_made_again_where_it_is_damaged(
     calibrated: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
-    monkeypatch.setattr(
-        "controller.stage.artefacts.calibrated.Calibrated", lambda run, names: read.append(run) or calibrated
-    )
+
+    def of_run(run: Path, names: tuple[str, ...]) -> Any:
+        read.append(run)
+        return calibrated
+
+    monkeypatch.setattr("controller.stage.artefacts.calibrated.Calibrated", of_run)
     monkeypatch.setattr(module, "_in_white", lambda calibrated: b"a picture")
 
     def known() -> PreviewLight:
