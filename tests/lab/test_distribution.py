@@ -14,6 +14,7 @@ import pytest
 from controller import __main__ as shell
 from controller.cli import groups
 from hal.errors import DeviceError
+from plugins.emulated.bench import EmulatedBench
 from plugins.emulated.core import extensions
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +33,7 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
     assert all(requirement.endswith(f"=={version}") for requirement in PROJECT["project"]["dependencies"])
 
 
-@pytest.mark.parametrize("part", ["boards", "bumps", "dousers", "mitsuba", "scenario", "tape", "usb"])
+@pytest.mark.parametrize("part", ["boards", "bumps", "dousers", "effects", "mitsuba", "scenario", "tape", "usb"])
 def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert EntryPoint(part, PROJECT["project"]["entry-points"][extensions.GROUP][part], extensions.GROUP).load()
     for found in ((), (EntryPoint(part, "no_such_module_at_all:Part", extensions.GROUP),)):
@@ -40,6 +41,16 @@ def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.Monkey
         with pytest.raises(DeviceError, match="needs the distribution velatura-lab") as refused:
             extensions.extension(part, asked_by="This stage")
         assert refused.value.code == "bench-part-missing"
+
+
+def test_a_hard_room_without_the_lab_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extensions, "entry_points", lambda group, name: ())
+    with pytest.raises(DeviceError, match='room "hard" needs the distribution velatura-lab') as refused:
+        EmulatedBench(room="hard").prepare(tmp_path / "stage", size="small", object_file=None, seed=1)
+    assert refused.value.code == "bench-part-missing"
+    assert not list(tmp_path.iterdir())
 
 
 _DEMO = """

@@ -43,7 +43,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Random seed of the stage.", min=0, max=2**32 - 1)] = 1,
     room: Annotated[
         Literal["dark", "room", "hard"],
-        typer.Option(help="Light: from the projectors alone, also from the room, or from a room with every fault."),
+        typer.Option(help="Light: from the projectors alone, also from the room, or with every fault (velatura-lab)."),
     ] = "room",
     prepare_only: Annotated[bool, typer.Option("--prepare-only", help="Only write OUT/stage.")] = False,
 ) -> None:

@@ -1,7 +1,8 @@
 """Parts of the bench that other distributions bring, by the entry-point group ``velatura.bench``.
 
 ``boards``: projectors with another control board than the usual one, or on a LAN port; ``bumps``: changes of a stage;
-``dousers``: DMX nodes with dousers; ``mitsuba``: an engine of indirect light
+``dousers``: DMX nodes with dousers; ``effects``: depth of field, dithered panels, varnish, light by wavelength and
+under the surface, and the room ``hard``; ``mitsuba``: an engine of indirect light
 (``plugins.emulated.optics.indirect.transfers``); ``scenario``: players of a script of faults; ``tape``: the devices of
 a tape; ``usb``: what ``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``). All are in velatura-lab.
 """

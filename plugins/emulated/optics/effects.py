@@ -1,20 +1,21 @@
-"""What lenses, panels, sensors, lamps and varnish do beyond the ideal; ``core.truth`` says how strongly.
+"""What lenses, sensors and lamps do beyond the ideal; ``core.truth`` says how strongly.
 
-What differs from pixel to pixel and from shot to shot is drawn from the stage's seed.
+What differs from pixel to pixel and from shot to shot is drawn from the stage's seed. Effects that no usual room has
+are in velatura-lab.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.truth import CameraTruth, LampTruth
-from plugins.emulated.optics.shapes import dot
 
 SPREAD: Final = 0.15
 """Standard deviation of the veil, in picture widths."""
@@ -78,116 +79,6 @@ def veiled(image: npt.NDArray[np.float32], share: float) -> npt.NDArray[np.float
     return np.asarray(cv2.addWeighted(image, 1.0 - share, whole, share, 0.0), dtype=np.float32)
 
 
-FloatImage = npt.NDArray[np.float32]
-LARGEST_PX: Final = 24.0
-STEP: Final = 1.25
-"""Between the blurs of two layers; a pixel's light is divided between the two that are next to its own."""
-SMALLEST_PX: Final = 0.3
-
-
-def confusion_px(
-    depth_m: npt.NDArray[np.float64], *, focal_px: float, pixel_m: float, aperture_f: float, focus_m: float
-) -> npt.NDArray[np.float64]:
-    """Standard deviation, along each axis, of the circle of confusion of points ``depth_m`` along the optical axis.
-
-    Its diameter is f^2 / N |z - s| / (z (s - f)) for a lens of focal length f = ``focal_px`` x ``pixel_m`` focused
-    at s; a disc's standard deviation is a quarter of its diameter.
-    """
-    focal = focal_px * pixel_m
-    diameter = focal**2 / aperture_f * np.abs(depth_m - focus_m) / (depth_m * (focus_m - focal))
-    return np.asarray(0.25 * diameter / pixel_m)
-
-
-def defocused(image: FloatImage, sigma_px: FloatImage) -> FloatImage:
-    """Each pixel's light (rows, columns, 3) spread by its own ``sigma_px`` (rows, columns)."""
-    most = float(min(sigma_px.max(initial=0.0), LARGEST_PX))
-    if most <= SMALLEST_PX:
-        return image
-    count = int(np.ceil(np.log(most / SMALLEST_PX) / np.log(STEP))) + 1
-    blurs = np.concatenate([[0.0], SMALLEST_PX * STEP ** np.arange(count)])
-    # Between two blurs the share is linear in the variance, so that each pixel's light has the variance asked for.
-    variances = [_variance(float(blur)) for blur in blurs]
-    at = np.interp(np.minimum(sigma_px, most) ** 2, variances, np.arange(len(blurs)))
-    out = np.zeros_like(image)
-    for n, sigma in enumerate(blurs):
-        share = np.maximum(1.0 - np.abs(at - n), 0.0).astype(np.float32)
-        if share.any():
-            part = image * share[..., None]
-            out += part if sigma == 0.0 else cv2.GaussianBlur(part, (0, 0), float(sigma))
-    return out
-
-
-def _variance(sigma: float) -> float:
-    """Of OpenCV's kernel, which is narrower than its Gaussian where that is as narrow as a pixel."""
-    if sigma == 0.0:
-        return 0.0
-    weights = cv2.getGaussianKernel(2 * round(4 * sigma) + 1, sigma)[:, 0]
-    return float(weights @ (np.arange(len(weights)) - len(weights) // 2) ** 2)
-
-
-ORDER: Final = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
-"""Bayer's matrix: adjacent pixels take their turns at different times."""
-
-
-def mean_light(light: FloatImage, *, levels: int, turns: int, start: float, frames: float) -> FloatImage:
-    """The mean light (rows, columns, 3) of a dithered panel during an exposure.
-
-    ``light``: wanted, 0 to 1; ``levels``: that the panel makes in one frame; ``turns``: frames in which it comes round;
-    ``start``: when the shutter opens, in frames; ``frames``: how long it is open, in frames
-    """
-    steps = np.float32(levels - 1)
-    low = np.floor(light * steps)
-    # so many of the turns show the level above
-    above = np.rint((light * steps - low) * np.float32(turns))
-    rows, columns = light.shape[:2]
-    phase = np.tile(ORDER, (rows // 4 + 1, columns // 4 + 1))[:rows, :columns, None] * turns // ORDER.size
-    mean = np.zeros_like(light)
-    for turn, weight in enumerate(seen_of_turns(turns, start, frames)):
-        mean += np.float32(weight) * (((turn + phase) % turns) < above)
-    return np.asarray((low + mean) / steps, np.float32)
-
-
-def seen_of_turns(turns: int, start: float, frames: float) -> npt.NDArray[np.float64]:
-    """Share (turns,) of an exposure that lies in each turn; they sum to 1."""
-    edges = np.arange(turns + 1)
-
-    def until(moment: float) -> npt.NDArray[np.float64]:
-        rounds, rest = divmod(moment, turns)
-        return np.asarray(rounds + np.clip(rest - edges[:-1], 0.0, 1.0))
-
-    seen = until(start + frames) - until(start)
-    return np.asarray(seen / seen.sum())
-
-
-Floats = npt.NDArray[np.float64]
-
-
-def reflected(towards_light: Floats, towards_eye: Floats, normals: Floats, roughness: float, index: float) -> Floats:
-    """pi times the varnish's reflectance (N,) for unit directions (N, 3): what a highlight adds to a paint's albedo.
-
-    D F G / (4 cos cos) with the distribution and shadowing of GGX and Fresnel's factor for unpolarised light.
-    ``roughness``: alpha of GGX; ``index``: of refraction. 0 where light or eye is below the surface.
-    """
-    half = towards_light + towards_eye
-    half = half / np.maximum(np.sqrt(dot(half, half)), 1e-12)[:, None]
-    to_light, to_eye = dot(normals, towards_light), dot(normals, towards_eye)
-    above = (to_light > 1e-6) & (to_eye > 1e-6)
-    to_light, to_eye = np.where(above, to_light, 1.0), np.where(above, to_eye, 1.0)
-    square = roughness * roughness
-    facets = square / (np.pi * (dot(normals, half) ** 2 * (square - 1.0) + 1.0) ** 2)
-    seen = _unshadowed(to_light, square) * _unshadowed(to_eye, square)
-    mirrored = fresnel(np.clip(dot(towards_light, half), 0.0, 1.0), index)
-    return np.where(above, np.pi * facets * seen * mirrored / (4.0 * to_light * to_eye), 0.0)
-
-
-def fresnel(cosine: Floats, index: float) -> Floats:
-    """Share (N,) of unpolarised light that is mirrored by a surface of a refractive ``index`` in air."""
-    inside = np.sqrt(1.0 - (1.0 - cosine**2) / index**2)
-    across = (cosine - index * inside) / (cosine + index * inside)
-    along = (index * cosine - inside) / (index * cosine + inside)
-    return np.asarray(0.5 * (across**2 + along**2))
-
-
-def _unshadowed(cosine: Floats, square: float) -> Floats:
-    """Smith's share of facets that a direction sees."""
-    return np.asarray(2.0 * cosine / (cosine + np.sqrt(square + (1.0 - square) * cosine**2)))
+def rare(what: str) -> Any:
+    """``lab.emulated.effects``, which ``what`` needs. Raises DeviceError("bench-part-missing")."""
+    return extension("effects", asked_by=what)

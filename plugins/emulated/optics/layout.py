@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import numpy as np
-
 from hal.errors import PluginError
 from hal.escapes import toml_value
 from hal.runtime.files import read_text
@@ -17,16 +15,14 @@ from plugins.emulated.core.tables import Between, load
 from plugins.emulated.core.truth import (
     ENGINES,
     BenchTruth,
-    Dithering,
     Lens,
-    Panels,
     Pose,
     ProjectorTruth,
-    Subsurface,
     SurfaceTruth,
     Three,
     Two,
 )
+from plugins.emulated.optics.effects import rare
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.scenes import BUILT_IN
 
@@ -39,15 +35,6 @@ FRONT_M, WALL_M, CEILING_M = 0.4, 0.35, 0.7
 """The table's edge, the wall and its upper edge, from the object's middle."""
 WOOD: Final = (0.42, 0.36, 0.29)
 PAINT: Final = (0.46, 0.46, 0.44)
-FILTERS_NM: Final = ((600.0, 38.0), (535.0, 38.0), (460.0, 28.0))
-"""Of a camera: peak and standard deviation for red, green and blue."""
-LAMP_NM: Final = ((625.0, 22.0), (540.0, 26.0), (455.0, 18.0))
-"""Of a projector, likewise."""
-BENT: Final = 0.02
-"""Largest first radial term of a projector's lens: about a pixel at the edge of a picture at size small."""
-MARBLE: Final = Subsurface(share=0.3, spread_m=0.0015)
-TURNS: Final = Dithering(levels=64, turns=4, frame_s=1 / 240)
-"""A panel of 64 levels, whose others are made by turns of frames."""
 
 
 def arranged(truth: BenchTruth, room: str, thing: StageObject, *, hung: bool = False) -> BenchTruth:
@@ -69,29 +56,7 @@ def arranged(truth: BenchTruth, room: str, thing: StageObject, *, hung: bool = F
             for one in truth.projectors
         ),
     )
-    return truth if room == "room" else _hard(truth, thing)
-
-
-def _hard(truth: BenchTruth, thing: StageObject) -> BenchTruth:
-    """All the rest, as strong as with real devices."""
-    rng = np.random.default_rng([truth.seed, 8])
-    sensor = dataclasses.replace(truth.camera.sensor, response_spread=0.01, hot_pixels=2e-4, shutter_spread=0.02)
-    away_m = float(np.linalg.norm(thing.vertices.mean(axis=0) - np.array(truth.camera.pose.position_m)))
-    return dataclasses.replace(
-        truth,
-        object=dataclasses.replace(truth.object, gloss=0.04, gloss_exponent=25.0, subsurface=MARBLE),
-        camera=dataclasses.replace(truth.camera, sensor=sensor, focus_m=away_m, bands_nm=FILTERS_NM),
-        projectors=tuple(_hard_projector(one, rng) for one in truth.projectors),
-    )
-
-
-def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> ProjectorTruth:
-    turn = rng.uniform(0.0, 2.0 * np.pi, 2)
-    red, blue = ((0.3 * float(np.cos(angle)), 0.3 * float(np.sin(angle))) for angle in turn)
-    panels = Panels(shift_px=(red, (0.0, 0.0), blue), magnified=(-4e-4, 0.0, 4e-4))
-    light = dataclasses.replace(projector.light, glare=0.02, white_segment=0.25, bands_nm=LAMP_NM)
-    lens = dataclasses.replace(projector.lens, distortion=(float(rng.uniform(-BENT, BENT)), 0.0))
-    return dataclasses.replace(projector, lens=lens, light=light, panels=panels, dithering=TURNS)
+    return truth if room == "room" else rare('The room "hard"').hard(truth, thing)
 
 
 def table_and_wall(thing: StageObject) -> tuple[SurfaceTruth, ...]:

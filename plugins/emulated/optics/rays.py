@@ -22,7 +22,7 @@ from embreex.mesh_construction import TriangleMesh
 from hal.runtime.compute import usable_cpus
 from plugins.emulated.core.tables import dump
 from plugins.emulated.core.truth import BenchTruth, Lens, Pose, ProjectorTruth
-from plugins.emulated.optics.effects import reflected
+from plugins.emulated.optics.effects import rare
 from plugins.emulated.optics.light_cache import read_arrays, write_arrays
 from plugins.emulated.optics.objects import Scene, StageObject, scene_of
 from plugins.emulated.optics.shapes import dot, length
@@ -246,6 +246,7 @@ def _highlight(
     cosine = np.clip(dot(half, normals), 0.0, 1.0)
     highlight = strength * (exponent + 8.0) / 8.0 * cosine**exponent
     if varnish.strength > 0.0:
+        reflected = rare("The varnish of bench.toml").reflected
         highlight += varnish.strength * reflected(towards, -ray, normals, varnish.roughness, varnish.index)
     return np.asarray(on_object * highlight)
 

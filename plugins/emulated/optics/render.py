@@ -15,16 +15,15 @@ import numpy.typing as npt
 
 from hal.runtime.jit import compiled
 from plugins.emulated.core.truth import BenchTruth, Dithering, LightTruth, ProjectorTruth
-from plugins.emulated.optics.effects import confusion_px, defocused, mean_light, veiled
+from plugins.emulated.optics.effects import rare, veiled
 from plugins.emulated.optics.footprints import KEPT_BYTES, Footprints, LitSamples
 from plugins.emulated.optics.rays import Samples
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM
-from plugins.emulated.optics.spectra import colours
-from plugins.emulated.optics.subsurface import Spread
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 
+FOCUS: Final = "The depth of field of bench.toml"
 LAYERS_KEPT: Final = 3
 LAYERS_BYTES: Final = 1 << 30
 """Of all projectors; at least one layer of each is kept."""
@@ -64,6 +63,7 @@ def channels(
     else:
         start, frames = shutter.start_s / dithering.frame_s, shutter.open_s / dithering.frame_s
         exact = _looked_up(table, frame)
+        mean_light = rare("The dithered panel of bench.toml").mean_light
         made = mean_light(exact, levels=dithering.levels, turns=dithering.turns, start=start, frames=frames)
         each = np.float32(black) + np.float32(1.0 - black) * made
     if light.white_segment > 0.0:
@@ -136,11 +136,12 @@ class Renderer:
         ]
         self._paint = _seen_paint(self._albedo, self._tensors)
         spread = truth.object.subsurface
-        self._surface = None
+        self._surface: Any = None
         if spread.share > 0.0:
             # Of the object alone: what spreads under its surface does not come out of the table that it stands on.
             width, on = truth.camera.lens.size_px[0], samples.on_object
-            self._surface = Spread.over(samples.pixels[on], samples.points[on], width, spread.spread_m)
+            kind = rare("Light under the surface, as bench.toml has it,").Spread
+            self._surface = kind.over(samples.pixels[on], samples.points[on], width, spread.spread_m)
         self._last: tuple[tuple[object, ...], FloatImage] | None = None
 
     def light(self, frames: Sequence[ByteImage], levels: Sequence[float], shutter: Shutter = ALWAYS) -> FloatImage:
@@ -263,7 +264,7 @@ class Renderer:
             flat[self._samples.pixels] = total
         image: FloatImage = flat.reshape(height, width, 3)
         if camera.focus_m > 0.0:
-            image = defocused(image, self._confusion(aperture_f))
+            image = rare(FOCUS).defocused(image, self._confusion(aperture_f))
         sigma = camera.psf_sigma_px
         if sigma > 0.05:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
@@ -278,7 +279,7 @@ class Renderer:
         (width, height), pose = camera.lens.size_px, camera.pose
         depth = (self._samples.points.astype(np.float64) - pose.position_m) @ pose.rotation[2]
         flat = np.zeros(height * width, np.float32)
-        flat[self._samples.pixels] = confusion_px(
+        flat[self._samples.pixels] = rare(FOCUS).confusion_px(
             depth, focal_px=camera.lens.focal_px, pixel_m=1e-3 * SENSOR_WIDTH_MM / width,
             aperture_f=aperture_f, focus_m=camera.focus_m,
         )  # fmt: skip
@@ -290,12 +291,13 @@ def _digest(image: npt.NDArray[Any]) -> bytes:
 
 
 def _colours(truth: BenchTruth, projector: ProjectorTruth) -> FloatImage | None:
-    """(3 camera, 3 paint, 3 channels): see ``spectra.colours``; None where light has no wavelengths."""
+    """(3 camera, 3 paint, 3 channels): see ``lab.emulated.spectra.colours``; None where light has no wavelengths."""
     light = projector.light
     if not truth.camera.spectral or not all(width > 0.0 for _, width in light.bands_nm):
         return None
     white = np.asarray(light.mixing).sum(axis=1)
-    return colours(light.bands_nm, truth.camera.bands_nm, white).astype(np.float32)
+    colours = rare("Light by wavelength, as bench.toml has it,").colours
+    return np.asarray(colours(light.bands_nm, truth.camera.bands_nm, white), np.float32)
 
 
 def _seen_paint(albedo: FloatImage, tensors: Sequence[FloatImage | None]) -> FloatImage:

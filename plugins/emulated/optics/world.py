@@ -16,7 +16,7 @@ from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.emulated.core.truth import BUMPS_FILE, FOLDER, BenchTruth, ObjectTruth
 from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
-from plugins.emulated.optics.effects import exposed_s, flickering, sensor_flaws
+from plugins.emulated.optics.effects import exposed_s, flickering, rare, sensor_flaws
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject, default_object
@@ -24,7 +24,6 @@ from plugins.emulated.optics.outputs import VisibleFrames, VisibleFrameSet
 from plugins.emulated.optics.rays import Progress, samples_of
 from plugins.emulated.optics.render import Renderer, Shutter
 from plugins.emulated.optics.sensor import SENSOR_WIDTH_MM, jpeg, mosaic
-from plugins.emulated.optics.spectra import xyz_to_camera
 
 MOST_FRAMES_IN_A_SHOT = 6
 
@@ -59,6 +58,10 @@ class World:
         self._flicker = np.random.default_rng([truth.seed, 5])
         self._moment = np.random.default_rng([truth.seed, 9])
         self._flaws = sensor_flaws(truth.camera, truth.seed)
+        self._xyz_to_camera = XYZ_TO_LINEAR_SRGB
+        if truth.camera.spectral:
+            filters = rare("A camera with filters, as bench.toml has it,")
+            self._xyz_to_camera = filters.xyz_to_camera(truth.camera.bands_nm)
 
     def __enter__(self) -> World:
         self._visible.__enter__()
@@ -164,7 +167,7 @@ class World:
             focal_length_mm=float(round(camera.lens.focal_px / camera.lens.size_px[0] * SENSOR_WIDTH_MM)),
             taken=taken,
             serial_number=camera.serial_number,
-            xyz_to_camera=xyz_to_camera(camera.bands_nm) if camera.spectral else XYZ_TO_LINEAR_SRGB,
+            xyz_to_camera=self._xyz_to_camera,
         )
         levels = {"black_level": camera.sensor.black_level, "white_level": camera.sensor.white_level}
         return ShotFiles(

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
@@ -209,6 +211,31 @@ def test_a_plane_with_measured_sides_is_metric_and_turned_right(tilt_deg: tuple[
         pose = placed["cam_from_world"].matrix()
         assert np.degrees(np.linalg.norm(cv2.Rodrigues(pose[:, :3] @ own.rotation.T)[0])) < 0.5
         assert np.linalg.norm(pose[:, 3] - own.translation_m) < 0.015
+
+
+@settings(max_examples=3)
+@given(
+    tilt_deg=st.tuples(st.floats(-30, 30), st.floats(-30, 30)),
+    left_top=st.tuples(st.integers(0, 33), st.integers(0, 23)),
+    right_bottom=st.tuples(st.integers(127, 160), st.integers(97, 120)),
+)
+def test_any_plane_lies_as_its_sides_were_measured(
+    tilt_deg: tuple[float, float], left_top: tuple[int, int], right_bottom: tuple[int, int]
+) -> None:
+    """Where a projector lights it; how far away it is only changes the unit."""
+    points, some = points_of(panel(tilt_deg)), np.zeros(CAMERA[::-1], np.bool_)
+    some[left_top[1] : right_bottom[1], left_top[0] : right_bottom[0]] = True
+    (one,) = stage = stage_of(points, [some])
+    found = shape_of(stage, "plane", sides(points)).reconstruction
+    assert found is not None
+    normals, lit = found.geometry.normals, one.valid
+    known = np.isfinite(found.geometry.points_m[..., 2])
+    assert known[lit].mean() > 0.99
+    assert not known[~lit].any()
+    assert (np.sum(normals[known] * points[known], axis=1) < 0).all(), "it faces the camera"
+    np.testing.assert_allclose(normals[known], np.broadcast_to(normals[known][0], (known.sum(), 3)), atol=1e-5)
+    np.testing.assert_allclose(found.geometry.points_m[known], points[known], atol=1e-4)
+    assert np.median(found.sigma_m[known]) < 0.002
 
 
 def test_a_plane_says_how_little_is_certain_without_measured_sides() -> None:

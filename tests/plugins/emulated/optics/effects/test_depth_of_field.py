@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plugins.emulated.optics.effects import confusion_px, defocused
+from lab.emulated.effects import confusion_px, defocused
 
 
 def test_blur_is_none_in_focus_and_as_large_as_the_aperture_lets_it() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plugins.emulated.optics.effects import mean_light, seen_of_turns
+from lab.emulated.effects import mean_light, seen_of_turns
 
 RAMP = np.tile(np.linspace(0.0, 1.0, 64, dtype=np.float32)[:, None, None], (1, 8, 3))
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from plugins.emulated.core.truth import Bands
-from plugins.emulated.optics.spectra import (
+from lab.emulated.spectra import (
     D65_WHITE,
     EDGES_NM,
     SOFT_NM,
@@ -19,6 +18,7 @@ from plugins.emulated.optics.spectra import (
     paint_bands,
     xyz_to_camera,
 )
+from plugins.emulated.core.truth import Bands
 
 LAMP: Bands = ((612.0, 22.0), (541.0, 27.0), (457.0, 17.0))
 FILTERS: Bands = ((598.0, 38.0), (538.0, 42.0), (462.0, 30.0))

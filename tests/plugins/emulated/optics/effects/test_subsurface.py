@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import k0
 
-from plugins.emulated.optics import subsurface
-from plugins.emulated.optics.subsurface import Spread
+from lab.emulated import subsurface
+from lab.emulated.subsurface import Spread
 
 SIDE = 121
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plugins.emulated.optics.effects import fresnel, reflected
+from lab.emulated.effects import fresnel, reflected
 
 mi = pytest.importorskip("mitsuba")
 mi.set_variant("scalar_rgb")
