@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.optics.transport.indirect.indirect_light import IndirectLight
 from controller.optics.transport.operator import LightTransport
@@ -34,6 +34,10 @@ APART_PX: Final = 8
 """Between views."""
 SMOOTH_PX: Final = 9
 """Projector pixels over which samples are counted: the shares of two views change slowly into each other."""
+LEAST_SHARE: Final = 0.05
+"""What a view says of a place counts above it."""
+MOSTLY: Final = 0.7
+"""A mean says something where more than this share of it is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +108,7 @@ class ViewsTransport(LightTransport):
         samples = np.stack([_samples(view) for view in views])
         total = samples.sum(axis=0)
         own = np.divide(samples, total, out=np.zeros_like(samples), where=total > 0)
-        shares = [_seen_share(view, share) * view.object_mask for view, share in zip(views, own, strict=True)]
+        shares = [_seen(view, [share])[0] * view.object_mask for view, share in zip(views, own, strict=True)]
         weight = own * samples
         total = weight.sum(axis=0)
         trust = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
@@ -122,6 +126,31 @@ class ViewsTransport(LightTransport):
         for view, box in zip(self.views, self.sheet.boxes(), strict=True):
             by_row[:, :, box.top : box.bottom] = view.mixing_of(n)
         return by_row
+
+    def by_places(self, image: FloatImage, mask: Mask) -> tuple[FloatImage, FloatImage, Mask]:
+        """How views differ in an ``image`` of the sheet (rows, columns, 3), known in ``mask``: as the pixel's own view
+        has it, as others have it by their ``trust``, and (rows, columns) which pixels' places others see.
+
+        Both are means over ``SMOOTH_PX`` projector pixels, so that no view differs by its sharpness.
+        """
+        planes = np.ascontiguousarray(np.where(mask[..., None], image, 0).transpose(2, 0, 1), np.float32)
+        known = np.ascontiguousarray(np.broadcast_to(mask, planes.shape), np.float32)
+        means = []
+        for (view, part), (_, there) in zip(self._parts(planes), self._parts(known), strict=True):
+            image_mean, share = (view.gaussian_mean_planes(np.ascontiguousarray(one)) for one in (part, there))
+            means.append(np.stack([_smooth(view, plane) for plane in (*image_mean, share[0])]))
+        total = np.sum([trust * own for trust, own in zip(self.trust, means, strict=True)], axis=0)
+        seen = []
+        for trust, own, view in zip(self.trust, means, self.views, strict=True):
+            others = (total - trust * own) / np.maximum(1 - trust, LEAST_SHARE)
+            counts = (trust < 1 - LEAST_SHARE) & (trust > LEAST_SHARE) & (own[3] > MOSTLY) & (others[3] > MOSTLY)
+            values = [
+                np.where(counts, one[c] / np.maximum(one[3], MOSTLY), 0) for one in (own, others) for c in range(3)
+            ]
+            seen.append(np.stack(_seen(view, [*values, counts.astype(np.float32)]), axis=-1))
+        sheet = self.sheet.joined(seen)
+        share = np.maximum(sheet[..., 6:], MOSTLY)
+        return sheet[..., :3] / share, sheet[..., 3:6] / share, np.asarray(mask & (sheet[..., 6] > MOSTLY))
 
     # planes
 
@@ -231,21 +260,27 @@ class ViewsTransport(LightTransport):
 def _samples(view: LightTransport) -> FloatImage:
     """(pixels,) how many of the view's pixels see each projector pixel, as a mean over its neighbours."""
     counted = np.divide(1, view.per_weight, out=np.zeros_like(view.per_weight), where=view.per_weight > 0)
-    counted = np.minimum(counted, np.float32(view.lit[0].size))
+    return _smooth(view, np.minimum(counted, np.float32(view.lit[0].size)))
+
+
+def _smooth(view: LightTransport, values: FloatImage) -> FloatImage:
+    """(pixels,): means of ``values`` (pixels,) over the neighbours of each projector pixel."""
     return np.concatenate([
-        cv2.blur(counted[view.span(n)].reshape(size), (SMOOTH_PX, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE).ravel()
+        cv2.blur(values[view.span(n)].reshape(size), (SMOOTH_PX, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE).ravel()
         for n, size in enumerate(view.sizes)
     ])  # fmt: skip
 
 
-def _seen_share(view: LightTransport, share: FloatImage) -> FloatImage:
-    """(rows, columns): the share (pixels,) of the projector pixels that light each pixel, as a mean by their light."""
-    planes = np.empty((3, view.pixels), np.float32)
-    planes[:] = 1
-    light = view.forward_planes(planes).sum(axis=0)
-    planes[:] = share
-    part = view.forward_planes(planes).sum(axis=0)
-    return np.asarray(np.clip(np.divide(part, light, out=np.zeros_like(part), where=light > 0), 0, 1))
+def _seen(view: LightTransport, values: Sequence[FloatImage]) -> list[FloatImage]:
+    """(rows, columns) each: ``values`` (pixels,) of the projector pixels that light a pixel, a mean by their light."""
+    planes = np.ones((3, view.pixels), np.float32)
+    light, found = view.forward_planes(planes).sum(axis=0), []
+    for one in values:
+        planes[:] = one
+        part = view.forward_planes(planes).sum(axis=0)
+        mean = np.divide(part, light, out=np.zeros_like(part), where=light > 0)
+        found.append(np.asarray(np.clip(mean, one.min(), one.max())))
+    return found
 
 
 def _beside(views: Sequence[LightTransport]) -> npt.NDArray[np.bool_] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from controller.optics.calibrate.values import Calibration, Geometry, ProjectorC
 from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.engine import Engine, Processor
 from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.solve.targets.sheets import Places, mesh_places, on_sheet
 from controller.optics.solve.targets.values import connected, pieces
 from controller.optics.transport import LightTransport, build_transport
@@ -34,6 +35,9 @@ from controller.stage.artefacts.geometry import (
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import SolvedBase
 from controller.stage.artefacts.views import first_view, view_folders
+
+CLEARLY: Final = 3.0
+"""CIEDE2000 above which a difference between views is easily seen."""
 
 
 class View(NamedTuple):
@@ -187,8 +191,21 @@ class Calibrated:
             self._reflectance = own_reflectance(self.calibration, geometry)
         return self._reflectance
 
+    def differences(self, image: FloatImage, mask: Mask, white: float) -> FloatImage | None:
+        """By how much the views differ in light (rows, columns, 3) known in ``mask``, CIEDE2000; ``white``: its white.
+
+        (rows, columns), NaN where no other view sees the place; None for the only view.
+        """
+        return None
+
     def keep_base(self, base: Base) -> None:
         self._base = base.in_files(self.folder)
+
+
+def share_above(differs: FloatImage) -> float:
+    """Where views differ clearly, as a share of what several see; ``differs``: of ``Calibrated.differences``."""
+    several = int(np.isfinite(differs).sum())
+    return float((differs > CLEARLY).sum()) / several if several else 0.0
 
 
 def all_views(run: Path, projectors: Sequence[str], engine: Engine | None = None) -> Calibrated:
@@ -263,6 +280,13 @@ class AllViews(Calibrated):
             _ = self.gains
             self._transport = ViewsTransport.of([view.transport for view in self._views])
         return self._transport
+
+    def differences(self, image: FloatImage, mask: Mask, white: float) -> FloatImage | None:
+        transport = self.transport
+        assert isinstance(transport, ViewsTransport)
+        own, others, seen = transport.by_places(image, mask)
+        difference = colour_difference(own, others, self.calibration.camera_to_xyz, white, seen)
+        return np.where(seen, difference, np.float32(np.nan))
 
     @property
     def reflected(self) -> ReflectedLight | None:

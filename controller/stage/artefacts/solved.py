@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from controller.optics.solve.targets.values import Target
 
 _SOLUTION = ("objective", "kkt", "iterations", "seconds", "converged")
+
+
+DIFFERS: Final = "differs"
+"""The name of ``Solved.differs`` in the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +135,7 @@ class Solved:
     ``target`` (camera rows, columns, 3): radiance in full scales per second; ``reachable`` (camera rows, columns)
     ``figures``: of the solve (docs/reference/report.md); ``exposure`` is the radiance of the target's white
     ``asked``: before any adaptation; None where this is ``target``
+    ``differs`` (camera rows, columns): by how much other views ask for something else there, CIEDE2000, or NaN
     """
 
     frames: dict[str, ByteImage]
@@ -139,6 +144,7 @@ class Solved:
     reachable: Mask
     figures: dict[str, object]
     asked: RequestedTarget | None = None
+    differs: FloatImage | None = None
 
     @property
     def exposure(self) -> float:
@@ -159,14 +165,17 @@ class Solved:
         if asked is not None:
             asked = RequestedTarget(part(asked.target) / gain, part(asked.reachable), part(asked.valid))
         figures = {**self.figures, "exposure": self.exposure / float(gain.mean())}
-        target = part(self.target) / gain
-        return replace(self, target=target, reachable=part(self.reachable), asked=asked, figures=figures)
+        target, differs = part(self.target) / gain, None if self.differs is None else part(self.differs)
+        reachable = part(self.reachable)
+        return replace(self, target=target, reachable=reachable, asked=asked, figures=figures, differs=differs)
 
     def write(self, run: Path, name: str) -> list[Path]:
         frames = {**_named("device", self.frames), **_named("linear", self.linear)}
         arrays = npz_path(run, StepKind.APPEARANCE, name)
         asked = {} if self.asked is None else _named("asked", {
             "target": self.asked.target, "reachable": self.asked.reachable, "valid": self.asked.valid})  # fmt: skip
+        if self.differs is not None:
+            asked[DIFFERS] = self.differs
         save_arrays(arrays, {**frames, "target": self.target, "reachable": self.reachable, **asked})
         return [arrays, write_json(json_path(run, StepKind.APPEARANCE, name), self.figures)]
 

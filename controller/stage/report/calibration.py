@@ -39,7 +39,7 @@ from controller.stage.artefacts.pattern_plans import patterns_figures, photograp
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
 from controller.stage.artefacts.views import VIEWS, first_view, view_folders
 from controller.stage.report import plots
-from controller.stage.report.galleries import causes_gallery, light_gallery, whites
+from controller.stage.report.galleries import causes_gallery, light_gallery, views_gallery, whites
 from controller.stage.report.page import Goal, Page, PageTable, ReportPicture, write_report
 from controller.stage.report.pictures import Crop, crop_around, fitted, to_screen
 from controller.stage.report.words import SUPERPOSITION, When, moment, spent
@@ -103,6 +103,7 @@ def write_calibration_report(run: Path, asked: StageDescription, out: Path | Non
               *_maps(run, calibration, crop, fine))),
             *causes_gallery(run, figures["verification"], calibration.object_mask.shape),
             *light_gallery(calibration, crop),
+            *views_gallery(run, asked.projectors),
             ("Plots", "", _plots(run, calibration, earlier, asked.worst_grade, figures, when)),
         ),
         steps=spent(_steps(run)),

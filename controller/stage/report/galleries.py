@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import ByteImage, FloatImage
+from controller.core.arrays import ByteImage, FloatImage, load_arrays
 from controller.optics.calibrate.values import Calibration
+from controller.stage.artefacts.calibrated import all_views, share_above
 from controller.stage.artefacts.grade import PICTURE, parts_of
+from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.solved import DIFFERS
 from controller.stage.report import plots
 from controller.stage.report.page import Gallery, ReportPicture
-from controller.stage.report.pictures import Crop, read_picture, to_screen
+from controller.stage.report.pictures import ERROR_SCALE_DELTA_E, Crop, crop_around, read_picture, to_screen
 
 SHOWN: Final = 3
 """Reasons of a projector, the most important first."""
@@ -89,3 +92,38 @@ def light_gallery(calibration: Calibration, crop: Crop) -> tuple[Gallery, ...]:
         ReportPicture("Share of indirect light", field),
     )
     return (("Direct and indirect light", text, pictures),)
+
+
+GLOSS: Final = (
+    "Each map is of what several cameras see. Where paint shines, they see different light at one place, and an "
+    "appearance is right from one side at most. Where an appearance asks for different colours, the object shows one "
+    "between."
+)
+
+
+def views_gallery(run: Path, projectors: Sequence[str]) -> tuple[Gallery, ...]:
+    """By how much the views of a run differ, in the object's own light and in each appearance; none for one view."""
+    calibrated = all_views(run, projectors)
+    views = calibrated.views()
+    if len(views) == 1:
+        return ()
+    calibration = calibrated.calibration
+    white, mask = whites(calibration)[0], calibration.object_mask
+    usual = float(np.percentile(channels.mean(white)[mask], 99)) if mask.any() else 1.0
+    found = calibrated.differences(white, mask, max(usual, 1e-12))
+    maps = {} if found is None else {"white light": [view.part(found) for view in views]}
+    for file in sorted(run.glob(f"{StepKind.APPEARANCE}-*.npz")):
+        own = [
+            load_arrays(view.folder / file.name).get(DIFFERS) for view in views if (view.folder / file.name).exists()
+        ]
+        if len(own) == len(views) and all(one is not None for one in own):
+            maps[file.stem.partition("-")[2]] = own
+    pictures = []
+    for what, parts in maps.items():
+        for name, view, one in zip(calibrated.names, views, parts, strict=True):
+            crop = crop_around(view.part(mask))
+            cut = plots.field(one[crop.rows, crop.columns], "CIEDE2000", least=0, most=ERROR_SCALE_DELTA_E)
+            pictures.append(ReportPicture(f"{what}, view {name}", cut))
+    shares = {what: share_above(np.concatenate([one.ravel() for one in parts])) for what, parts in maps.items()}
+    told = ", ".join(f"{what} {100 * share:.0f} %" for what, share in shares.items())
+    return (("Where views differ", f"{GLOSS} They differ clearly on so much of it: {told}.", tuple(pictures)),)

@@ -25,7 +25,7 @@ from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.targets.values import Target
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import Calibrated, share_above
 from controller.stage.artefacts.grade import FIGURES
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.outline import outline_digest
@@ -35,6 +35,8 @@ from hal.notices import Level
 from hal.runtime.compute import free_bytes
 
 BASE = StepId(StepKind.BASE)
+FEW: Final = 0.01
+"""Of what several views see: less than this need not be known."""
 MOSTLY: Final = 0.5
 """A target of which less is in reach is mostly out of reach."""
 
@@ -191,10 +193,19 @@ def _solve_appearance(
         context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
     for line in _limits(request.title, made.figures, options.share):
         context.reporter.say(line, Level.WARNING)
+    differs = calibrated.differences(made.target, made.valid, float(str(made.figures["exposure"])))
+    differ = 0.0 if differs is None else share_above(differs)
+    if differ > FEW:
+        context.reporter.say(
+            f"{request.title}: views ask for different colours on {differ:.0%} of what several of them see, and get "
+            "something between. `velatura report STAGE` shows where.",
+            Level.WARNING,
+        )
     figures: dict[str, object] = {
         "name": request.name,
         "title": request.title,
         **made.figures,
+        **({} if differs is None else {"views_differ_share": differ}),
         "seconds_with_target": time.perf_counter() - began_s,
     }
     solved = Solved(
@@ -204,6 +215,7 @@ def _solve_appearance(
         reachable=made.reachable,
         figures=figures,
         asked=RequestedTarget(made.asked, made.asked_reachable, made.valid),
+        differs=differs,
     )
     return [
         path

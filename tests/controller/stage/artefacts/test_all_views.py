@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,27 @@ from controller.optics.solve.targets.values import Target, connected
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
-from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views
+from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views, share_above
 from controller.stage.artefacts.projectors import Light
 from controller.stage.artefacts.solved import SolvedBase, is_solved, read_solved
 from controller.stage.artefacts.views import view_folder, write_view
+from controller.stage.report.galleries import views_gallery
 from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
 from hal.deadline import in_seconds
+from hal.notices import Level
 from lab.timings.tools.synthetic import synthetic_calibration, write_synthetic_run
 
 PROJECTOR = (14, 18)
 CAMERAS = {"left": (36, 50), "right": (52, 70)}
 GAIN = np.array([0.7, 1.9, 1.2], np.float32)
+
+
+class Told(Silent):
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str, level: Level = Level.INFO) -> None:
+        self.said.append(text)
 
 
 def other_units(calibration: Calibration, matrix: np.ndarray) -> Calibration:
@@ -44,12 +55,17 @@ def other_units(calibration: Calibration, matrix: np.ndarray) -> Calibration:
     return dataclasses.replace(calibration, projectors=tuple(parts), black=black)
 
 
-def two_views(run: Path) -> tuple[list[str], AllViews]:
-    """The same object by two cameras in one place, one of them with more pixels and other units."""
-    for number, (name, camera) in enumerate(CAMERAS.items()):
+def two_views(run: Path, larger: int = 1) -> tuple[list[str], AllViews]:
+    """The same object by two cameras in one place, one of them with more pixels and other units.
+
+    All pictures are so many times ``larger``.
+    """
+    for number, (name, size) in enumerate(CAMERAS.items()):
+        camera = larger * size[0], larger * size[1]
         folder = run if number == 0 else view_folder(run, name)
         folder.mkdir(parents=True, exist_ok=True)
-        names = write_synthetic_run(folder, projector=PROJECTOR, camera=camera)
+        pixels = larger * PROJECTOR[0], larger * PROJECTOR[1]
+        names = write_synthetic_run(folder, projector=pixels, camera=camera)
         if number:
             for projector in names:
                 light = Light.read(folder, projector)
@@ -106,6 +122,57 @@ def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_pa
     np.testing.assert_allclose(again.base.image, calibrated.base.image)
 
 
+def test_where_views_ask_for_different_colours_is_told_and_kept(tmp_path: Path) -> None:
+    names, calibrated = two_views(tmp_path, 3)
+    masks = [np.ones((3 * rows, 3 * columns), np.bool_) for rows, columns in CAMERAS.values()]
+    grey = [np.full((*mask.shape, 3), 0.4, np.float32) for mask in masks]
+    other = [image.copy() for image in grey]
+    rows, columns = masks[1].shape
+    there = np.s_[rows // 4 : rows // 2, columns // 4 : columns // 2]
+    other[1][there] = 0.4 * np.array([1.3, 0.9, 0.6], np.float32)
+    told, shares = Told(), []
+    for name, images in (("alike", grey), ("apart", other)):
+        with Journal(tmp_path) as journal:
+            target = Target(calibrated.joined(images), calibrated.joined(masks))
+            request = AppearanceRequest(name, name, partial(Target, target.image, target.mask), {})
+            steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+            Runner(steps, journal, reporter=told).run("appearance", deadline=in_seconds(120))
+        shares.append(float(str(read_solved(tmp_path, name, names).figures["views_differ_share"])))
+    assert shares[0] < 0.01, "too little to be told"
+    assert 0.06 < shares[1] < 0.3, "a sixteenth of both, and what is near it"
+    assert [line for line in told.said if "views ask" in line] == [
+        f"apart: views ask for different colours on {shares[1]:.0%} of what several of them see, and get something "
+        "between. `velatura report STAGE` shows where."
+    ]
+    with np.load(view_folder(tmp_path, "right") / "appearance-apart.npz") as kept:
+        differs = kept["differs"]
+    assert differs.shape == masks[1].shape
+    assert np.nanmedian(differs[there]) > 3
+    assert np.nanmedian(differs[rows // 2 + 36 :]) < 1
+    text, pictures = views_gallery(tmp_path, names)[0][1:]
+    assert len(pictures) == 3 * 2
+    assert f"alike 0 %, apart {100 * shares[1]:.0f} %" in text
+
+
+def test_a_highlight_that_one_view_sees_is_a_difference(tmp_path: Path) -> None:
+    names, calibrated = two_views(tmp_path, 3)
+    white = np.sum([part.white for part in calibrated.calibration.projectors], axis=0)
+    mask = calibrated.calibration.object_mask
+    usual = float(white.mean(axis=2)[mask].max())
+    even = calibrated.differences(white, mask, usual)
+    assert even is not None
+    assert np.nanmedian(even) < 1
+    box = calibrated.sheet.boxes()[1]
+    place = np.s_[box.top + 60 : box.top + 96, 75:135]
+    shining = white.copy()
+    shining[place] *= 1.6
+    found = calibrated.differences(shining, mask, usual)
+    assert found is not None
+    assert np.nanmedian(found[place]) > 3
+    assert share_above(found) > share_above(even)
+    assert Calibrated(tmp_path, names).differences(white, mask, usual) is None
+
+
 def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None:
     names, calibrated = two_views(tmp_path)
     one, folder = Calibrated(tmp_path, names), view_folder(tmp_path, "right")
@@ -113,7 +180,7 @@ def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None
         grey = [np.full((*size, 3), 0.4, np.float32) for size in sizes]
         target = Target(of.joined(grey), of.joined([np.ones(size, np.bool_) for size in sizes]))
         with Journal(tmp_path) as journal:
-            request = AppearanceRequest("look", "Look", lambda target=target: target, {})
+            request = AppearanceRequest("look", "Look", partial(Target, target.image, target.mask), {})
             steps = solve_steps(of, [request], SolveOptions(0.9, 0.001, "full"), ())
             Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
     assert is_solved(folder, "look")
