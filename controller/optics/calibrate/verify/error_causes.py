@@ -50,7 +50,7 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
         "darken what stands around the object, or use targets that are less dark there",
     ),
     ErrorCause.UNEXPLAINED: ("unexplained", "no simple reason was found",
-                         "glossy or translucent surfaces and reflections between surfaces can cause this"),
+                         "gloss, metal, translucent surfaces and reflections can cause this: make shiny metal matt"),
 }  # fmt: skip
 """Short name, description, remedy."""
 

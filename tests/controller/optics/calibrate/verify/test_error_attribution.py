@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -107,6 +108,43 @@ def test_indirect_light_is_the_reason_where_there_is_much_of_it() -> None:
     assert "indirect light" in [row["reason"] for row in ranked(found)]
     exact = attribute_error(light, calibration, 0, SHOWN, seen + back, variance=variance(seen), indirect=back)
     assert not exact.labels.any()
+
+
+def of_metal(light: OneToOne) -> FloatImage:
+    """A mirror in the middle shows another part of the object."""
+    seen = light.forward_part(0, SHOWN)
+    seen[PATCH] = seen[:, ::-1][:30, :40]
+    return seen
+
+
+def of_a_dent(light: OneToOne) -> FloatImage:
+    """15 % less light at levels between two measured ones."""
+    dent = 0.15 * np.exp(-(((SHOWN - 0.6) / 0.12) ** 2))
+    return light.forward_part(0, np.asarray(SHOWN * (1 - dent), np.float32))
+
+
+def of_a_knock(light: OneToOne) -> FloatImage:
+    """Knocked after its x patterns: places are known across as before, and down as now."""
+    return light.forward_part(0, np.asarray(np.roll(SHOWN, 1, axis=1), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("seen_of", "reason", "advice"),
+    [
+        (of_metal, "unexplained", "make shiny metal matt"),
+        (of_a_dent, "brightness", "picture mode"),
+        (of_a_knock, "moved", "velatura drift"),
+    ],
+)
+def test_what_no_part_of_the_model_describes_has_a_reason_and_advice(
+    seen_of: Callable[[OneToOne], FloatImage], reason: str, advice: str
+) -> None:
+    light, calibration = stage()
+    seen = seen_of(light)
+    found = ranked(attribute_error(light, calibration, 0, SHOWN, seen, variance=variance(seen)))
+    assert found[0]["reason"] == reason
+    assert found[0]["error_share"] > 0.5
+    assert advice in found[0]["sentence"]
 
 
 def test_colours_differ_for_every_reason() -> None:
