@@ -242,7 +242,7 @@ class CalibratedRun:
 
     @property
     def indirect(self) -> IndirectLight | None:
-        """The light by way of other surfaces; None if the run measured none that counts."""
+        """The light by way of other surfaces without table and walls (these: ``predicted``); None if none counts."""
         return self._calibrated.indirect
 
     def predicted(self, frames: Sequence[npt.ArrayLike]) -> FloatImage:
@@ -250,7 +250,6 @@ class CalibratedRun:
 
         (camera rows, columns, 3) float32, as for the grade: the black image, direct light, and what object and room
         throw back.
-        ``indirect.forward(transport.forward(frames))`` leaves out what comes back from table and walls.
         """
         light = self.calibration.black.astype(np.float32)
         for n, frame in enumerate(frames):
