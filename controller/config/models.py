@@ -291,7 +291,7 @@ class SolveTable(ConfigTable):
         '"high-pass" (the fine detail of each target, with a solve for each)',
     )
     adapt: float = Field(
-        default=1.0,
+        default=0.5,
         ge=0,
         le=1,
         description="how far a target is bent where it is darker or more saturated than can be shown, so that the "

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.config.models import SolveTable
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError
 from controller.optics.solve.reach.adaptation import adapted_target
@@ -85,6 +86,26 @@ def test_dark_places_of_the_object_do_not_show_through_a_highlight() -> None:
     bent = shown(adapted(wanted, floor), floor)
     inside = np.s_[20:-20, 20:-20, 1]
     assert np.log(bent[inside]).std() < 0.25 * np.log(cut[inside]).std()
+
+
+def test_the_default_hides_what_a_cut_off_target_shows_and_spares_what_is_in_reach() -> None:
+    """Light of other surfaces in squares: full adaptation costs pixels in reach more than what they hide is worth."""
+    squares = checked(8)[..., None] * np.float32(0.1 * np.median(REACH))
+    floor = np.asarray(STAGE.black + squares, np.float32)
+    rising = np.linspace(0.2, 1.2, 160, dtype=np.float32)[None, :, None]
+    wanted = np.asarray(STAGE.black + 0.02 * float(np.median(REACH)) * rising, np.float32)
+    wanted = np.broadcast_to(wanted, floor.shape).copy()
+    inside = np.s_[20:-20, 20:-20]
+    reach = feasibility(TRANSPORT, wanted - squares, STAGE.black, drive=DRIVE).reachable[inside]
+    pattern, costs = [], []
+    for strength in (0.0, SolveTable().adapt, 1.0):
+        seen = shown(adapted(wanted, floor, strength=strength), floor)
+        error = np.log(seen / wanted)[..., 1][inside]
+        pattern.append(float(error.std()))
+        costs.append(float(np.percentile(np.abs(error[reach]), 95)))
+    cut, default, full = pattern
+    assert full < default < 0.65 * cut
+    assert costs[1] < 0.75 * costs[2]
 
 
 def test_coloured_light_that_no_grey_outshines_lifts_nothing_around() -> None:
