@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -190,3 +191,33 @@ def test_no_datagram_raises(datagram: bytes) -> None:
         frame_of(found, "10.0.0.7", ArtNetOptions(channel=510))
     elif found is not None:
         assert 0 <= found.lowest <= 0xFFFF
+
+
+def test_of_sixty_that_ask_at_once_twenty_are_answered_and_the_others_when_they_ask_again(
+    kiosk: MemoryKiosk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("random.uniform", lambda _, longest: longest)
+    with shown(kiosk, tmp_path) as port, contextlib.ExitStack() as asking:
+        askers = [asking.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(60)]
+        for number, asker in enumerate(askers):
+            asker.bind((f"127.0.1.{number + 1}", port))
+            asker.settimeout(0)
+
+        def answered(asked: list[socket.socket]) -> list[socket.socket]:
+            """In a little more than the longest delay."""
+            for asker in asked:
+                asker.sendto(POLL, ("127.0.0.1", port))
+            time.sleep(artnet.LONGEST_DELAY_S + 0.5)
+            return [asker for asker in asked if _has_one(asker)]
+
+        wait_for(lambda: answered(askers[:1]))
+        first = answered(askers)
+        assert len(first) == artnet.MOST_POLLS_WAITING
+        others = [asker for asker in askers if asker not in first]
+        assert len(answered(others[:10])) == 10
+
+
+def _has_one(asker: socket.socket) -> bool:
+    with contextlib.suppress(BlockingIOError):
+        return bool(asker.recv(1024))
+    return False

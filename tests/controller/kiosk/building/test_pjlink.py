@@ -257,3 +257,18 @@ def test_every_line_gets_one_line_that_is_no_more_than_the_longest(line: bytes, 
         answer = command.answer(told)
         assert answer.count(b"\r") == 1
         assert len(answer) <= 136
+
+
+def test_sixteen_of_twenty_clients_are_heard_and_sixteen_again_when_they_have_left(
+    kiosk: MemoryKiosk, tmp_path: Path
+) -> None:
+    with stage(kiosk, tmp_path) as port:
+
+        def heard() -> int:
+            with contextlib.ExitStack() as stack:
+                clients = [stack.enter_context(socket.create_connection(("127.0.0.1", port), 10)) for _ in range(20)]
+                return sum(client.recv(64) == b"PJLINK 0\r" for client in clients)
+
+        # Those of the call before may still be leaving.
+        wait_for(lambda: heard() == 16)
+        wait_for(lambda: heard() == 16)
