@@ -216,3 +216,25 @@ def test_the_stage_can_make_each_rule_stricter_but_not_laxer(rule: str) -> None:
     at_least = replace(LampRules(0, 0, 0, 0), **{rule: 900.0})
     guard = LampGuard("left", Lamp(World()), Shelf(), at_least=at_least, clock=World())
     assert guard.capabilities.lamp_rules == replace(RULES, **{rule: 900.0})
+
+
+def test_a_lamp_rests_at_least_until_it_is_cool() -> None:
+    world = World()
+    lamp = Lamp(world)
+    cool_down_s = RULES.minimum_off_s + 50
+    guard = LampGuard("left", lamp, Shelf(), at_least=replace(RULES, cool_down_s=cool_down_s), clock=world)
+    guard.switch_on(deadline=soon())
+    guard.switch_off(deadline=soon())
+    world.time_s += RULES.minimum_off_s + 1
+    assert refusal(lambda: guard.switch_on(deadline=soon())) == "lamp-resting"
+    world.time_s += 49
+    guard.switch_on(deadline=soon())
+
+
+def test_mains_stay_on_until_a_lamp_could_have_cooled_that_was_never_seen() -> None:
+    world = World()
+    world.time_s += 10 * RULES.cool_down_s
+    guard, _ = a_guard(world)
+    assert not guard.may_open_mains(deadline=soon())
+    world.time_s += RULES.cool_down_s
+    assert guard.may_open_mains(deadline=soon())
