@@ -11,6 +11,8 @@ import pytest
 from controller.core.errors import WorkError
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile, LampRecord
+from hal.deadline import Deadline
+from hal.errors import DeviceRefused
 from hal.interfaces import Projector
 from hal.values import LampRules, Power, ProjectorStatus
 from tests.controller.stage.rig.lamp_model import RULES, Lamp, Shelf, World, refusal, soon
@@ -238,3 +240,16 @@ def test_mains_stay_on_until_a_lamp_could_have_cooled_that_was_never_seen() -> N
     assert not guard.may_open_mains(deadline=soon())
     world.time_s += RULES.cool_down_s
     assert guard.may_open_mains(deadline=soon())
+
+
+def test_a_strike_that_the_projector_refuses_does_not_count() -> None:
+    class Refusing(Lamp):
+        def switch_on(self, *, deadline: Deadline) -> None:
+            raise DeviceRefused("lamp-locked", what="It is locked.", remedy="Unlock it.")
+
+    world, shelf = World(), Shelf()
+    guard = LampGuard("left", Refusing(world), shelf, clock=world)
+    assert refusal(lambda: guard.switch_on(deadline=soon())) == "lamp-locked"
+    assert not guard.may_be_lit
+    assert guard.use().strikes == 0
+    assert not LampGuard("left", Lamp(world), shelf, clock=world).may_be_lit
