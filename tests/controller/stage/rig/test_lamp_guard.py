@@ -253,3 +253,11 @@ def test_a_strike_that_the_projector_refuses_does_not_count() -> None:
     assert not guard.may_be_lit
     assert guard.use().strikes == 0
     assert not LampGuard("left", Lamp(world), shelf, clock=world).may_be_lit
+
+
+def test_a_lamp_of_unknown_state_rests_from_when_it_was_switched_off() -> None:
+    world = World()
+    guard, lamp = a_guard(world)
+    lamp.reports = ProjectorStatus(Power.UNKNOWN)
+    guard.switch_off(deadline=soon())
+    assert guard.rest_left_s() == RULES.minimum_off_s
