@@ -8,17 +8,21 @@ from functools import partial
 import numpy as np
 from numba import prange
 
+from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import ByteImage, FloatImage
 from controller.core.jit import compiled
 from controller.optics.calibrate.values import Calibration
-from controller.optics.solve.appearance import Base, base_image, scale_frames, solve_base
+from controller.optics.solve.appearance import Base, StageLight, base_image, scale_frames, solve_base
+from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import exposures, target_radiance
+from controller.optics.solve.request import SolveOptions, aim_at, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.scaling.interactive import interactive
+from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
 from lab.timings import Row, Timing, at_most, peak_bytes, timed
-from lab.timings.tools.synthetic import synthetic_calibration, synthetic_target
+from lab.timings.tools.synthetic import synthetic_calibration, synthetic_indirect, synthetic_target
 from lab.timings.tools.traced import Sweep, Trace, traced
 
 STREAMED_FLOATS = 1 << 27
@@ -51,6 +55,7 @@ def measure(size: str) -> list[Row]:
     exposure, _ = exposures(DriveLevels.of_transport(transport), reflectance, calibration.black)
     target = target_radiance(reflectance, calibration.black, exposure)
     rows += _solve(transport, calibration, target, paper=paper)
+    rows += _whole(transport, calibration, reflectance)
     return rows
 
 
@@ -131,6 +136,28 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
                 how=f"{shown}; by every sample and error diffusion {slow}")
     )  # fmt: skip
     return rows
+
+
+def _whole(transport: LightTransport, calibration: Calibration, reflectance: FloatImage) -> list[Row]:
+    """A warm appearance with indirect light as the program makes it, in processor time: by the share of its parts."""
+    drive, indirect = DriveLevels.of_transport(transport), synthetic_indirect(calibration, transport.object_mask)
+    light = StageLight(transport, calibration.black, indirect, drive)
+    target = Target(reflectance, np.ones(reflectance.shape[:2], np.bool_))
+    options, sweeps, spent, aims = SolveOptions(share=0.9, smoothness=SMOOTHNESS, adapt=1.0), [0], [], []
+    context = SolveContext(progress=lambda number, kkt: sweeps.append(number))
+    for _ in range(3):
+        began = time.process_time()
+        aim_at(drive, light.black, indirect, target.image, options)
+        aims.append(time.process_time() - began)
+        began, sweeps[:] = time.process_time(), [0]
+        solve_appearance(light, None, target, options, context)
+        spent.append(time.process_time() - began)
+    whole, aim = min(spent), min(aims)
+    how = f"{len(sweeps) - 1} sweeps of two solves; the least of {len(spent)}"
+    return [
+        at_most("a warm appearance with indirect light", whole, None, unit="s of processor time", how=how),
+        at_most("of it before the solves", aim / whole, None, unit="", how="exposure, indirect light, adaptation"),
+    ]
 
 
 def _near(what: str, trace: Trace, gap: float, goal: float | None) -> list[Row]:

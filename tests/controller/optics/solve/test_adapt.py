@@ -96,7 +96,7 @@ def test_the_default_hides_what_a_cut_off_target_shows_and_spares_what_is_in_rea
     wanted = np.asarray(STAGE.black + 0.02 * float(np.median(REACH)) * rising, np.float32)
     wanted = np.broadcast_to(wanted, floor.shape).copy()
     inside = np.s_[20:-20, 20:-20]
-    reach = feasibility(TRANSPORT, wanted - squares, STAGE.black, drive=DRIVE).reachable[inside]
+    reach = feasibility(DRIVE, wanted - squares, STAGE.black).reachable[inside]
     pattern, costs = [], []
     for strength in (0.0, SolveTable().adapt, 1.0):
         seen = shown(adapted(wanted, floor, strength=strength), floor)
