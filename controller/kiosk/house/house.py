@@ -23,20 +23,24 @@ from pydantic import BaseModel, Field, ValidationError
 
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.files import read_text
+from controller.core.storage import sha256_of, write_atomically
 from controller.kiosk.backup import OURS
 from controller.kiosk.backup import Folder as BackupFolder
 from controller.kiosk.house.member import Order, Report
+from controller.kiosk.install.system import System
 from controller.kiosk.operations.dispatch import CALLER
-from controller.kiosk.operations.house import HOUSE_FILE, HouseEvent, HouseNow, StageNow
+from controller.kiosk.operations.house import HOUSE_FILE, UPDATE_FILE, HouseEvent, HouseNow, StageNow
 from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventLevel
 from controller.stage.link.joining import admit
 from controller.stage.link.membership import Authority
 from controller.stage.link.session import EVERYWHERE, PORT, house_link
-from controller.stage.link.transfer import Arrivals, Offer
+from controller.stage.link.transfer import Arrivals, Offer, send
 from hal.errors import CodedError
 
 FOLDER: Final = "keys/house-authority"
+ROLLOUT: Final = "update-stages"
+"""While an update is brought to stages: their names, the first one first."""
 MOST_EVENTS: Final = 2000
 _AT_ONCE: Final = 16
 _ORDER_S: Final = 10.0
@@ -87,6 +91,8 @@ class _Stage:
     shown: tuple[str, str] = ("", "")
     """The appearance and bundle of ``picture``."""
     backup_again_s: float = 0.0
+    offered: str = ""
+    """The update that it got from this process."""
     events: deque[HouseEvent] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
 
 
@@ -99,7 +105,7 @@ class House:
         self._authority = Authority(stage / FOLDER, settings.name)
         self._stages: dict[str, _Stage] = {}
         self._openings = 0
-        self._changing, self._ended = threading.Lock(), threading.Event()
+        self._changing, self._rolling, self._ended = threading.Lock(), threading.Lock(), threading.Event()
         self._pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="house")
         self._open()
         self._thread = threading.Thread(target=self._look_after, name="house backups", daemon=True)
@@ -166,7 +172,7 @@ class House:
         return StageNow(
             name, stage.linked, None if report is None else report.state, groups,
             () if report is None else report.appearances, "" if report is None else report.version,
-            self._newest_backup(name),
+            self._newest_backup(name), "" if report is None else f"{report.update.state} {report.update.why}".strip(),
         )  # fmt: skip
 
     def picture(self, stage: str) -> bytes | None:
@@ -235,6 +241,57 @@ class House:
         self._link.close()
         self._open()
 
+    # -- updates
+
+    def plan(self, stages: str) -> str:
+        """Raises UsageError("house-no-update", "house-stages-unknown")."""
+        package = self._stage / UPDATE_FILE
+        if not package.is_file():
+            raise UsageError("house-no-update", what=f"There is no {UPDATE_FILE} beside {HOUSE_FILE}.",
+                             remedy="Put the signed package of the new version there.")  # fmt: skip
+        first, *others = (f"{name} ({stage.version})" for name in self._named(stages) if (stage := self._now(name)))
+        version = System(lambda line: None).look("dpkg-deb", "--field", str(package), "Version") or "unknown"
+        then = f" Once it has proved itself there: {', '.join(others)}." if others else ""
+        return f"Version {version.strip()} goes to {first}.{then}"
+
+    def update(self, stages: str) -> None:
+        """Begin; it continues also after a restart. Raises as ``plan``."""
+        self.plan(stages)
+        write_atomically(self._stage / ROLLOUT, "\n".join(self._named(stages)).encode())
+        self._pool.submit(self.roll_out)
+
+    def roll_out(self) -> None:
+        """Bring the update to the first stage, and to the others once that reports that it is well. Raises OSError."""
+        rollout, package = self._stage / ROLLOUT, self._stage / UPDATE_FILE
+        with self._rolling:
+            if not rollout.exists():
+                return
+            digest = sha256_of(package)
+            stages = {name: self._stages[name] for name in rollout.read_text().split() if name in self._stages}
+            told = {name: one.report.update for name, one in stages.items() if one.report is not None}
+            state = {name: one.state if one.name == digest else "" for name, one in told.items()}
+            try:
+                for name in [name for name in stages if state.get(name) == "failed"]:
+                    raise WorkError("house-update-failed", what=f"{name} went back. {told[name].why}", remedy="")
+                if all(state.get(name) == "done" for name in stages):
+                    rollout.unlink()
+                    self._record("house-updated", f"The update is on {', '.join(stages)}.", "info")
+                    return
+                proved = state.get(next(iter(stages))) == "done"
+                for name, stage in list(stages.items())[: None if proved else 1]:
+                    if stage.linked and not state.get(name) and stage.offered != digest:
+                        self._offer(name, package)
+                        stage.offered = digest
+            except WorkError as error:
+                if error.code == "link-no-answer":
+                    return  # it is tried again
+                rollout.unlink()
+                self._record("house-update-failed", f"The update goes to no more stages. {error.what}", "error")
+
+    def _offer(self, name: str, package: Path) -> None:
+        arrived = send(self._link, f"member/{name}/package", package)
+        self._link.ask(f"member/{name}/update", arrived, type(None))
+
     # -- backups
 
     def _newest_backup(self, name: str) -> float | None:
@@ -246,6 +303,8 @@ class House:
 
     def _look_after(self) -> None:
         while not self._ended.wait(_LOOK_S):
+            with contextlib.suppress(OSError):
+                self.roll_out()
             for name in list(self._stages) if self._settings.backups is not None else ():
                 if self._backup_due(name, time.time()):
                     self._fetch_backup(name)

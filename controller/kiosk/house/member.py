@@ -9,11 +9,16 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
+from controller.core.kiosk_places import STATE, is_installed
+from controller.kiosk.install.steps import TRUSTED
+from controller.kiosk.install.system import System
+from controller.kiosk.install.update import OFFERED, Outcome, check_package, outcome
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.dispatch import local_values
 from controller.kiosk.operations.house import MEMBERSHIP, Invitation
@@ -23,7 +28,7 @@ from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
 from controller.stage.link.membership import Membership, leave, membership
 from controller.stage.link.session import EVERYWHERE, Link, member_link
-from controller.stage.link.transfer import Offer
+from controller.stage.link.transfer import Arrivals, Offer
 from hal.errors import CodedError
 
 PAUSE_S: Final = 2.0
@@ -42,6 +47,8 @@ class Report:
     appearances: tuple[str, ...]
     version: str
     events: tuple[EventRow, ...] = ()
+    update: Outcome = field(default_factory=Outcome)
+    """Of its program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +63,15 @@ class Order:
 class Member:
     """This stage's side. Use as a context manager; it follows a membership that begins or ends meanwhile."""
 
-    def __init__(self, kiosk: Kiosk, stage: Path, *, host: str = EVERYWHERE, **joining: Any) -> None:
-        """``host`` and ``joining``: as of ``Joining``."""
+    def __init__(
+        self, kiosk: Kiosk, stage: Path, *, host: str = EVERYWHERE, computer: System | None = None, **joining: Any
+    ) -> None:
+        """``host`` and ``joining``: as of ``Joining``; ``computer``: whose program the house may update; None for this
+        one, if it is a kiosk.
+        """
+        if computer is None and is_installed(stage):
+            computer = System(lambda line: None)
+        self._computer = computer
         self._kiosk, self._folder = kiosk, stage / MEMBERSHIP
         self._host, self._joining = host, joining
         self._lock = threading.Lock()
@@ -111,7 +125,7 @@ class Member:
             try:
                 there = membership(self._folder)
                 if there is not None and self._running is None:
-                    self._running = _Reports(self._kiosk, there)
+                    self._running = _Reports(self._kiosk, there, self._computer)
             except CodedError as error:
                 self._kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
 
@@ -129,8 +143,8 @@ class Member:
 class _Reports:
     """The link of one membership, and the thread that publishes."""
 
-    def __init__(self, kiosk: Kiosk, member: Membership) -> None:
-        self._kiosk, self._member = kiosk, member
+    def __init__(self, kiosk: Kiosk, member: Membership, computer: System | None) -> None:
+        self._kiosk, self._member, self._computer = kiosk, member, computer
         self._key = f"member/{member.name}"
         self._link: Link = member_link(member)
         self._changed, self._ended = threading.Event(), threading.Event()
@@ -141,6 +155,11 @@ class _Reports:
             self._link.answer(f"{self._key}/{name}", bytes, answer)
         self._link.answer(f"{self._key}/do", Order, self._do)
         self._link.answer(f"{self._key}/part", int, self._part)
+        if computer is not None:
+            trusted = computer.at(TRUSTED)
+            self._packages = Arrivals(computer.at(STATE / "updates"), lambda file: check_package(file, trusted))
+            self._packages.listen(self._link, f"{self._key}/package")
+            self._link.answer(f"{self._key}/update", str, partial(self._update, computer))
         self._link.appear(f"{self._key}/here")
         self._thread = threading.Thread(target=self._publish, name="house", daemon=True)
         self._thread.start()
@@ -173,7 +192,16 @@ class _Reports:
         with contextlib.suppress(CodedError):
             names = tuple(one.name for one in self._kiosk.appearances())
         state = replace(now, revision=0, lamps=lamps, grades=now.grades[:1], drifts=now.drifts[:1], places=())
-        return Report(state, names, metadata.version("velatura"), tuple(events))
+        return Report(state, names, metadata.version("velatura"), tuple(events), self._outcome())
+
+    def _outcome(self) -> Outcome:
+        return Outcome() if self._computer is None else replace(outcome(self._computer), before={})
+
+    def _update(self, computer: System, name: str) -> None:
+        """Offer what has come to this computer's own service, which checks it again."""
+        if self._outcome().state == "trial":
+            raise WorkError("update-on-trial", what="An update is on trial.", remedy="Wait until it has ended.")
+        self._packages.path(name).replace(computer.at(OFFERED))
 
     def _whole(self, _: bytes) -> Report:
         return self._report(tuple(self._kiosk.events())[-MOST_EVENTS:])

@@ -17,6 +17,8 @@ from controller.kiosk.state import EventRow, KioskState
 
 HOUSE_FILE: Final = "house.toml"
 """In the folder of a stage whose kiosk is that of a house."""
+UPDATE_FILE: Final = "update.deb"
+"""Beside it: the signed package of Velatura that the house offers its stages."""
 MEMBERSHIP: Final = "keys/house"
 """A stage's membership; keys are in no backup."""
 _ABOUT_NAME: Final = "the name of a stage of the house: small letters, digits and hyphens"
@@ -31,7 +33,8 @@ Code = Annotated[str, Field(max_length=20, description="the code that it shows")
 @dataclass(frozen=True, slots=True)
 class StageNow:
     """A stage of the house. ``state``: the last known, None before the first; ``linked``: it answers now;
-    ``appearances``: names of those installed; ``backup_unix_s``: of its newest backup here, None without one.
+    ``appearances``: names of those installed; ``backup_unix_s``: of its newest backup here, None without one;
+    ``update``: "trial", "done" or "failed", and why, of its last update; empty without one.
     """
 
     name: str
@@ -41,6 +44,7 @@ class StageNow:
     appearances: tuple[str, ...]
     version: str
     backup_unix_s: float | None
+    update: str = ""
 
     @property
     def urgency(self) -> int:
@@ -49,7 +53,8 @@ class StageNow:
             return 2
         drifts, state = self.state.drifts, self.state
         wrong = state.failures or any(device.problem for device in state.devices) or state.state == "degraded"
-        return 2 if wrong else int(bool(state.warnings or (drifts and drifts[0].advice != "nothing")))
+        returned = self.update.startswith("failed")
+        return 2 if wrong else int(bool(returned or state.warnings or (drifts and drifts[0].advice != "nothing")))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +92,8 @@ class Stagehouse(Protocol):
     def do(self, stages: str, verb: str, **values: object) -> None: ...
     def admit(self, address: str, code: str) -> None: ...
     def remove(self, stage: str) -> None: ...
+    def plan(self, stages: str) -> str: ...
+    def update(self, stages: str) -> None: ...
 
 
 class Membership(Protocol):
@@ -165,6 +172,20 @@ def house_play(house: House, stages: Stages, name: AppearanceName) -> None:
     house.open().do(stages, "play", name=name)
 
 
+@operation("GET /house/update", Role.TECHNICIAN, Effect.LOOKS, names=Names(command="house update-plan"))
+def house_update_plan(house: House, stages: Stages) -> str:
+    """What an update would change, and where first. Its package is the file update.deb beside house.toml."""
+    return house.open().plan(stages)
+
+
+@operation("POST /house/update", Role.TECHNICIAN, Effect.CHANGES, done="The update goes to the first stage.",
+           asks="Update {stages}? The first stage has to prove it before the others get it.",
+           names=Names(command="house update"))  # fmt: skip
+def house_update(house: House, stages: Stages) -> None:
+    """Bring update.deb to a stage of the house, a group or all. The first stage has to prove it before the others."""
+    house.open().update(stages)
+
+
 @operation("POST /house/stages", Role.TECHNICIAN, Effect.CHANGES, done="The stage belongs to the house now.",
            names=Names(command="house add"))  # fmt: skip
 def house_add(house: House, address: Address, code: Code) -> None:
@@ -197,5 +218,5 @@ def house_leave(house: House) -> None:
 
 HOUSE_OPERATIONS: Final = (
     house_state, house_picture, house_events, house_open, house_close, house_play, house_add, house_remove,
-    house_join, house_leave,
+    house_update_plan, house_update, house_join, house_leave,
 )  # fmt: skip

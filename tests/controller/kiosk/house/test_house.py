@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import re
 import subprocess
 import sys
@@ -13,17 +15,21 @@ from pathlib import Path
 
 import pytest
 
+from controller.bundle.signing import write_public_key
 from controller.cli.kiosk_process import serve
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.kiosk.api.control import call_kiosk
 from controller.kiosk.house.house import House, HouseSettings, house_settings
 from controller.kiosk.house.member import Member
+from controller.kiosk.install.system import System
+from controller.kiosk.install.update import OFFERED, sign_package
 from controller.kiosk.operations import house as operations
 from controller.kiosk.operations.dispatch import CALLER
 from controller.kiosk.state import DriftCheck
 from controller.kiosk.store import archive
 from controller.run.progress import Silent
 from hal.notices import Level
+from tests.controller.kiosk.install.test_update import KEY, OTHER_KEY, debian_package
 from tests.controller.kiosk.vase import vase
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, Served, csrf, served
@@ -68,7 +74,9 @@ class Museum:
     def join(self, name: str) -> None:
         kiosk = self.kiosks[name] = MemoryKiosk(self.folder / name / "pictures")
         port = free_port()
-        member = self.members[name] = Member(kiosk, vase(self.folder / name / "stage"), host="127.0.0.1", port=port)
+        computer = System(lambda line: None, root=self.folder / name / "root")
+        stage = vase(self.folder / name / "stage")
+        member = self.members[name] = Member(kiosk, stage, host="127.0.0.1", port=port, computer=computer)
         self.stack.enter_context(member)
         self.house.admit(f"127.0.0.1:{port}", member.invite(name).code)
 
@@ -191,6 +199,46 @@ def test_the_backups_of_all_stages_are_in_one_place(museum: Museum, monkeypatch:
     with pytest.raises(WorkError):
         museum.house.fetch_backup("vase")
     assert file.read_bytes() == before
+
+
+def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(museum: Museum, tmp_path: Path) -> None:
+    roots = {name: tmp_path / name / "root" for name in ("knight", "vase")}
+    offered = {name: root / OFFERED.relative_to("/") for name, root in roots.items()}
+    for root in roots.values():
+        (root / "opt").mkdir()
+        (root / "etc/velatura/update-keys").mkdir(parents=True)
+        write_public_key(root / "etc/velatura/update-keys/house.pub", bytes(KEY.verify_key))
+    with pytest.raises(UsageError, match=r"update\.deb"):
+        museum.house.update("east wing")
+    package = debian_package(tmp_path, "2-1").rename(tmp_path / "house/update.deb")
+    digest = hashlib.sha256(package.read_bytes()).hexdigest()
+
+    def tell(name: str, state: str) -> None:
+        told = {"name": digest, "state": state, "why": "It is dark."}
+        (roots[name] / "opt/velatura.update").write_text(json.dumps(told))
+        museum.kiosks[name].note("info", state)
+        wait_for(lambda: museum.stage(name).update.startswith(state))
+
+    assert re.match(r"Version 2-1 goes to knight .* proved itself there: vase", museum.house.plan("east wing"))
+    museum.house.update("east wing")
+    wait_for(offered["knight"].exists)
+    assert offered["knight"].read_bytes() == package.read_bytes()
+    for state in ("trial", "done"):
+        assert not offered["vase"].exists()
+        tell("knight", state)
+        museum.house.roll_out()
+    assert offered["vase"].read_bytes() == package.read_bytes()
+    tell("vase", "failed")
+    museum.house.roll_out()
+    assert museum.recorded[-1] == (
+        "house-update-failed",
+        "The update goes to no more stages. vase went back. It is dark.",
+    )
+    # What a stage does not trust ends it, too.
+    sign_package(package, OTHER_KEY, package)
+    museum.house.update("vase")
+    wait_for(lambda: "No key that this computer trusts" in museum.recorded[-1][1])
+    assert not (tmp_path / "house/update-stages").exists()
 
 
 def test_the_page_has_every_stage_and_asks_before_it_closes_all(museum: Museum) -> None:
