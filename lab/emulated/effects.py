@@ -1,4 +1,5 @@
-"""What real light does beyond the room of a demo: depth of field, dithered panels, varnish, and the room ``hard``.
+"""What real devices do beyond those of a demo: flaws of sensors, depth of field, dithered panels, varnish; the room
+``hard``.
 
 ``plugins.emulated.optics`` asks for this module where a stage has such effects (``plugins.emulated.core.extensions``);
 ``Spread``, ``colours`` and ``xyz_to_camera`` are part of it.
@@ -15,7 +16,8 @@ import numpy.typing as npt
 
 from lab.emulated.spectra import colours, xyz_to_camera
 from lab.emulated.subsurface import Spread
-from plugins.emulated.core.truth import BenchTruth, Dithering, Panels, ProjectorTruth, Subsurface
+from plugins.emulated.core.truth import BenchTruth, CameraTruth, Dithering, Panels, ProjectorTruth, Subsurface
+from plugins.emulated.optics.effects import SensorFlaws
 from plugins.emulated.optics.objects import StageObject
 from plugins.emulated.optics.shapes import dot
 
@@ -28,11 +30,36 @@ BENT: Final = 0.02
 MARBLE: Final = Subsurface(share=0.3, spread_m=0.0015)
 TURNS: Final = Dithering(levels=64, turns=4, frame_s=1 / 240)
 """A panel of 64 levels, whose others are made by turns of frames."""
+HOT_E_PER_S: Final = 2e4
+"""Mean dark current of hot pixels; each has its own, by an exponential law."""
 FloatImage = npt.NDArray[np.float32]
 LARGEST_PX: Final = 24.0
 STEP: Final = 1.25
 """Between the blurs of two layers; a pixel's light is divided between the two that are next to its own."""
 SMALLEST_PX: Final = 0.3
+
+
+def sensor_flaws(camera: CameraTruth, seed: int) -> SensorFlaws | None:
+    """Of this very sensor; None where it has none."""
+    sensor = camera.sensor
+    if not (sensor.response_spread or sensor.hot_pixels):
+        return None
+    rng, shape = np.random.default_rng([seed, 6]), camera.lens.size_px[::-1]
+    response = 1.0 + sensor.response_spread * rng.standard_normal(shape)
+    hot = rng.random(shape) < sensor.hot_pixels
+    return SensorFlaws(
+        response=np.maximum(response, 0.0).astype(np.float32),
+        dark_e_per_s=(hot * rng.exponential(HOT_E_PER_S, shape)).astype(np.float32),
+    )
+
+
+def exposed_s(camera: CameraTruth, seed: int, exposure_s: float) -> float:
+    """How long the shutter is open when the camera says ``exposure_s``: each speed has an error of its own."""
+    spread = camera.sensor.shutter_spread
+    if not spread:
+        return exposure_s
+    speed = np.random.default_rng([seed, 7, round(1e6 * exposure_s)])
+    return exposure_s * float(np.exp(spread * speed.standard_normal()))
 
 
 def confusion_px(
@@ -166,6 +193,6 @@ def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> Proj
 
 
 __all__ = (
-    "Spread", "colours", "confusion_px", "defocused", "fresnel", "hard", "mean_light", "reflected", "seen_of_turns",
-    "xyz_to_camera",
+    "Spread", "colours", "confusion_px", "defocused", "exposed_s", "fresnel", "hard", "mean_light", "reflected",
+    "seen_of_turns", "sensor_flaws", "xyz_to_camera",
 )  # fmt: skip

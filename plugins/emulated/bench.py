@@ -40,7 +40,7 @@ from plugins.emulated.core.truth import (
 )
 from plugins.emulated.optics.layout import DARK, SETTINGS, Stands, arranged, read_choice, read_stands
 from plugins.emulated.optics.objects import VASE_AND_BUST, default_object, load_object
-from plugins.emulated.optics.scenes import BUILT_IN
+from plugins.emulated.optics.scenes import built_in
 from plugins.emulated.optics.staging import (
     FAST_LAMP,
     FAST_PROFILE,
@@ -114,7 +114,7 @@ class EmulatedBench:
     """``hal.interfaces.Bench``.
 
     ``stands``: where it puts the projectors of a stage that it prepares; ``engine`` None: as the ``room`` says;
-    ``built_in``: a name of ``scenes.BUILT_IN``, which stands there where no mesh is given
+    ``built_in``: a name for ``scenes.built_in``, which stands there where no mesh is given
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class EmulatedBench:
         stands, hung = self._stands, False
         files: Mapping[str, bytes] = {}
         if object_file is None and self._built_in is not None:
-            thing = BUILT_IN[self._built_in]
+            thing = built_in(self._built_in)
             (shape, files), hung = thing.on_stage(), thing.hung
             if stands == Stands(cameras=stands.cameras):
                 stands = dataclasses.replace(stands, names=thing.places)

@@ -105,7 +105,8 @@ def mend_projectors(kiosk: WiredKiosk) -> None:
         wire.faults.clear()
         wire.replug()
         if wire.wedged:
-            wire.power_cycle()
+            wire.cut_mains()
+            wire.restore_mains()
         kiosk.lamps[name].repair()
     for supervisor in kiosk.service.devices.projectors:
         supervisor.forgive()

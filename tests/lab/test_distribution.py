@@ -33,7 +33,9 @@ def test_the_lab_needs_the_product_of_its_own_version() -> None:
     assert all(requirement.endswith(f"=={version}") for requirement in PROJECT["project"]["dependencies"])
 
 
-@pytest.mark.parametrize("part", ["boards", "bumps", "dousers", "effects", "mitsuba", "scenario", "tape", "usb"])
+@pytest.mark.parametrize(
+    "part", ["boards", "bumps", "dousers", "effects", "mitsuba", "scenario", "solids", "stands", "tape", "usb"]
+)
 def test_the_lab_brings_parts_of_the_bench(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert EntryPoint(part, PROJECT["project"]["entry-points"][extensions.GROUP][part], extensions.GROUP).load()
     for found in ((), (EntryPoint(part, "no_such_module_at_all:Part", extensions.GROUP),)):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+import cv2
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, lsmr
 
@@ -17,7 +18,8 @@ from controller.optics.solve.result.metrics import (
     PixelSet,
     by_pixels,
     compare,
-    sharpness_around,
+    edges_of_both,
+    sharpness,
 )
 from controller.optics.transport import LightTransport
 from controller.optics.transport.planes import image_planes, plane_frames
@@ -227,3 +229,24 @@ def predicted(subject: Subject, frames: Sequence[FloatImage], transport: LightTr
     direct = (subject.transport if transport is None else transport).forward(frames)
     whole = direct if subject.indirect is None else direct + subject.indirect.forward(direct)
     return np.asarray(whole + subject.calibration.black, np.float32)
+
+
+def sharpness_around(
+    achieved: FloatImage, target: FloatImage, white: float, mask: Mask, size_px: int, *, least_edges: int = 12
+) -> tuple[FloatImage, float]:
+    """lambda (paper 6, eq. 9) in the square neighbourhood of ``size_px`` camera pixels of each pixel, and over all.
+
+    (rows, columns) float32, NaN outside the mask and where the target has fewer than ``least_edges`` edge pixels near.
+    """
+    ours, theirs = edges_of_both(achieved, target, white, mask)
+
+    def counted(picture: Mask) -> FloatImage:
+        flat = cv2.boxFilter(picture.astype(np.float32), -1, (size_px, size_px), normalize=False,
+                             borderType=cv2.BORDER_CONSTANT)  # fmt: skip
+        return np.asarray(np.round(flat), np.float32)
+
+    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
+    enough = mask & (counted(theirs) >= least_edges)
+    return np.divide(common, most, out=np.full(mask.shape, np.nan, np.float32), where=enough), sharpness(
+        achieved, target, white, mask
+    )

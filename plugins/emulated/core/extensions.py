@@ -3,8 +3,9 @@
 ``boards``: projectors with another control board than the usual one, or on a LAN port; ``bumps``: changes of a stage;
 ``dousers``: DMX nodes with dousers; ``effects``: depth of field, dithered panels, varnish, light by wavelength and
 under the surface, and the room ``hard``; ``mitsuba``: an engine of indirect light
-(``plugins.emulated.optics.indirect.transfers``); ``scenario``: players of a script of faults; ``tape``: the devices of
-a tape; ``usb``: what ``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``). All are in velatura-lab.
+(``plugins.emulated.optics.indirect.transfers``); ``scenario``: players of a script of faults; ``solids``: objects of
+plain shapes; ``stands``: projectors at planned places; ``tape``: the devices of a tape; ``usb``: what
+``bench/usb.toml`` lists (``plugins.emulated.bench.UsbDevices``). All are in velatura-lab.
 """
 
 from __future__ import annotations

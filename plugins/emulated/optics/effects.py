@@ -15,14 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from plugins.emulated.core.extensions import extension
-from plugins.emulated.core.truth import CameraTruth, LampTruth
+from plugins.emulated.core.truth import LampTruth
 
 SPREAD: Final = 0.15
 """Standard deviation of the veil, in picture widths."""
 COARSE_PX: Final = 96
 """The veil is smooth, so it is worked out in a picture that is so wide."""
-HOT_E_PER_S: Final = 2e4
-"""Mean dark current of hot pixels; each has its own, by an exponential law."""
 FLICKER_S: Final = 0.1
 """Flicker averages out over exposures that are longer."""
 
@@ -33,29 +31,6 @@ class SensorFlaws:
 
     response: npt.NDArray[np.float32]
     dark_e_per_s: npt.NDArray[np.float32]
-
-
-def sensor_flaws(camera: CameraTruth, seed: int) -> SensorFlaws | None:
-    """Of this very sensor; None where it has none."""
-    sensor = camera.sensor
-    if not (sensor.response_spread or sensor.hot_pixels):
-        return None
-    rng, shape = np.random.default_rng([seed, 6]), camera.lens.size_px[::-1]
-    response = 1.0 + sensor.response_spread * rng.standard_normal(shape)
-    hot = rng.random(shape) < sensor.hot_pixels
-    return SensorFlaws(
-        response=np.maximum(response, 0.0).astype(np.float32),
-        dark_e_per_s=(hot * rng.exponential(HOT_E_PER_S, shape)).astype(np.float32),
-    )
-
-
-def exposed_s(camera: CameraTruth, seed: int, exposure_s: float) -> float:
-    """How long the shutter is open when the camera says ``exposure_s``: each speed has an error of its own."""
-    spread = camera.sensor.shutter_spread
-    if not spread:
-        return exposure_s
-    speed = np.random.default_rng([seed, 7, round(1e6 * exposure_s)])
-    return exposure_s * float(np.exp(spread * speed.standard_normal()))
 
 
 def flickering(lamp: LampTruth, exposure_s: float, rng: np.random.Generator) -> float:

@@ -6,25 +6,19 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 from hal.errors import PluginError
 from hal.escapes import toml_value
-from hal.runtime.files import read_text
-from plugins.emulated.core.tables import Between, load
+from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.truth import (
     ENGINES,
     BenchTruth,
-    Lens,
-    Pose,
-    ProjectorTruth,
     SurfaceTruth,
-    Three,
-    Two,
 )
 from plugins.emulated.optics.effects import rare
 from plugins.emulated.optics.objects import StageObject
-from plugins.emulated.optics.scenes import BUILT_IN
+from plugins.emulated.optics.scenes import BUILT_IN, SOLIDS
 
 DARK: Final = "dark"
 ROOMS: Final = (DARK, "room", "hard")
@@ -81,54 +75,19 @@ PLACES: Final = (
 DEFAULT: Final = 3
 MOST_CAMERAS: Final = 8
 AROUND: Final = 4
-DRAWN: Final = -1.0
-"""Instead of a blur: it is drawn, as lenses differ."""
-LUX_OF_LIGHT: Final = 9000.0
-"""Illuminance by which the bench calls the light on a surface 1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stand:
-    """A projector put up as planned. World and device frames as in ``truth``; lens and light as data sheets have them.
-
-    ``throw_ratio``: distance by picture width; ``centre_share``: the axis' place in the picture, in its width and
-    height from the upper left corner; ``focus_m``: the depth of best focus; ``lumens`` of a white picture; ``pupil_m``;
-    ``sharpest_px``: standard deviation of a pixel's blur in focus; ``DRAWN``: as lenses differ
-    """
-
-    name: str
-    position_m: Annotated[Three, Between(-100.0, 100.0)]
-    rotation_vector: Annotated[Three, Between(-10.0, 10.0)]
-    throw_ratio: Annotated[float, Between(0.05, 100.0)]
-    centre_share: Annotated[Two, Between(-10.0, 10.0)]
-    focus_m: Annotated[float, Between(0.01, 100.0)]
-    lumens: Annotated[float, Between(1.0, 1e6)]
-    pupil_m: Annotated[float, Between(0.0, 1.0)]
-    sharpest_px: Annotated[float, Between(0.0, 3.0)] = DRAWN
-
-    def lens(self, size_px: tuple[int, int]) -> Lens:
-        width, height = size_px
-        centre = (self.centre_share[0] * width - 0.5, self.centre_share[1] * height - 0.5)
-        return Lens(size_px, self.throw_ratio * width, centre, (0.0, 0.0))
-
-    def light_at_focus(self, size_px: tuple[int, int]) -> float:
-        """Of a white picture on a plane facing the lens: the picture there is focus by throw ratio wide."""
-        wide_m = self.focus_m / self.throw_ratio
-        return self.lumens / (wide_m * wide_m * size_px[1] / size_px[0]) / LUX_OF_LIGHT
 
 
 @dataclass(frozen=True, slots=True)
 class Stands:
-    """How many projectors, or where each of them: ``placed``; else at the ``PLACES`` of ``names``; else at the first
-    ``count`` of them.
-
+    """How many projectors, or where each of them: ``placed`` (``lab.emulated.stands.Stand``); else at the ``PLACES`` of
+    ``names``; else at the first ``count`` of them.
 
     ``count`` None: as many as stages of the size have; ``cameras``: how many; from ``AROUND`` on, all devices stand
     all around
     """
 
     count: int | None = None
-    placed: tuple[Stand, ...] = ()
+    placed: tuple[Any, ...] = ()
     names: tuple[str, ...] = ()
     cameras: int = 1
 
@@ -151,46 +110,19 @@ class Stands:
             return found
         return [(name, 360.0 * (n + 0.5) / len(found), above) for n, (name, _, above) in enumerate(found)]
 
-    def put(self, index: int, projector: ProjectorTruth) -> ProjectorTruth:
-        """``projector`` (of this index) at its given position; unchanged where none was given."""
-        if not self.placed:
-            return projector
-        stand, size = self.placed[index], projector.lens.size_px
-        lens = stand.lens(size)
-        # near its focus a lens' disc grows in proportion to the depth; its sigma is a quarter of its width
-        slope = 0.25 * stand.pupil_m * lens.focal_px / stand.focus_m**2
-        return dataclasses.replace(
-            projector,
-            pose=Pose(stand.position_m, stand.rotation_vector),
-            lens=lens,
-            focus=dataclasses.replace(
-                projector.focus,
-                distance_m=stand.focus_m,
-                slope_px_per_m=slope,
-                sharpest_px=projector.focus.sharpest_px if stand.sharpest_px < 0 else stand.sharpest_px,
-            ),
-            light=dataclasses.replace(
-                projector.light, reference_m=stand.focus_m, brightness=stand.light_at_focus(size)
-            ),
-        )
 
-
-CHOICES: Final = {"object": tuple(BUILT_IN), "room": ROOMS, "engine": ENGINES}
+CHOICES: Final = {"object": (*BUILT_IN, *SOLIDS), "room": ROOMS, "engine": ENGINES}
 SETTINGS: Final = {
     "projectors": f"how many projectors there are, a whole number from 1 to {len(PLACES)}, or a list of places, each"
     f" one of {', '.join(place[0] for place in PLACES)}; if omitted: {DEFAULT}, or 4 at size uhd",
     "cameras": f"how many cameras there are, a whole number from 1 to {MOST_CAMERAS}; if omitted: 1",
     "stands": "instead, a TOML file with a table [[stands]] for each projector: name, position_m, rotation_vector,"
     " throw_ratio, centre_share, focus_m, lumens, pupil_m and sharpest_px; without the last, it is drawn at random",
-    "object": f"one of {', '.join(BUILT_IN)}; if omitted: a mesh (`velatura demo --object FILE`), or a vase and a bust",
+    "object": f"one of {', '.join(CHOICES['object'])}; if omitted: a mesh (`velatura demo --object FILE`), or a vase"
+    " and a bust",
     "room": f"one of {', '.join(ROOMS)}; if omitted: {DARK}",
     "engine": f"what works out the light between surfaces, one of {', '.join(ENGINES)}; if omitted: as the room says",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class _File:
-    stands: tuple[Stand, ...]
 
 
 def read_stands(settings: Mapping[str, Any], folder: Path) -> Stands:
@@ -216,13 +148,10 @@ def _projectors(settings: Mapping[str, Any], folder: Path) -> Stands:
     if file is None:
         return Stands(count)
     try:
-        text = read_text(folder / str(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise _wrong("stands", str(file)) from error
-    stands = load(text, _File, file=str(file)).stands
-    if len({stand.name for stand in stands}) != len(stands):
-        raise _wrong("stands", [stand.name for stand in stands])
-    return Stands(len(stands), stands)
+        placed = extension("stands", asked_by="Projectors at given places")(folder, str(file))
+    except ValueError as error:
+        raise _wrong("stands", error.args[0]) from error
+    return Stands(len(placed), placed)
 
 
 def read_choice(settings: Mapping[str, Any], key: str) -> str | None:

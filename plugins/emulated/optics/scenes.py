@@ -1,4 +1,4 @@
-"""The bench's built-in objects beside vase and bust: flat ones, solids, and what their owner has of them, as files.
+"""The bench's built-in objects beside vase and bust: flat ones, a statue, and what their owner has of them, as files.
 
 Local frame: metres, x to the right, y up, z towards the audience. Paint is linear RGB between 0 and 1.
 """
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from plugins.emulated.core.extensions import extension
 from plugins.emulated.optics.objects import StageObject, assembled, srgb_bytes
 from plugins.emulated.optics.shapes import BUST_AXIS_X, Floats, Rgb, bust, paint_bust
 
@@ -23,8 +24,6 @@ FRAME: Final = ((0.0, 0.0), (0.0, 0.010), (0.009, 0.012), (0.020, 0.007), (0.024
 STRIP_PX: Final = 96
 """Rows of gilded wood below the picture, for the frame."""
 RELIEF_M: Final = 0.005
-OPENING: Final = np.deg2rad(110.0)
-"""Between the walls of the corner."""
 STONE: Final = (0.74, 0.68, 0.56)
 LEFT_OF_IT: Final = 0.22
 """How much of its colours a faded object still has."""
@@ -131,7 +130,7 @@ def painting() -> Model:
     rows, columns = original.shape[:2]
     share = STRIP_PX / (STRIP_PX + rows)
     across, up = (0.5 * size for size in CANVAS_M)
-    (canvas,) = _facets(_sheet(2, 2, lambda u, v: (across * (2 * u - 1), up * (2 * v - 1), 0.0 * u)))
+    (canvas,) = facets(sheet(2, 2, lambda u, v: (across * (2 * u - 1), up * (2 * v - 1), 0.0 * u)))
     canvas.uv[..., 1] = share + (1.0 - share) * canvas.uv[..., 1]
     corners = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1], [-1, 1]], dtype=np.float64)
     rings = [np.column_stack((corners * (across + out, up + out), np.full(5, before))) for out, before in FRAME[::-1]]
@@ -140,7 +139,7 @@ def painting() -> Model:
     grain = np.random.default_rng(51).normal(1.0, 0.5, (STRIP_PX, columns))
     wood = cv2.GaussianBlur(grain, (0, 0), 8.0, sigmaY=2.0)[..., None] * (0.52, 0.36, 0.15)
     picture = np.concatenate([faded(original), wood.astype(np.float32)])
-    return Model((canvas, *_facets(frame)), picture, {"original.png": _png(original)})
+    return Model((canvas, *facets(frame)), picture, {"original.png": _png(original)})
 
 
 def relief() -> Model:
@@ -154,7 +153,7 @@ def relief() -> Model:
         high = petals + waves + np.cos(2 * np.pi * away / 0.035) * np.exp(-((away / 0.08) ** 4))
         return x, y, RELIEF_M * (high - high.min()) / np.ptp(high)
 
-    part = _sheet(240, 300, slab)
+    part = sheet(240, 300, slab)
     high = cv2.resize(part.points[..., 2] / RELIEF_M, (1200, 960), interpolation=cv2.INTER_CUBIC)[..., None]
     colours = np.clip(high * (0.80, 0.58, 0.20) + (1.0 - high) * (0.08, 0.16, 0.45), 0.04, 0.85).astype(np.float32)
     return Model((part,), faded(colours), {"original.png": _png(colours)})
@@ -174,65 +173,32 @@ def statue() -> Model:
     return Model((part,), today, {"statue.glb": _scan(part, today), "colours.png": _png(colours)})
 
 
-def corner() -> Model:
-    """Two walls of a room that meet at 110 degrees."""
-    deep = 0.18 / np.tan(0.5 * OPENING)
-    walls = _sheet(2, 3, lambda u, v: (0.18 * (2 * u - 1), 0.14 * (2 * v - 1), deep * np.abs(2 * u - 1)))
-    return Model(_facets(walls), _marble(0.15))
-
-
-def cylinder(radius: float = 0.1, high: float = 0.28, x: float = 0.0) -> Model:
-    """A column."""
-    return Model((_round(x, lambda v: radius + 0 * v, lambda v: high * (v - 0.5)),), _marble(0.15))
-
-
-def sphere(radius: float = 0.14, x: float = 0.0) -> Model:
-    """A ball."""
-    part = _round(x, lambda v: radius * np.sin(np.pi * v), lambda v: -radius * np.cos(np.pi * v))
-    return Model((part,), _marble(0.15))
-
-
-def two_objects() -> Model:
-    """A ball and a column apart from each other."""
-    parts = sphere(0.065, -0.115).parts + cylinder(0.065, 0.12, 0.115).parts
-    return Model(parts, _marble(0.15))
-
-
 BUILT_IN: Final[Mapping[str, BuiltIn]] = {
     "painting": BuiltIn(painting, ("left", "right"), hung=True),
     "relief": BuiltIn(relief),
     "statue": BuiltIn(statue),
-    "corner": BuiltIn(corner),
-    "cylinder": BuiltIn(cylinder),
-    "sphere": BuiltIn(sphere),
-    "two-objects": BuiltIn(two_objects, ("left", "right", "far-left", "far-right"), apart=True),
 }
+SOLIDS: Final = ("corner", "cylinder", "sphere", "two-objects")
+"""Those of velatura-lab."""
 
 
-def _sheet(rows: int, columns: int, surface: Callable[[Floats, Floats], tuple[Floats, ...]]) -> Part:
+def built_in(name: str) -> BuiltIn:
+    """The object of this name, of ``BUILT_IN`` or ``SOLIDS``. Raises DeviceError("bench-part-missing")."""
+    thing: BuiltIn = BUILT_IN.get(name) or extension("solids", asked_by=f"The object {name}")[name]
+    return thing
+
+
+def sheet(rows: int, columns: int, surface: Callable[[Floats, Floats], tuple[Floats, ...]]) -> Part:
     """Points of ``surface`` over u to the right and v up, both from 0 to 1."""
     u, v = np.meshgrid(np.linspace(0.0, 1.0, columns), np.linspace(1.0, 0.0, rows))
     return Part(np.stack(surface(u, v), axis=-1), np.stack((u, v), axis=-1))
 
 
-def _facets(part: Part) -> tuple[Part, ...]:
+def facets(part: Part) -> tuple[Part, ...]:
     """Its quadrilaterals, each a micrometre larger, so that they share no corners and each has its own normal."""
     windows = [np.s_[i : i + 2, j : j + 2] for i, j in np.ndindex(*(side - 1 for side in part.points.shape[:2]))]
     out = [1e-6 * np.sign(part.points[at] - part.points[at].mean(axis=(0, 1))) for at in windows]
     return tuple(Part(part.points[at] + step, part.uv[at]) for at, step in zip(windows, out, strict=True))
-
-
-def _round(x: float, radius: Callable[[Floats], Floats], height: Callable[[Floats], Floats]) -> Part:
-    """A surface of revolution."""
-    turn = 2.0 * np.pi
-    return _sheet(120, 241, lambda u, v: (x - radius(v) * np.sin(turn * u), height(v), -radius(v) * np.cos(turn * u)))
-
-
-def _marble(strength: float) -> Rgb:
-    """Pale stone with soft veins (rows, columns, 3), the same at the left and the right edge."""
-    noise = np.random.default_rng(52).normal(0.0, 1.0, (512, 1024))
-    soft = cv2.GaussianBlur(np.tile(noise, (1, 3)), (0, 0), 12.0)[:, 1024:2048]
-    return np.asarray((1.0 - strength * np.abs(soft / soft.std()))[..., None].clip(0.3) * STONE, dtype=np.float32)
 
 
 def _png(colours: Rgb) -> bytes:

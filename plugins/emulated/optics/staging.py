@@ -100,11 +100,12 @@ def random_truth(
     if stage_object.paint != VASE_AND_BUST and len(stage_object.parts) > 1:
         parts = np.split(stage_object.faces, stage_object.parts[1:])
         aims = [stage_object.vertices[np.unique(part)].astype(np.float64) for part in parts]
-    drawn = (
+    projectors = tuple(
         _projector(index, *place, sizes, rng, aims[index % len(aims)])
         for index, place in enumerate(stands.places(sizes.projectors))
     )
-    projectors = tuple(stands.put(index, projector) for index, projector in enumerate(drawn))
+    if stands.placed:
+        projectors = tuple(stand.put(drawn) for stand, drawn in zip(stands.placed, projectors, strict=True))
     return BenchTruth(
         size=size,
         frames=FRAMES,

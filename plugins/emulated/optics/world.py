@@ -16,7 +16,7 @@ from plugins.emulated.core.extensions import extension
 from plugins.emulated.core.shot import ShotFiles, ShotSettings
 from plugins.emulated.core.truth import BUMPS_FILE, FOLDER, BenchTruth, ObjectTruth
 from plugins.emulated.optics.dng import XYZ_TO_LINEAR_SRGB, PictureFacts, dng, with_exif
-from plugins.emulated.optics.effects import exposed_s, flickering, rare, sensor_flaws
+from plugins.emulated.optics.effects import flickering, rare
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject, default_object
@@ -57,7 +57,10 @@ class World:
         self._rng = np.random.default_rng([truth.seed, 2])
         self._flicker = np.random.default_rng([truth.seed, 5])
         self._moment = np.random.default_rng([truth.seed, 9])
-        self._flaws = sensor_flaws(truth.camera, truth.seed)
+        sensor = truth.camera.sensor
+        flawed = sensor.response_spread or sensor.hot_pixels or sensor.shutter_spread
+        self._sensor = rare("A flawed sensor, as bench.toml has it,") if flawed else None
+        self._flaws = self._sensor and self._sensor.sensor_flaws(truth.camera, truth.seed)
         self._xyz_to_camera = XYZ_TO_LINEAR_SRGB
         if truth.camera.spectral:
             filters = rare("A camera with filters, as bench.toml has it,")
@@ -149,18 +152,18 @@ class World:
         return frame
 
     def _files(self, light: npt.NDArray[np.float32], settings: ShotSettings, taken: str) -> ShotFiles:
-        camera = self._truth.camera
+        camera, exposure_s = self._truth.camera, settings.exposure_s
         raw = mosaic(
             light if camera.tint == (1.0, 1.0, 1.0) else light * np.asarray(camera.tint, np.float32),
             camera.sensor,
             self._rng,
-            exposure_s=exposed_s(camera, self._truth.seed, settings.exposure_s),
+            exposure_s=self._sensor.exposed_s(camera, self._truth.seed, exposure_s) if self._sensor else exposure_s,
             iso=settings.iso,
             aperture_f=settings.aperture_f,
             flaws=self._flaws,
         )
         facts = PictureFacts(
-            exposure_s=settings.exposure_s,
+            exposure_s=exposure_s,
             iso=settings.iso,
             aperture_f=settings.aperture_f,
             # Lenses report whole millimetres, so a picture tells the focal length only roughly.

@@ -65,11 +65,6 @@ class BoardProjector(EmulatedProjector):
             self.lamp.restore_mains()
             self._awake_at_s = time.monotonic() + self._boot_s
 
-    def power_cycle(self) -> None:
-        """Pull the mains plug and put it back: a hanging control board restarts."""
-        self.cut_mains()
-        self.restore_mains()
-
     def _copied(self, board: Board) -> Board:
         """Another board of this kind, on the same lamp."""
         return copy.deepcopy(board, {id(self.lamp): self.lamp})

@@ -227,7 +227,8 @@ def test_the_emulated_wedge_is_real_a_hastier_profile_falls_into_it(open_serial:
     with pytest.raises(DeviceError):
         burn(pair)
     assert pair.emulator.wedged
-    pair.emulator.power_cycle()
+    pair.emulator.cut_mains()
+    pair.emulator.restore_mains()
     assert pair.driver.status(deadline=in_seconds(SOON)).power in (Power.COOLING, Power.OFF)
     assert pair.emulator.lamp.damages == 1
 

@@ -155,7 +155,7 @@ def sharpness(achieved: FloatImage, target: FloatImage, white: float, mask: Mask
 
     Both edge images are cut at the target's own threshold, so a flat result does not find edges in its noise.
     """
-    return _lambda(*_both_edges(achieved, target, white, mask))
+    return _lambda(*edges_of_both(achieved, target, white, mask))
 
 
 def sharpness_windows(
@@ -165,7 +165,7 @@ def sharpness_windows(
 
     (window rows, window columns) float32, NaN where the target has fewer than ``least_edges`` edge pixels.
     """
-    ours, theirs = _both_edges(achieved, target, white, mask)
+    ours, theirs = edges_of_both(achieved, target, white, mask)
 
     def counted(picture: Mask) -> Float64:
         rows, columns = (-(-side // size_px) * size_px for side in mask.shape)
@@ -179,31 +179,12 @@ def sharpness_windows(
     return local.astype(np.float32), _lambda(ours, theirs)
 
 
-def sharpness_around(
-    achieved: FloatImage, target: FloatImage, white: float, mask: Mask, size_px: int, *, least_edges: int = 12
-) -> tuple[FloatImage, float]:
-    """lambda (paper 6, eq. 9) in the square neighbourhood of ``size_px`` camera pixels of each pixel, and over all.
-
-    (rows, columns) float32, NaN outside the mask and where the target has fewer than ``least_edges`` edge pixels near.
-    """
-    ours, theirs = _both_edges(achieved, target, white, mask)
-
-    def counted(picture: Mask) -> FloatImage:
-        flat = cv2.boxFilter(picture.astype(np.float32), -1, (size_px, size_px), normalize=False,
-                             borderType=cv2.BORDER_CONSTANT)  # fmt: skip
-        return np.asarray(np.round(flat), np.float32)
-
-    common, most = counted(ours & theirs), np.maximum(counted(ours), counted(theirs))
-    enough = mask & (counted(theirs) >= least_edges)
-    return np.divide(common, most, out=np.full(mask.shape, np.nan, np.float32), where=enough), _lambda(ours, theirs)
-
-
 def _lambda(ours: Mask, theirs: Mask) -> float:
     most = max(int(ours.sum()), int(theirs.sum()))
     return float((ours & theirs).sum() / most) if most else 1.0
 
 
-def _both_edges(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> tuple[Mask, Mask]:
+def edges_of_both(achieved: FloatImage, target: FloatImage, white: float, mask: Mask) -> tuple[Mask, Mask]:
     """Edges (rows, columns) of both pictures inside the mask, by Canny."""
     gradients = [_gradient(image, white) for image in (achieved, target)]
     of_target = _canny(gradients[1], FAINTEST_EDGE) & mask

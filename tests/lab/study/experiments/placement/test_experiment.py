@@ -14,9 +14,9 @@ from controller.optics.calibrate.values import Geometry, Metapixels, PhaseMap, P
 from controller.optics.plan.optics import lit_by, pixels_of
 from controller.optics.plan.target_object import AFTER_M, TargetObject
 from controller.optics.plan.values import Placement, Surface
+from lab.emulated.stands import read
 from lab.study.experiments.placement.experiment import CAMERA_M, STANDS, at_size, planned, planned_object, set_up
 from lab.study.experiments.placement.measuring import compare_placement, seen_by, seen_by_camera
-from plugins.emulated.optics.layout import read_stands
 
 SIZE = (280, 210)
 
@@ -114,7 +114,7 @@ def test_the_bench_is_set_up_near_the_plan_and_never_exactly_so(
     plan: tuple[Path, TargetObject, list[Placement]],
 ) -> None:
     mesh, _, placements = plan
-    stands = read_stands({"stands": STANDS}, mesh.parent).placed
+    stands = read(mesh.parent, STANDS)
     assert len(stands) == len(placements)
     for stand, placement in zip(stands, placements, strict=True):
         lens = stand.lens(SIZE)
