@@ -136,6 +136,12 @@ def _keep(stage: Path, names: Sequence[str], photographs: int) -> None:
         np.savez(_kept(stage, name, photographs), *[solved.frames[projector] for projector in projectors])
 
 
+def kept_frames(stage: Path, name: str, photographs: int) -> list[ByteImage]:
+    """The device frames that ``worked`` has kept, in the order of the projectors."""
+    with np.load(_kept(stage, name, photographs)) as kept:
+        return [kept[key] for key in kept.files]
+
+
 def judged(stage: Path, run: Path, names: Sequence[str] = NAMES, refined: Sequence[int] = REFINED) -> dict[str, float]:
     """All figures of a stage."""
     projectors = check_stage(stage).names
@@ -143,9 +149,7 @@ def judged(stage: Path, run: Path, names: Sequence[str] = NAMES, refined: Sequen
     found = judge.calibration()
     for photographs in refined:
         for name in names:
-            with np.load(_kept(stage, name, photographs)) as kept:
-                frames = [kept[key] for key in kept.files]
-            figures = judge.appearance(read_solved(run, name, projectors), frames)
+            figures = judge.appearance(read_solved(run, name, projectors), kept_frames(stage, name, photographs))
             found |= {f"{name} {key}, {photographs}": value for key, value in figures.items()}
     return found
 
@@ -272,4 +276,4 @@ def _rows(found: list[dict[str, float]]) -> list[Row]:
     return rows
 
 
-__all__: Sequence[str] = ("GOALS", "Judge", "judged", "measure", "traced_stage", "worked")
+__all__: Sequence[str] = ("GOALS", "Judge", "judged", "kept_frames", "measure", "traced_stage", "worked")

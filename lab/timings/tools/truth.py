@@ -16,7 +16,7 @@ from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
 from controller.optics.capture.raw import develop
 from lab.emulated.bumps import bumped, read_bumps
 from plugins.emulated.core.truth import BUMPS_FILE as BUMPS
-from plugins.emulated.core.truth import FOLDER, BenchTruth, read_truth
+from plugins.emulated.core.truth import FOLDER, BenchTruth, CameraTruth, read_truth
 from plugins.emulated.optics.indirect.transfers import IndirectTransfers
 from plugins.emulated.optics.light_cache import light_folder
 from plugins.emulated.optics.objects import StageObject
@@ -110,21 +110,8 @@ class Truth:
     def points_m(self) -> Float64:
         """(rows, columns, 3): where the middle of each camera pixel sees the object, in the camera's frame; or NaN."""
         camera = self.bench.camera
-        rows, columns = self.shape
-        y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
-        ray = directions(camera.pose, camera.lens, x.ravel(), y.ravel())
-        scene = rtcore_scene.EmbreeScene(robust=True)
-        mesh = TriangleMesh(scene, self.stage_object.vertices, self.stage_object.faces)
-        origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
-        found = scene.run(origin, ray.astype(np.float32), output=1)
-        del mesh
-        hit = found["primID"] >= 0
-        u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
-        corners = self.stage_object.vertices[self.stage_object.faces[found["primID"][hit]]].astype(np.float64)
-        world = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
-        points = np.full((rows * columns, 3), np.nan)
-        points[hit] = (world - camera.pose.position_m) @ camera.pose.rotation.T
-        return points.reshape(rows, columns, 3)
+        world = surface_points(self.stage_object, camera)
+        return np.asarray((world - camera.pose.position_m) @ camera.pose.rotation.T)
 
     def _mean_of_lit(self, n: int, values: Float64) -> Float64:
         lit = (self.samples.gain[n] > 0).astype(np.float64)[:, None]
@@ -134,6 +121,24 @@ class Truth:
         mean = np.full((self.shape[0] * self.shape[1], values.shape[1]), np.nan)
         mean[self.samples.pixels] = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
         return mean.reshape(*self.shape, -1)
+
+
+def surface_points(stage_object: StageObject, camera: CameraTruth) -> Float64:
+    """(rows, columns, 3): where the middle of each pixel of a camera sees the object, world metres; NaN elsewhere."""
+    columns, rows = camera.lens.size_px
+    y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
+    ray = directions(camera.pose, camera.lens, x.ravel(), y.ravel())
+    scene = rtcore_scene.EmbreeScene(robust=True)
+    mesh = TriangleMesh(scene, stage_object.vertices, stage_object.faces)
+    origin = np.broadcast_to(np.asarray(camera.pose.position_m, np.float32), ray.shape).copy()
+    found = scene.run(origin, ray.astype(np.float32), output=1)
+    del mesh
+    hit = found["primID"] >= 0
+    u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
+    corners = stage_object.vertices[stage_object.faces[found["primID"][hit]]].astype(np.float64)
+    points = np.full((rows * columns, 3), np.nan)
+    points[hit] = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
+    return points.reshape(rows, columns, 3)
 
 
 def _direct_alone(truth: BenchTruth, samples: Samples) -> tuple[BenchTruth, Samples]:
