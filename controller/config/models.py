@@ -7,7 +7,17 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from controller.config.defaults import SMOOTHNESS
-from controller.config.table import ConfigTable, KeyFile, Name, OpenConfigTable, Positive, Seconds, Size, StageFile
+from controller.config.table import (
+    ConfigTable,
+    KeyFile,
+    Name,
+    Offset,
+    OpenConfigTable,
+    Positive,
+    Seconds,
+    Size,
+    StageFile,
+)
 from hal.values import LampRules
 
 _Address = Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$", max_length=254)]
@@ -158,7 +168,7 @@ class OutputTable(ConfigTable):
         description='the connector ("HDMI-1") or the serial number of its display; if omitted: the name is one of '
         "these",
     )
-    left_top_px: Annotated[tuple[int, int], Field(strict=False)] | None = Field(
+    left_top_px: Annotated[tuple[Offset, Offset], Field(strict=False)] | None = Field(
         default=None,
         description="[x, y] of its upper left corner in the picture of its connector, where a splitter divides that "
         "among several projectors; if omitted: the output is the whole connector",

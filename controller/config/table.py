@@ -16,6 +16,7 @@ Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
 Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[int, Field(ge=1, le=16_384)]
+Offset = Annotated[int, Field(ge=0, le=16_384)]
 
 
 def is_name(text: str) -> bool:

@@ -78,7 +78,7 @@ class Swaps:
 class Watch:
     """What each player says that it presented, by the moment that was due."""
 
-    def __init__(self, computers: Spread) -> None:
+    def __init__(self, computers: Computers) -> None:
         self._computers = computers
         self._after = dict.fromkeys(computers.players(), 0)
         self.seen: dict[str, dict[int, tuple[float, str]]] = {name: {} for name in self._after}
@@ -128,7 +128,7 @@ def play(computers: Computers, request: dict[str, Any], within_s: float = 30.0) 
     return time.monotonic() - began_s
 
 
-def compared(computers: Spread, count: int, seconds: float = 1 / RATE_HZ) -> Swaps:
+def compared(computers: Computers, count: int, seconds: float = 1 / RATE_HZ) -> Swaps:
     """``count`` swaps of a sequence."""
     begin(computers, seconds)
     watch, until_s = Watch(computers), time.monotonic() + count * seconds + 2.5

@@ -102,9 +102,12 @@ def network(count: int, tag: str = "velatura") -> Iterator[Network]:
                 subprocess.run([*made.prefix(name), "ip", *words], check=True)
         carrier = threading.Thread(target=made._carry, daemon=True)
         carrier.start()
-        yield made
-        made._stop.set()
-        carrier.join()
+        try:
+            yield made
+        finally:
+            # Before the devices are closed: their numbers are soon those of other files, which it would read.
+            made._stop.set()
+            carrier.join()
     finally:
         for device in made._devices.values():
             os.close(device)

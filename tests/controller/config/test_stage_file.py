@@ -263,6 +263,28 @@ def test_a_key_that_neither_the_driver_nor_we_understand_is_named_with_its_line(
     assert error.value.code == "stage-key-unknown"
 
 
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('hst = "left"', "did you mean 'host'"),
+        ('scren = ":0.1"', "did you mean 'screen'"),
+        ("left_top = [0, 0]", "did you mean 'left_top_px'"),
+        ("left_top_px = [-1, 0]", "-1 is below 0"),
+        ("left_top_px = [0, 99999999999]", "is above 16384"),
+        ('screen = "0.1"', "does not have the allowed form"),
+        ('host = "a b"', "does not have the allowed form"),
+    ],
+)
+def test_a_wrong_place_of_an_output_is_named(tmp_path: Path, line: str, says: str) -> None:
+    with pytest.raises(UsageError, match=rf"\[\[display.outputs\]\] number 1.*{re.escape(says)}"):
+        load(tmp_path, swapped('name = "P1"\n', f'name = "P1"\n{line}\n'))
+
+
+def test_cameras_misspelt_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="'camras'; did you mean 'cameras'"):
+        load(tmp_path, swapped("[camera]", "[[camras]]"))
+
+
 def test_a_key_that_the_driver_needs_is_asked_for_with_its_explanation(tmp_path: Path) -> None:
     stage = load(tmp_path, swapped('port = "run/tty-right"\n', ""))
     with pytest.raises(UsageError, match=r"line 11.*'port' is missing.*the path of a tty") as error:

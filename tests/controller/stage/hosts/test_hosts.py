@@ -14,6 +14,7 @@ from controller.stage.link.transfer import PART_BYTES, Arrivals, Offer
 from hal.deadline import in_seconds
 from hal.errors import CodedError, DeviceError
 from plugins.display.player import PlayerDisplay
+from tests.campaigns.in_step import compared
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.wire import Frames, Wire, noise, same
 from tests.controller.stage.hosts.computers import Computers, running
@@ -60,6 +61,12 @@ def test_one_display_of_three_computers(three: Computers) -> None:
         assert not Frames(three.players()["right"].with_name("out.frame")).read()["right"].any()
     finally:
         display.close()
+
+
+def test_no_swap_of_a_list_is_mixed(three: Computers) -> None:
+    found = compared(three, 60, 0.05)
+    assert found.mixed == 0
+    assert found.compared >= 30, found
 
 
 def _played(display: PlayerDisplay) -> bool:
