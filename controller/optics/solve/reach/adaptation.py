@@ -40,9 +40,9 @@ LEAST_SIDE_PX: Final = 4
 """A cell's side is at least so many camera pixels."""
 THIN: Final = 0.005
 """Obstacles narrower than this part of the picture are ignored: grazing edges, specks, noise."""
-QUANTILE: Final = 0.7
+QUANTILE: Final = 0.95
 """A cell's obstacle is this quantile of the needs of its pixels."""
-REACH: Final = 0.01
+REACH: Final = 0.04
 """Beside an obstacle, the sheet falls to 1/e over this distance, relative to the picture's longer side."""
 ROUNDS: Final = 60
 """Active sets are tried so often at most."""
