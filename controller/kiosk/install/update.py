@@ -206,7 +206,9 @@ class Updates:
             unpacked.joinpath(*PROGRAM.parts[1:]).rename(self._other)
             shutil.rmtree(unpacked)
             write_atomically(self._other / MARK, name.encode())
-            self._tell(Outcome(name, "trial", "", self._now(), dict(self._status() or {})))
+            now = self._status() or {}
+            before = {key: now[key] for key in ("state", "drifts", "grades") if key in now}
+            self._tell(Outcome(name, "trial", "", self._now(), before))
             write_atomically(self._system.at(STARTS), b"0")
             os.sync()
             write_atomically(self._trial, name.encode())
