@@ -31,7 +31,7 @@ from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.state_machine import Event
 from controller.run.step_id import StepId
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import AllViews, Calibrated
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.published import Dimmed, write_photograph
 from controller.stage.artefacts.solved import RequestedTarget, read_solved
@@ -55,6 +55,7 @@ from controller.stage.steps.appearance.photographing import (
 from controller.stage.steps.appearance.refining import RefineOptions, refine_steps
 from controller.stage.steps.appearance.requests import requests_of
 from controller.stage.steps.appearance.solving import device_frames, options_of, solve_steps
+from controller.stage.steps.calibrate.full import join_geometry
 from controller.stage.steps.calibrate.gate import gate_step
 from hal.errors import DeviceError
 
@@ -242,11 +243,15 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
 
 
 def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequence[Step]:
-    """Calibrate, solve, refine, publish, photograph, compare with one projector, swap; other views only calibrate."""
+    """Calibrate, solve for all views, refine, publish, photograph, compare with one projector, swap.
+
+    Other views only calibrate; from then on, the first view's steps use all of them.
+    """
     stage = checked.stage
     if not rig.is_first:
         return calibrating(rig, run, checked=checked)
-    calibrated = Calibrated(run, checked.names, engine)
+    first = Calibrated(run, checked.names, engine)
+    calibrated = AllViews(run, checked.names, engine) if rig.others else first
     scan = stage.path(SCAN)
     requests = [
         replace(one, prepare=partial(_lay_scan, scan), prepare_s=LAY_S) if one.inputs["kind"] == "texture" else one
@@ -263,7 +268,11 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
     refining = RefineOptions(table.refine, table.smoothness, longest_s)
     solvings = {name: StepId(StepKind.APPEARANCE, item=name) for name in names}
     return [
-        *calibrating(rig, run, checked=checked, calibrated=calibrated),
+        *calibrating(rig, run, checked=checked, calibrated=first),
+        *(
+            [Step(StepId("views-joined"), partial(_join, checked), title="Joining the views", always=True)]
+            * bool(rig.others)
+        ),
         # The objects are emulated: a demo in a hard room is shown with the grade that it has.
         gate_step(worst_grade(checked), accepted=True),
         marker("solving", "Solving", enter=Event.SOLVE),
@@ -271,14 +280,20 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
         *refine_steps(rig, calibrated, {request.name: request.title for request in requests}, refining, after=solvings),
         marker("solved", "Solved", leave=Event.SOLVED),
         marker("publishing", "Publishing", enter=Event.PUBLISH),
-        publishing(checked, calibrated, names),
+        publishing(checked, first, names),
         marker("published", "Published", leave=Event.PUBLISHED),
         marker("playing", "Playing", enter=Event.PLAY),
         photograph_step(rig, names, longest_exposure_s=longest_s),
-        *_one_projector_steps(rig, calibrated, names, longest_s, options.share),
+        *_one_projector_steps(rig, first, names, longest_s, options.share),
         playback_step(rig, names, seconds=PLAYBACK_S),
         marker("played", "Played", leave=Event.PAUSE),
     ]
+
+
+def _join(checked: Checked, context: Context) -> Sequence[Path]:
+    shape = checked.stage.tables.object.shape
+    join_geometry(context.folder, checked.names, checked.prior, shape, context.reporter)
+    return ()
 
 
 def _lay_scan(scan: Path, context: Context) -> Sequence[Path]:

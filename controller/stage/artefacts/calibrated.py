@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -60,12 +61,11 @@ class View(NamedTuple):
 class Calibrated:
     """The calibration of a run and its transport, read at the first use and kept.
 
-    ``engine``: what does the heavy loops of its solves; ``names``: of its views
+    ``engine``: what does the heavy loops of its solves
     """
 
     def __init__(self, folder: Path, projectors: Sequence[str], engine: Engine | None = None) -> None:
         self.folder = folder
-        self.names: tuple[str, ...] = (first_view(folder),)
         self.projectors = tuple(projectors)
         self.engine: Engine = Processor() if engine is None else engine
         self._calibration: Calibration | None = None
@@ -75,6 +75,11 @@ class Calibrated:
         self._base: Base | None = None
         self._drive: DriveLevels | None = None
         self._reflectance: FloatImage | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its views."""
+        return (first_view(self.folder),)
 
     @property
     def base_folder(self) -> Path:
@@ -210,18 +215,26 @@ def share_above(differs: FloatImage) -> float:
 
 def all_views(run: Path, projectors: Sequence[str], engine: Engine | None = None) -> Calibrated:
     """The calibration of a run with all of its whole views; of one view it is that view's own."""
-    folders = view_folders(run)
-    return AllViews(folders, projectors, engine) if len(folders) > 1 else Calibrated(run, projectors, engine)
+    kind = AllViews if len(view_folders(run)) > 1 else Calibrated
+    return kind(run, projectors, engine)
 
 
 class AllViews(Calibrated):
-    """Several views of a run as one: their camera images lie on one sheet, in the units of the first view."""
+    """Several views of a run as one: their camera images lie on one sheet, in the units of the first view.
 
-    def __init__(self, folders: Mapping[str, Path], projectors: Sequence[str], engine: Engine | None = None) -> None:
-        super().__init__(next(iter(folders.values())), projectors, engine)
-        self.names = tuple(folders)
-        self._views = [Calibrated(folder, projectors, self.engine) for folder in folders.values()]
-        self._gains: list[FloatImage] | None = None
+    Those count that are whole at its first use.
+    """
+
+    _gains: list[FloatImage] | None = None
+
+    @functools.cached_property
+    def _views(self) -> list[Calibrated]:
+        folders = view_folders(self.folder).values()
+        return [Calibrated(folder, self.projectors, self.engine) for folder in folders]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(view_folders(self.folder))
 
     @property
     def first(self) -> Calibrated:
@@ -249,7 +262,7 @@ class AllViews(Calibrated):
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        return tuple(view.folder for view in self._views)
+        return tuple(view_folders(self.folder).values())
 
     def joined(self, images: Sequence[Any]) -> Any:
         return self.sheet.joined(images)

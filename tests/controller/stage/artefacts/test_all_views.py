@@ -27,7 +27,7 @@ from controller.stage.report.galleries import views_gallery
 from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
 from hal.deadline import in_seconds
 from hal.notices import Level
-from lab.timings.tools.synthetic import synthetic_calibration, write_synthetic_run
+from lab.timings.tools.synthetic import NAMES, synthetic_calibration, write_synthetic_run
 
 PROJECTOR = (14, 18)
 CAMERAS = {"left": (36, 50), "right": (52, 70)}
@@ -187,6 +187,15 @@ def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None
     replaced = [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())]
     (folder / "verification.json").write_text("{}")
     assert [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())] != replaced
+
+
+def test_views_that_become_whole_before_the_first_use_count(tmp_path: Path) -> None:
+    early = AllViews(tmp_path, NAMES[:3])
+    assert list(early.folders) == [tmp_path]
+    two_views(tmp_path)
+    assert early.names == ("left", "right")
+    assert early.folders == (tmp_path, view_folder(tmp_path, "right"))
+    assert len(early.views()) == 2
 
 
 def test_one_view_is_read_as_ever(tmp_path: Path) -> None:

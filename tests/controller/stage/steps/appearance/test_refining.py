@@ -33,7 +33,7 @@ from controller.stage.artefacts.solved import (
     read_solved,
     remove_refined,
 )
-from controller.stage.artefacts.views import view_folder
+from controller.stage.artefacts.views import view_folder, view_folders, write_view
 from controller.stage.report.page import refined_row
 from controller.stage.rig.rig import RigCamera
 from controller.stage.rig.shared_display import SharedDisplay
@@ -377,9 +377,11 @@ class SecondCamera(SeeingCamera):
 
 class TwoViews(AllViews):
     def __init__(self, run: Path) -> None:
-        folders = {"front": run, "side": view_folder(run, "side")}
-        super().__init__(folders, NAMES)
-        self._views = [Known(folder) for folder in folders.values()]
+        super().__init__(run, NAMES)
+        for number, (name, folder) in enumerate((("front", run), ("side", view_folder(run, "side")))):
+            folder.mkdir(parents=True, exist_ok=True)
+            write_view(folder, name, number)
+        self._views = [Known(folder) for folder in view_folders(run).values()]
         known = calibration()
         parts = tuple(replace(part, white=UNITS * part.white) for part in known.projectors)
         self._views[1]._calibration = replace(known, projectors=parts, black=UNITS * known.black)
@@ -389,8 +391,7 @@ class TwoViews(AllViews):
 def two(tmp_path: Path) -> Stage:
     stage = Stage(tmp_path)
     calibrated = TwoViews(stage.calibrated.folder)
-    (own := calibrated.folders[1]).mkdir(parents=True)
-    stage.solved.seen(lambda image: image, calibrated.gains[1]).write(own, NAME)
+    stage.solved.seen(lambda image: image, calibrated.gains[1]).write(calibrated.folders[1], NAME)
     stage.calibrated = calibrated
     stage.second = SecondCamera(display=stage.display)
     acquirer = Acquirer(stage.display, stage.second, iso=100, aperture_f=None, settle_s=0.0)
