@@ -4,11 +4,13 @@ The real one is in tests/booted.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
+import firmware_configs
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.kiosk_places import RUNTIME
 from controller.kiosk import panel_address
@@ -190,3 +192,11 @@ def test_the_player_of_a_stage_with_other_computers_may_use_the_network(debian: 
     stage.write_text('[[display.outputs]]\nname = "P1"\nhost = "left"\n')
     assert "systemctl restart velatura-controller velatura-player" in installed(debian, THERE).ran
     assert "AF_INET" in network.read_text()
+
+
+def test_every_unit_and_profile_is_in_the_package() -> None:
+    root = Path(firmware_configs.__file__).parent
+    patterns = tomllib.loads((root.parent / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    packed = {path for pattern in patterns["firmware_configs"] for path in root.glob(pattern)}
+    there = {path for path in root.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    assert there == packed
