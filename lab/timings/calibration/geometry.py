@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from embreex import rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 from scipy.spatial.transform import Rotation
 
 from controller.core.arrays import Float64
@@ -28,9 +26,10 @@ from controller.optics.calibrate.values import Correspondence
 from lab.timings import Row, at_least, at_most, peak_bytes
 from lab.timings.tools.alignment import similarity
 from lab.timings.tools.stage import over
+from lab.timings.tools.truth import points_from
 from plugins.emulated.core.truth import BenchTruth, ObjectTruth
 from plugins.emulated.optics.objects import StageObject, default_object, load_object
-from plugins.emulated.optics.rays import cast, directions
+from plugins.emulated.optics.rays import cast
 from plugins.emulated.optics.staging import device_tables, intrinsics_of, random_truth
 
 FIRST_SEED = 900
@@ -143,26 +142,7 @@ def _correspondences(truth: BenchTruth, stage_object: StageObject, seed: int) ->
         shaped = px.reshape(height, width, 2).astype(np.float32)
         valid = np.isfinite(shaped[..., 0])
         out.append(Correspondence(shaped, valid.astype(np.float32), valid))
-    return out, _points(truth, stage_object)
-
-
-def _points(truth: BenchTruth, stage_object: StageObject) -> Float64:
-    """(rows, columns, 3) in the camera's frame, NaN where the camera sees no object."""
-    width, height = truth.camera.lens.size_px
-    y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-    ray = directions(truth.camera.pose, truth.camera.lens, x.ravel(), y.ravel())
-    scene = rtcore_scene.EmbreeScene(robust=True)
-    mesh = TriangleMesh(scene, stage_object.vertices, stage_object.faces)
-    origin = np.broadcast_to(np.asarray(truth.camera.pose.position_m, np.float32), ray.shape).copy()
-    hits = scene.run(origin, ray.astype(np.float32), output=1)
-    del mesh
-    hit = hits["primID"] >= 0
-    u, v = hits["u"][hit].astype(np.float64), hits["v"][hit].astype(np.float64)
-    corners = stage_object.vertices[stage_object.faces[hits["primID"][hit]]].astype(np.float64)
-    points = np.full((height * width, 3), np.nan)
-    world = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
-    points[hit] = (world - truth.camera.pose.position_m) @ truth.camera.pose.rotation.T
-    return points.reshape(height, width, 3)
+    return out, points_from(truth.camera, stage_object)
 
 
 def _errors(truth: BenchTruth, true: Float64, result: Reconstruction) -> dict[str, float]:

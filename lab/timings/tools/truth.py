@@ -109,9 +109,7 @@ class Truth:
 
     def points_m(self) -> Float64:
         """(rows, columns, 3): where the middle of each camera pixel sees the object, in the camera's frame; or NaN."""
-        camera = self.bench.camera
-        world = surface_points(self.stage_object, camera)
-        return np.asarray((world - camera.pose.position_m) @ camera.pose.rotation.T)
+        return points_from(self.bench.camera, self.stage_object)
 
     def _mean_of_lit(self, n: int, values: Float64) -> Float64:
         lit = (self.samples.gain[n] > 0).astype(np.float64)[:, None]
@@ -121,6 +119,11 @@ class Truth:
         mean = np.full((self.shape[0] * self.shape[1], values.shape[1]), np.nan)
         mean[self.samples.pixels] = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
         return mean.reshape(*self.shape, -1)
+
+
+def points_from(camera: CameraTruth, stage_object: StageObject) -> Float64:
+    """(rows, columns, 3): as ``surface_points``, in the camera's own frame."""
+    return np.asarray((surface_points(stage_object, camera) - camera.pose.position_m) @ camera.pose.rotation.T)
 
 
 def surface_points(stage_object: StageObject, camera: CameraTruth) -> Float64:
