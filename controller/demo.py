@@ -267,12 +267,10 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
     longest_s = stage.tables.capture.longest_exposure_s
     refining = RefineOptions(table.refine, table.smoothness, longest_s)
     solvings = {name: StepId(StepKind.APPEARANCE, item=name) for name in names}
+    joining = Step(StepId("views-joined"), partial(_join, checked), title="Joining the views", always=True)
     return [
         *calibrating(rig, run, checked=checked, calibrated=first),
-        *(
-            [Step(StepId("views-joined"), partial(_join, checked), title="Joining the views", always=True)]
-            * bool(rig.others)
-        ),
+        *((joining,) if rig.others else ()),
         # The objects are emulated: a demo in a hard room is shown with the grade that it has.
         gate_step(worst_grade(checked), accepted=True),
         marker("solving", "Solving", enter=Event.SOLVE),

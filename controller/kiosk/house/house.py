@@ -270,23 +270,27 @@ class House:
             stages = {name: self._stages[name] for name in rollout.read_text().split() if name in self._stages}
             told = {name: one.report.update for name, one in stages.items() if one.report is not None}
             state = {name: one.state if one.name == digest else "" for name, one in told.items()}
+            if failed := [name for name in stages if state.get(name) == "failed"]:
+                self._give_up(f"{failed[0]} went back. {told[failed[0]].why}")
+                return
+            if all(state.get(name) == "done" for name in stages):
+                rollout.unlink()
+                self._record("house-updated", f"The update is on {', '.join(stages)}.", "info")
+                return
+            proved = state.get(next(iter(stages))) == "done"
             try:
-                for name in [name for name in stages if state.get(name) == "failed"]:
-                    raise WorkError("house-update-failed", what=f"{name} went back. {told[name].why}", remedy="")
-                if all(state.get(name) == "done" for name in stages):
-                    rollout.unlink()
-                    self._record("house-updated", f"The update is on {', '.join(stages)}.", "info")
-                    return
-                proved = state.get(next(iter(stages))) == "done"
                 for name, stage in list(stages.items())[: None if proved else 1]:
                     if stage.linked and not state.get(name) and stage.offered != digest:
                         self._offer(name, package)
                         stage.offered = digest
             except WorkError as error:
-                if error.code == "link-no-answer":
-                    return  # it is tried again
-                rollout.unlink()
-                self._record("house-update-failed", f"The update goes to no more stages. {error.what}", "error")
+                # a stage that does not answer is asked again
+                if error.code != "link-no-answer":
+                    self._give_up(error.what)
+
+    def _give_up(self, why: str) -> None:
+        (self._stage / ROLLOUT).unlink()
+        self._record("house-update-failed", f"The update goes to no more stages. {why}", "error")
 
     def _offer(self, name: str, package: Path) -> None:
         arrived = send(self._link, f"member/{name}/package", package)
