@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
@@ -128,6 +129,11 @@ def points_from(camera: CameraTruth, stage_object: StageObject) -> Float64:
 
 def surface_points(stage_object: StageObject, camera: CameraTruth) -> Float64:
     """(rows, columns, 3): where the middle of each pixel of a camera sees the object, world metres; NaN elsewhere."""
+    return seen_values(stage_object, camera, stage_object.vertices[stage_object.faces])
+
+
+def seen_values(stage_object: StageObject, camera: CameraTruth, corners: npt.NDArray[np.float32]) -> Float64:
+    """(rows, columns, K): what the middle of each pixel sees of values at the faces' corners (F, 3, K); NaN beside."""
     columns, rows = camera.lens.size_px
     y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
     ray = directions(camera.pose, camera.lens, x.ravel(), y.ravel())
@@ -138,10 +144,10 @@ def surface_points(stage_object: StageObject, camera: CameraTruth) -> Float64:
     del mesh
     hit = found["primID"] >= 0
     u, v = found["u"][hit].astype(np.float64), found["v"][hit].astype(np.float64)
-    corners = stage_object.vertices[stage_object.faces[found["primID"][hit]]].astype(np.float64)
-    points = np.full((rows * columns, 3), np.nan)
-    points[hit] = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), corners)
-    return points.reshape(rows, columns, 3)
+    values = np.full((rows * columns, corners.shape[2]), np.nan)
+    of_face = corners[found["primID"][hit]].astype(np.float64)
+    values[hit] = np.einsum("nk,nkc->nc", np.stack((1 - u - v, u, v), -1), of_face)
+    return values.reshape(rows, columns, -1)
 
 
 def _direct_alone(truth: BenchTruth, samples: Samples) -> tuple[BenchTruth, Samples]:
