@@ -102,7 +102,7 @@ def _render(checked: Checked, run: Path, kept: Path, scene: str | Path) -> None:
     from controller.optics.solve.targets.files import read_picture
     from controller.stage.artefacts.calibrated import Calibrated
     from controller.stage.artefacts.geometry import read_geometry, require_shape
-    from controller.stage.blender.job import RenderSettings, as_seen, write_job
+    from controller.stage.blender.job import RenderSettings, as_seen, own_paint, write_job
     from controller.stage.blender.run import find_blender, render
 
     require_shape(run, "A scene of Blender")
@@ -115,10 +115,10 @@ def _render(checked: Checked, run: Path, kept: Path, scene: str | Path) -> None:
     settings = RenderSettings(samples=SAMPLES, threads=max(1, (os.cpu_count() or 2) - 1))
     with tempfile.TemporaryDirectory(dir=kept.parent) as scratch:
         work = Path(scratch)
-        write_job(work, geometry, transport.object_mask, transport.reach(),
+        write_job(work, geometry, transport.object_mask, own_paint(geometry, transport.reach()),
                   scene=scene, settings=settings, view=view)  # fmt: skip
         picture = read_picture(render(blender, work, lambda share, note: None))
-    target = as_seen(picture, view, light.drive.mask)
+    (target,) = as_seen([picture], [view], [light.drive.mask])
     save_arrays(kept, {"image": target.image, "mask": target.mask})
 
 

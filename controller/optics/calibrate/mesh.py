@@ -20,9 +20,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import Float64, FloatImage
+from controller.core.arrays import Float64, FloatImage, Mask
 from controller.core.errors import UsageError
 from controller.core.storage import stream_atomically
+from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Geometry, Pinhole
 
 STEEPEST = 6.0
@@ -78,6 +79,23 @@ def _joined(points: FloatImage, corners: npt.NDArray[np.int32], reach: float) ->
         with np.errstate(invalid="ignore"):
             keep &= np.linalg.norm(end - start, axis=1) <= reach * np.minimum(start[:, 2], end[:, 2])
     return np.asarray(keep)
+
+
+COVERED: Final = 0.01
+"""Relative difference of distance up to which two views see the same surface."""
+
+
+def seen_at(camera: Pinhole, points_m: FloatImage, places_m: FloatImage) -> tuple[Float64, Mask]:
+    """Where a camera has places in space (places, 3) in its picture, (places, 2) px, and whether it sees them.
+
+    ``points_m`` (rows, columns, 3): what it sees, in its own frame
+    """
+    px, depth = project(camera, places_m.astype(np.float64))
+    rows, columns = points_m.shape[:2]
+    x, y = np.rint(np.nan_to_num(px, nan=-1.0)).clip(-1, max(rows, columns)).astype(np.int64).T
+    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows) & (depth > 0)
+    known = np.where(inside, points_m[np.where(inside, y, 0), np.where(inside, x, 0), 2], np.nan)
+    return px, np.asarray(np.abs(known - depth) < COVERED * known)
 
 
 OBJECT = "object"
@@ -222,11 +240,11 @@ def scene_script(views: Sequence[tuple[str, Pinhole]], cameras: int, mesh_file: 
 
     ``views``: all by name, first the ``cameras``; ``-- --render FILE`` renders, ``-- --save FILE`` keeps a .blend.
     """
-    made = [_view(name, own, margin_px(own) if n < cameras else 0) for n, (name, own) in enumerate(views)]
+    made = [blender_camera(name, own, margin_px(own) if n < cameras else 0) for n, (name, own) in enumerate(views)]
     return _SCRIPT.replace("@MESH@", json.dumps(mesh_file)).replace("@VIEWS@", json.dumps(made, indent=4))
 
 
-def _view(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:
+def blender_camera(name: str, own: Pinhole, margin: int) -> Mapping[str, object]:
     """A Blender camera: focal length and shift in widths of the rendered picture, and its matrix in the world."""
     width, height = own.size_px
     whole_width, whole_height = width + 2 * margin, height + 2 * margin

@@ -12,6 +12,7 @@ import numpy as np
 
 from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.errors import UsageError
+from controller.optics.calibrate.mesh import seen_at
 from controller.optics.calibrate.photometry.reflectance import own_reflectance
 from controller.optics.calibrate.photometry.view_colours import in_common_units, view_gains
 from controller.optics.calibrate.values import Calibration, Geometry, ProjectorCalibration
@@ -37,6 +38,8 @@ from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import SolvedBase
 from controller.stage.artefacts.views import first_view, view_folders
 
+_IMAGES: Final = ("points_m", "normals")
+"""Of a geometry."""
 CLEARLY: Final = 3.0
 """CIEDE2000 above which a difference between views is easily seen."""
 
@@ -108,6 +111,10 @@ class Calibrated:
         """Points and poses in the camera's frame. Raises UsageError("shape-unknown")."""
         return read_geometry(self.folder, self.projectors)
 
+    def geometries(self) -> list[Geometry]:
+        """Of each view, all in the first camera's frame. Raises as ``geometry``."""
+        return [self.geometry]
+
     def places(self, mesh: RegisteredMesh) -> Places:
         """Where the camera's pixels lie on a mesh's sheet."""
         return mesh.places(read_camera(self.folder))
@@ -134,6 +141,21 @@ class Calibrated:
     def first(self) -> Calibrated:
         """The first view alone."""
         return self
+
+    def each(self) -> list[Calibrated]:
+        """The views, each alone, in the units of the first one."""
+        return [self]
+
+    def places_in(self, of: int, to: int) -> FloatImage | None:
+        """Where the pixels of one view lie in the picture of another one, by the shape: (rows, columns, 2) x, y in px,
+        NaN where that one sees something else. ``of``, ``to``: numbers of views. None where the shape does not tell.
+        """
+        return None
+
+    @functools.cached_property
+    def known_geometry(self) -> Geometry | None:
+        """``geometry``; None where it is not known."""
+        return known_geometry(self.folder, self.projectors)
 
     @property
     def indirect(self) -> IndirectLight | None:
@@ -192,8 +214,7 @@ class Calibrated:
     def reflectance(self) -> FloatImage:
         """The object's own pattern (rows, columns, 3), NaN where it is not known."""
         if self._reflectance is None:
-            geometry = known_geometry(self.folder, self.projectors)
-            self._reflectance = own_reflectance(self.calibration, geometry)
+            self._reflectance = own_reflectance(self.calibration, self.known_geometry)
         return self._reflectance
 
     def differences(self, image: FloatImage, mask: Mask, white: float) -> FloatImage | None:
@@ -240,6 +261,24 @@ class AllViews(Calibrated):
     def first(self) -> Calibrated:
         """The first view alone, which is in its own units anyway."""
         return self._views[0]
+
+    def each(self) -> list[Calibrated]:
+        _ = self.gains
+        return list(self._views)
+
+    def places_in(self, of: int, to: int) -> FloatImage | None:
+        if self.known_geometry is None:
+            return None
+        each, points = self.geometries(), self.sheet.parts(self.known_geometry.points_m)[of]
+        px, seen = seen_at(each[to].camera, self._views[to].geometry.points_m, points.reshape(-1, 3))
+        return np.asarray(np.where(seen[:, None], px, np.nan).reshape(*points.shape[:2], 2), np.float32)
+
+    @functools.cached_property
+    def known_geometry(self) -> Geometry | None:
+        try:
+            return self.geometry
+        except UsageError:
+            return None
 
     @property
     def gains(self) -> list[FloatImage]:
@@ -322,21 +361,31 @@ class AllViews(Calibrated):
 
         Raises UsageError("shape-unknown", "views-apart").
         """
-        geometries = [view.geometry for view in self._views]
-        poses = [read_view_pose(view.folder) for view in self._views]
-        points, normals = [], []
-        for name, pose, own in zip(self.names, poses, geometries, strict=True):
-            if pose is None:
-                raise UsageError(
-                    "views-apart",
-                    what=f"It is not known where the view {name} stands, and this needs the shape from all sides.",
-                    remedy="Let it see two projectors that another view sees, too, and calibrate again; or use an"
-                    " appearance that needs no shape.",
-                )
-            points.append((own.points_m - pose.shift_m.astype(np.float32)) @ pose.rotation.astype(np.float32))
-            normals.append(own.normals @ pose.rotation.astype(np.float32))
-        points_m, normals_there = (self.sheet.joined(images, np.nan) for images in (points, normals))
-        return dataclasses.replace(geometries[0], points_m=points_m, normals=normals_there)
+        each = self.geometries()
+        points_m, normals = (self.sheet.joined([getattr(one, key) for one in each], np.nan) for key in _IMAGES)
+        return dataclasses.replace(each[0], points_m=points_m, normals=normals)
+
+    def geometries(self) -> list[Geometry]:
+        return [self._in_first_frame(name, view) for name, view in zip(self.names, self._views, strict=True)]
+
+    def _in_first_frame(self, name: str, view: Calibrated) -> Geometry:
+        own, pose = view.geometry, read_view_pose(view.folder)
+        if pose is None:
+            raise UsageError(
+                "views-apart",
+                what=f"It is not known where the view {name} stands, and this needs the shape from all sides.",
+                remedy="Let it see two projectors that another view sees, too, and calibrate again; or use an"
+                " appearance that needs no shape.",
+            )
+        turn = pose.rotation.astype(np.float32)
+        return Geometry(
+            dataclasses.replace(own.camera, rotation=pose.rotation, translation_m=pose.shift_m),
+            self._views[0].geometry.projectors,
+            (own.points_m - pose.shift_m.astype(np.float32)) @ turn,
+            own.normals @ turn,
+            own.reprojection_rms_px,
+            own.scale_known,
+        )
 
     def places(self, mesh: RegisteredMesh) -> Places:
         _ = self.geometry  # refuses views that stand apart

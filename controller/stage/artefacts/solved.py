@@ -94,7 +94,8 @@ class Registered:
     """``registration-NAME.json`` and ``.npz``: how a restoration's picture lies on the object.
 
     ``about``: what it depends on; ``figures``: turned_degrees, residual_px and residual_px_p95 (camera pixels, None
-    where nothing can be measured), by_points, matched_share of the picture's place, and what ``with_less_light`` gives
+    where nothing can be measured), by_points, matched_share of the picture's place, ``carried`` (views that it was
+    carried to by the shape), and what ``with_less_light`` gives
     ``residual_px`` (rows, columns) float16: NaN where it can't be measured
     """
 

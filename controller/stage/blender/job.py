@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from controller.core.arrays import FloatImage, Mask, save_arrays
 from controller.core.blur import nearest_known
 from controller.core.errors import WorkError
 from controller.core.storage import write_atomically
-from controller.optics.calibrate.mesh import TO_BLENDER, Mesh, grid_mesh, margin_px, places_in_rendering
+from controller.optics.calibrate.mesh import TO_BLENDER, Mesh, blender_camera, grid_mesh, margin_px, places_in_rendering
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.relight import smooth_normals
 from controller.optics.solve.targets.values import Target
@@ -48,7 +49,7 @@ def write_job(
     folder: Path,
     geometry: Geometry,
     mask: Mask,
-    light: FloatImage,
+    paint: FloatImage,
     *,
     scene: str | Path,
     settings: RenderSettings,
@@ -58,50 +59,51 @@ def write_job(
 
     Parameters
     ----------
+    geometry : its camera may stand anywhere; all views of a stage are in the first one's frame, which is Blender's
     mask : (camera rows, columns), the object
+    paint : (camera rows, columns, 3), of ``own_paint``
     scene : the name of one of ``BUILTIN``, or a .blend file
     view : the camera of the picture; by default the calibrated one, whose picture a quick look needs only small
-    light : (camera rows, columns, 3), what the camera sees under the white of all projectors; from it and the known
-        places of the projectors comes the object's own paint
 
     Raises WorkError("target-no-geometry") when too little of the object's shape is known.
     """
-    mesh = _surface(geometry, mask)
+    turn, shift_m = (one.astype(np.float32) for one in (geometry.camera.rotation, geometry.camera.translation_m))
+    own = dataclasses.replace(
+        geometry, points_m=geometry.points_m @ turn.T + shift_m, normals=geometry.normals @ turn.T
+    )
+    mesh = _surface(own, mask)
     rows, columns = mask.shape
     column, row = np.round(mesh.camera_px).astype(int).T
-    paint = own_paint(geometry, light)[row, column]
+    vertices_m = upright((np.concatenate([mesh.vertices_m, _behind(mesh.vertices_m)]) - shift_m) @ turn)
     save_arrays(
         folder / "mesh.npz",
         {
-            "vertices_m": upright(np.concatenate([mesh.vertices_m, _behind(mesh.vertices_m)])),
-            "normals": upright(np.concatenate([mesh.normals, -mesh.normals])),
+            "vertices_m": vertices_m,
+            "normals": upright(np.concatenate([mesh.normals, -mesh.normals]) @ turn),
             "triangles": solid(mesh.triangles, len(mesh.vertices_m)),
             "uv": np.tile(np.stack([(column + 0.5) / columns, 1 - (row + 0.5) / rows], axis=1), (2, 1)),
-            "reflectance": np.tile(paint, (2, 1)),
+            "reflectance": np.tile(paint[row, column], (2, 1)),
         },
     )
-    view = geometry.camera if view is None else view
+    view, depth_m = geometry.camera if view is None else view, mesh.vertices_m[:, 2]
+    clip = {"near_m": float(depth_m.min()) * 0.2, "far_m": float(depth_m.max()) * 20}
     job = {
         "builtin": scene if isinstance(scene, str) else None,
         "scene_file": None if isinstance(scene, str) else str(scene.resolve()),
-        "camera": _camera_of(view, mesh.vertices_m[:, 2]),
+        "camera": {**blender_camera("calibrated", view, margin_px(view)), **clip},
+        "bounds_m": [vertices_m.min(axis=0).tolist(), vertices_m.max(axis=0).tolist()],
         **dataclasses.asdict(settings),
     }
     write_atomically(folder / "job.json", json.dumps(job, indent=1).encode())
 
 
-def _camera_of(view: Pinhole, depth_m: FloatImage) -> dict[str, Any]:
-    """Blender's camera, with the margin that the lens's distortion needs; ``depth_m`` (N,) of the object."""
-    margin, matrix = margin_px(view), view.matrix
-    return {
-        "size_px": (view.size_px[0] + 2 * margin, view.size_px[1] + 2 * margin),
-        "fx": float(matrix[0, 0]),
-        "fy": float(matrix[1, 1]),
-        "cx": float(matrix[0, 2]) + margin,
-        "cy": float(matrix[1, 2]) + margin,
-        "near_m": float(depth_m.min()) * 0.2,
-        "far_m": float(depth_m.max()) * 20,
-    }
+def light_alike(folders: Sequence[Path]) -> None:
+    """Let the jobs in these folders, of several views of one object, have one size of it, which the lights follow."""
+    jobs = [json.loads((folder / "job.json").read_bytes()) for folder in folders]
+    low, high = (np.array([job["bounds_m"][end] for job in jobs]) for end in (0, 1))
+    bounds_m = [low.min(axis=0).tolist(), high.max(axis=0).tolist()]
+    for folder, job in zip(folders, jobs, strict=True):
+        write_atomically(folder / "job.json", json.dumps({**job, "bounds_m": bounds_m}, indent=1).encode())
 
 
 def upright(vectors: FloatImage) -> FloatImage:
@@ -146,6 +148,7 @@ def solid(triangles: npt.NDArray[np.int32], vertices: int) -> npt.NDArray[np.int
 def own_paint(geometry: Geometry, light: FloatImage) -> FloatImage:
     """(rows, columns, 3) reflectance in [0.02, 0.95]: the light that comes back over the light that arrives.
 
+    ``light`` (rows, columns, 3): what the camera sees under the white of all projectors
     What arrives is taken as falling with the square of the distance and the cosine (Lambert), the same from every
     projector, which is right but for one factor; the palest places are given 0.9.
     """
@@ -163,21 +166,33 @@ def own_paint(geometry: Geometry, light: FloatImage) -> FloatImage:
     return paint
 
 
-def as_seen(picture: FloatImage, camera: Pinhole, mask: Mask) -> Target:
-    """The rendered picture (rows, columns, 4; transparent where no object is) as the calibrated camera sees it.
+def as_seen(pictures: Sequence[FloatImage], cameras: Sequence[Pinhole], masks: Sequence[Mask]) -> list[Target]:
+    """The rendered pictures (rows, columns, 4; transparent where no object is) as the calibrated cameras see them.
 
-    The picture is scaled so that all but its highlights lie below 1, and clipped at 1.5; the exposure is the solver's.
+    They are scaled alike, so that all but their highlights lie below 1, and clipped at 1.5; the exposure is the
+    solver's.
     """
+    seen = [_seen(*one) for one in zip(pictures, cameras, strict=True)]
+    levels = [colour[mask & covered].max(axis=1) for (colour, covered), mask in zip(seen, masks, strict=True)]
+    bright = np.concatenate(levels)
+    scale = max(float(np.percentile(bright, BRIGHTEST_PERCENT)), 1e-9) if len(bright) else 1.0
+    return [_filled(colour / scale, covered, mask) for (colour, covered), mask in zip(seen, masks, strict=True)]
+
+
+def _seen(picture: FloatImage, camera: Pinhole) -> tuple[FloatImage, Mask]:
+    """Light (rows, columns, 3), and where the object is."""
     at = places_in_rendering(camera).astype(np.float32)
     # linear, since splines would ring around highlights and silhouettes
     picture = np.asarray(cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float32)
     covered = picture[..., 3] > 0.5
     # Alpha is premultiplied in a rendering; at silhouettes the object's own light is what counts.
     colour = np.where(covered[..., None], picture[..., :3] / np.maximum(picture[..., 3:], 0.5), 0)
-    colour = np.where(np.isfinite(colour), np.maximum(colour, 0), 0)
-    scale = float(np.percentile(colour[mask & covered].max(axis=1), BRIGHTEST_PERCENT)) if covered[mask].any() else 1.0
+    return np.where(np.isfinite(colour), np.maximum(colour, 0), 0).astype(np.float32), covered
+
+
+def _filled(colour: FloatImage, covered: Mask, mask: Mask) -> Target:
     distance, nearest = nearest_known(covered & mask)
     filled = mask & (distance <= FURTHEST_FILL_PX)
     # Where a bent shape leaves the object bare, there is nothing to be seen: black.
-    image = np.where(filled[..., None], np.minimum(colour[nearest] / max(scale, 1e-9), 1.5), 0)
+    image = np.where(filled[..., None], np.minimum(colour[nearest], 1.5), 0)
     return Target(np.ascontiguousarray(image, np.float32), mask)

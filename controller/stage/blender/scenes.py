@@ -1,7 +1,8 @@
 """The scenes that come with Velatura. Runs inside Blender's own Python, beside ``worker.py``; imports nothing of ours.
 
-A scene gets the object as the camera sees it: metres, z up, the camera at the origin looking along y. It gives it a
-material and lights it; all sizes follow the object's own. The object is solid: behind what the camera sees lies a back.
+A scene gets the object as a camera sees it: metres, z up, the first camera at the origin looking along y. It gives it
+a material and lights it; all sizes follow the object's own, from ``low`` to ``high``. The object is solid: behind what
+the camera sees lies a back.
 """
 
 import math
@@ -15,10 +16,10 @@ COLOURS = "reflectance"
 """Name of the vertex colours: the object's own paint, linear."""
 
 
-def marble(body: Any) -> None:
+def marble(body: Any, low: Any, high: Any) -> None:
     """White marble with grey veins; light goes some way inside (Christensen and Burley's random walk)."""
     nodes, links, surface = _material(body, "marble")
-    size = _size(body)
+    size = float(max(high - low))
     place = nodes.new("ShaderNodeTexCoord")
     bends = nodes.new("ShaderNodeTexNoise")
     bends.inputs["Scale"].default_value = 6.0 / size
@@ -44,25 +45,25 @@ def marble(body: Any) -> None:
     surface.inputs["Subsurface Scale"].default_value = 0.04 * size
     surface.inputs["Subsurface Radius"].default_value = (1.0, 0.7, 0.5)
     surface.inputs["Roughness"].default_value = 0.25
-    _studio(body, ambient=0.25)
+    _studio(low, high, ambient=0.25)
 
 
-def gold(body: Any) -> None:
+def gold(body: Any, low: Any, high: Any) -> None:
     """Polished gold in a bright room, with the object mirrored in itself."""
     _, _, surface = _material(body, "gold")
     surface.inputs["Base Color"].default_value = (1.0, 0.66, 0.24, 1)
     surface.inputs["Metallic"].default_value = 1.0
     surface.inputs["Roughness"].default_value = 0.22
-    _studio(body, ambient=0.15)
+    _studio(low, high, ambient=0.15)
     _room()
 
 
-def glazed(body: Any) -> None:
+def glazed(body: Any, low: Any, high: Any) -> None:
     """A blue glaze over white clay: the object's own relief, and a clear coat with sharp highlights."""
     nodes, links, surface = _material(body, "glaze")
     place = nodes.new("ShaderNodeTexCoord")
     spots = nodes.new("ShaderNodeTexNoise")
-    spots.inputs["Scale"].default_value = 14.0 / _size(body)
+    spots.inputs["Scale"].default_value = 14.0 / float(max(high - low))
     spots.inputs["Detail"].default_value = 4.0
     ramp = nodes.new("ShaderNodeValToRGB")
     ramp.color_ramp.elements[0].color = (0.010, 0.035, 0.22, 1)
@@ -75,21 +76,21 @@ def glazed(body: Any) -> None:
     surface.inputs["Roughness"].default_value = 0.5
     surface.inputs["Coat Weight"].default_value = 1.0
     surface.inputs["Coat Roughness"].default_value = 0.06
-    _studio(body, ambient=0.3)
+    _studio(low, high, ambient=0.3)
 
 
-def lowered_head(body: Any) -> None:
+def lowered_head(body: Any, low: Any, high: Any) -> None:
     """The object in its own paint, its upper third bent forward: geometry that is not there."""
     nodes, links, surface = _material(body, "own paint")
     paint = nodes.new("ShaderNodeVertexColor")
     paint.layer_name = COLOURS
     links.new(paint.outputs["Color"], surface.inputs["Base Color"])
     surface.inputs["Roughness"].default_value = 0.8
-    _bend_forward(body, from_height=0.62, angle=math.radians(24))
-    _studio(body, ambient=0.35)
+    _bend_forward(body, low, high, from_height=0.62, angle=math.radians(24))
+    _studio(low, high, ambient=0.35)
 
 
-BUILTIN: Mapping[str, Callable[[Any], None]] = {
+BUILTIN: Mapping[str, Callable[[Any, Any, Any], None]] = {
     "marble": marble,
     "gold": gold,
     "glazed": glazed,
@@ -106,28 +107,14 @@ def _material(body: Any, name: str) -> tuple[Any, Any, Any]:
     return material.node_tree.nodes, material.node_tree.links, material.node_tree.nodes["Principled BSDF"]
 
 
-def _bounds(body: Any) -> tuple[Any, Any]:
-    corners = [Vector(corner) for corner in body.bound_box]
-    low = Vector([min(corner[axis] for corner in corners) for axis in range(3)])
-    high = Vector([max(corner[axis] for corner in corners) for axis in range(3)])
-    return low, high
-
-
-def _size(body: Any) -> float:
-    low, high = _bounds(body)
-    return float(max(high - low))
-
-
-def _bend_forward(body: Any, *, from_height: float, angle: float) -> None:
+def _bend_forward(body: Any, low: Any, high: Any, *, from_height: float, angle: float) -> None:
     """Turn what lies above ``from_height`` (share of the height) towards the camera, over a smooth transition."""
-    low, high = _bounds(body)
     height = high.z - low.z
     pivot_z = low.z + from_height * height
-    upper = [vertex for vertex in body.data.vertices if vertex.co.z > pivot_z - 0.08 * height]
-    if not upper:
-        return
-    pivot_y = sorted(vertex.co.y for vertex in upper)[len(upper) // 2]
-    for vertex in upper:
+    pivot_y = (low.y + high.y) / 2
+    for vertex in body.data.vertices:
+        if vertex.co.z <= pivot_z - 0.08 * height:
+            continue
         share = min(max((vertex.co.z - pivot_z) / (0.16 * height) + 0.5, 0.0), 1.0)
         turned = angle * share * share * (3 - 2 * share)
         y, z = vertex.co.y - pivot_y, vertex.co.z - pivot_z
@@ -136,10 +123,9 @@ def _bend_forward(body: Any, *, from_height: float, angle: float) -> None:
         vertex.co.z = pivot_z + y * math.sin(turned) + z * math.cos(turned)
 
 
-def _studio(body: Any, *, ambient: float) -> None:
+def _studio(low: Any, high: Any, *, ambient: float) -> None:
     """A key light above the camera's left, a fill at its right, and some light from everywhere."""
-    low, high = _bounds(body)
-    middle, size = (low + high) / 2, _size(body)
+    middle, size = (low + high) / 2, float(max(high - low))
     for name, place, extent, strength in (("key", (-1.6, -1.8, 2.0), 1.2, 1.0), ("fill", (2.2, -1.6, 0.4), 1.6, 0.25)):
         light = bpy.data.lights.new(name, "AREA")
         light.shape, light.size = "DISK", extent * size

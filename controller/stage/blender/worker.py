@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scenes import BUILTIN, COLOURS  # type: ignore[import-not-found]
@@ -35,7 +35,7 @@ def main(folder: Path) -> None:
         mesh = _mesh({name: arrays[name] for name in arrays.files})
     body = _body(mesh)
     if scene_file is None:
-        BUILTIN[job["builtin"]](body)
+        BUILTIN[job["builtin"]](body, *(Vector(corner) for corner in job["bounds_m"]))
     _camera(job["camera"])
     _settings(job, folder)
     bpy.ops.render.render(write_still=True)
@@ -102,23 +102,24 @@ def _body(mesh: Any) -> Any:
 
 
 def _camera(camera: dict[str, Any]) -> None:
-    """The calibrated camera at the origin, looking along +y, z up. Pixel centres of ours lie at whole numbers."""
-    width, height = camera["size_px"]
-    fx, fy, cx, cy = (camera[key] for key in ("fx", "fy", "cx", "cy"))
-    data = bpy.data.cameras.new("calibrated")
+    """The calibrated camera; the first of several is at the origin, looking along +y, z up."""
+    data = bpy.data.cameras.new(camera["name"])
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_MM
-    data.lens = fx * SENSOR_MM / width
-    data.shift_x = (width / 2 - (cx + 0.5)) / width
-    data.shift_y = ((cy + 0.5) - height / 2) * (fx / fy) / width
+    data.lens = camera["focal_widths"] * SENSOR_MM
+    data.shift_x, data.shift_y = camera["shift_x"], camera["shift_y"]
     data.clip_start, data.clip_end = (camera[key] * _units_per_m() for key in ("near_m", "far_m"))
-    place = bpy.data.objects.new("calibrated", data)
-    place.rotation_euler = (np.pi / 2, 0, 0)
+    place = bpy.data.objects.new(camera["name"], data)
+    matrix = Matrix(camera["matrix_world"])
+    matrix.translation *= _units_per_m()
+    place.matrix_world = matrix
     scene = bpy.context.scene
     scene.collection.objects.link(place)
     scene.camera = place
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
-    # A pixel is fx/fy times as high as it is wide; Blender wants ratios of at least 1.
-    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
+    scene.render.resolution_x, scene.render.resolution_y = camera["resolution"]
+    scene.render.resolution_percentage = 100
+    # Blender wants ratios of at least 1
+    tall = camera["pixel_aspect"]
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1.0, 1 / tall), max(1.0, tall)
 
 
 def _settings(job: dict[str, Any], folder: Path) -> None:

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
-from controller.core.arrays import ByteImage, Float64, FloatImage, Mask
-from controller.optics.calibrate.mesh import Mesh, grid_mesh
+from controller.core.arrays import ByteImage, Float64, FloatImage
+from controller.optics.calibrate.mesh import Mesh, grid_mesh, seen_at
 from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.calibrate.metapixels.from_dots import project
 from controller.optics.calibrate.values import Geometry, Metapixels, Pinhole
@@ -121,7 +120,7 @@ class Content:
             vertices = (own.vertices_m - one.pose.shift_m.astype(np.float32)) @ one.pose.rotation.astype(np.float32)
             before = [(self.geometry.camera, self.geometry.points_m)]
             before += [(other.camera, other.shape.points_m) for other in self.others[:n]]
-            new = ~np.any([_covers(camera, points, vertices) for camera, points in before], axis=0)
+            new = ~np.any([seen_at(camera, points, vertices)[1] for camera, points in before], axis=0)
             triangles = own.triangles[new[own.triangles].any(axis=1)]
             used, renumbered = np.unique(triangles, return_inverse=True)
             normals = own.normals[used] @ one.pose.rotation.astype(np.float32)
@@ -172,20 +171,6 @@ class Content:
                 x, y = own.astype(np.int64).T
                 found[mine] = seen[y, x]
         return found
-
-
-COVERED: Final = 0.01
-"""Relative difference of distance up to which two views see the same surface."""
-
-
-def _covers(camera: Pinhole, points_m: FloatImage, vertices_m: FloatImage) -> Mask:
-    """(vertices,): whether a camera knows ``points_m`` (rows, columns, 3), in its own frame, where a vertex lies."""
-    px, depth = project(camera, vertices_m.astype(np.float64))
-    rows, columns = points_m.shape[:2]
-    x, y = np.rint(np.nan_to_num(px, nan=-1.0)).clip(-1, max(rows, columns)).astype(np.int64).T
-    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows) & (depth > 0)
-    known = np.where(inside, points_m[np.where(inside, y, 0), np.where(inside, x, 0), 2], np.nan)
-    return np.asarray(np.abs(known - depth) < COVERED * known)
 
 
 def projected(pinhole: Pinhole, points_m: FloatImage) -> Float64:

@@ -9,7 +9,7 @@ the object is not flat, those that move as their neighbours do bend the picture 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
 import cv2
@@ -104,6 +104,23 @@ def register(picture: FloatImage, own: FloatImage, points: Points = ()) -> Regis
         alike = _like_neighbours(at, off)
         at, off = at[alike], off[alike]
     return _laid(scan, body, own.shape[:2], _Fit(homography, at, off, by_points))
+
+
+def carried(registration: Registration, places_px: FloatImage) -> Registration:
+    """The same from another place, whose pixels lie at ``places_px`` (rows, columns, 2) in this camera's picture.
+
+    NaN: this camera does not see what lies there, so it is not on the picture.
+    """
+    x, y = np.moveaxis(np.nan_to_num(places_px, nan=-9.0).astype(np.float32), 2, 0)
+    position = cv2.remap(registration.position_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside, matched, residual = (
+        cv2.remap(image.astype(np.float32), x, y, cv2.INTER_NEAREST)
+        for image in (registration.inside, registration.matched, registration.residual_px)
+    )
+    there = np.isfinite(places_px[..., 0])
+    residual_px = np.where(matched > 0, residual, np.nan).astype(np.float32)
+    return replace(registration, position_px=np.asarray(position, np.float32), inside=there & (inside > 0),
+                   matched=there & (matched > 0), residual_px=np.asarray(residual_px, np.float32))  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ from controller.stage.artefacts.geometry import camera_px, require_shape
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.names import safe_name
 from controller.stage.artefacts.solved import read_target, render_folder, write_target
-from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, write_job
+from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, light_alike, own_paint, write_job
 from controller.stage.blender.run import find_blender, render
 from controller.stage.steps.appearance.restoring import TITLE, Restoration, restoration_request
 from controller.stage.steps.appearance.solving import AppearanceRequest
@@ -59,8 +59,6 @@ TITLES: Mapping[str, str] = {
 """Title of every kind of appearance."""
 
 NEEDS_FILE = ("photograph", "picture", "restoration", "texture")
-OF_ONE_VIEW: Final = ("blender", "restoration")
-"""Kinds that are made from where one camera stands."""
 VIEW: Final = "{view}"
 """Stands for the name of each view in the file of a picture."""
 NEEDS_NO_SHAPE: Final = ("recolour", "picture", "restoration", "texture")
@@ -96,13 +94,6 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         require_shape(calibrated.folder, f"The appearance {table.name} of kind {table.kind}")
     _ = table.hint_ms  # report its errors before an hour of solving
     wanted = _options(table.kind)
-    if table.kind in OF_ONE_VIEW and len(calibrated.names) > 1:
-        raise UsageError(
-            "appearance-of-one-view",
-            what=f"The appearance {table.name} of kind {table.kind} is made for one camera, and the stage has"
-            f" {len(calibrated.names)} views.",
-            remedy='Use kind = "texture" on a mesh, which is the same for all views.',
-        )
     required = ("tint",) if table.kind == "recolour" else ()
     settings = table.settings({key: allowed(kind) for key, kind in wanted.items()}, required)
     options = checked_arguments(table.place, settings, wanted)
@@ -284,12 +275,24 @@ def blender_request(
     facts = dict(inputs) if isinstance(scene, str) else {**inputs, "file": sha256_of(scene)}
 
     def prepare(context: Context) -> Sequence[Path]:
-        work = render_folder(context.folder, name)
-        work.mkdir(exist_ok=True)
-        geometry, mask = calibrated.geometry, calibrated.transport.object_mask
-        write_job(work, geometry, mask, calibrated.transport.reach(), scene=scene, settings=settings)
-        picture = render(blender, work, context.advance)
-        return [write_target(context.folder, name, as_seen(read_picture(picture), geometry.camera, mask))]
+        works = [render_folder(folder, name) for folder in (context.folder, *calibrated.folders[1:])]
+        paint = own_paint(calibrated.geometry, calibrated.transport.reach())
+        parts, geometries = [view.part for view in calibrated.views()], calibrated.geometries()
+        masks = [part(calibrated.transport.object_mask) for part in parts]
+        for work, geometry, mask, part in zip(works, geometries, masks, parts, strict=True):
+            work.mkdir(exist_ok=True)
+            write_job(work, geometry, mask, part(paint), scene=scene, settings=settings)
+        light_alike(works)
+        pictures = []
+        for n, work in enumerate(works):
+
+            def advance(share: float, note: str, n: int = n) -> None:
+                context.advance((n + share) / len(works), note)
+
+            pictures.append(read_picture(render(blender, work, advance)))
+        seen = as_seen(pictures, [geometry.camera for geometry in geometries], masks)
+        images, said = ([getattr(one, key) for one in seen] for key in ("image", "mask"))
+        return [write_target(context.folder, name, Target(calibrated.joined(images), calibrated.joined(said)))]
 
     def target() -> Target:
         return read_target(calibrated.folder, name)

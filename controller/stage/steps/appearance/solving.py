@@ -112,7 +112,7 @@ def solve_steps(
                 Step(
                     rendered,
                     request.prepare,
-                    inputs=request.inputs,
+                    inputs=request.inputs | drawn,
                     after=tuple(after),
                     title=f"{request.preparing} {request.title}",
                     weight=request.prepare_s * scale,

@@ -150,7 +150,7 @@ def rendered(subject: Subject, on_progress: ProgressCallback, *, scene: str) -> 
     folder: Path = subject.parts.context.folder / f"study-render-{scene}"
     folder.mkdir(exist_ok=True)
     write_job(
-        folder, subject.geometry, subject.mask, subject.transport.reach(), scene=scene,
+        folder, subject.geometry, subject.mask, own_paint(subject.geometry, subject.transport.reach()), scene=scene,
         settings=RenderSettings(SAMPLES, subject.seed),
     )  # fmt: skip
     asked = [folder / "job.json", folder / "mesh.npz", Path(job.__file__).with_name("scenes.py")]
@@ -160,7 +160,7 @@ def rendered(subject: Subject, on_progress: ProgressCallback, *, scene: str) -> 
         known.unlink(missing_ok=True)
         picture = render(blender, folder, on_progress)
         write_atomically(known, key)
-    return as_seen(read_picture(picture), subject.geometry.camera, subject.mask)
+    return as_seen([read_picture(picture)], [subject.geometry.camera], [subject.mask])[0]
 
 
 OURS: Final = "this program"

@@ -15,7 +15,7 @@ from controller.core.arrays import FloatImage, Mask, load_arrays
 from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Geometry, Pinhole
 from controller.optics.solve.targets.files import read_picture
-from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, solid, write_job
+from controller.stage.blender.job import BUILTIN, RenderSettings, as_seen, own_paint, solid, write_job
 from controller.stage.blender.run import Blender, find_blender, render
 
 ROWS, COLUMNS = 90, 140
@@ -95,8 +95,8 @@ def test_blender_sees_what_the_calibrated_camera_sees(
 ) -> None:
     geometry, light = ball(k1)
     mask = known(geometry)
-    write_job(tmp_path, geometry, mask, light, scene=paint_scene, settings=QUICK)
-    target = as_seen(read_picture(render(blender, tmp_path, no_progress)), geometry.camera, mask)
+    write_job(tmp_path, geometry, mask, own_paint(geometry, light), scene=paint_scene, settings=QUICK)
+    target = as_seen([read_picture(render(blender, tmp_path, no_progress))], [geometry.camera], [mask])[0]
     y, x = np.mgrid[0:ROWS, 0:COLUMNS]
     facing = mask & (np.sum(geometry.points_m * -geometry.normals, axis=2) > 0.5)
     red, green, blue = target.image[facing].T
@@ -152,9 +152,9 @@ def test_a_scene_that_moves_hides_or_scales_the_placeholder_shows_the_object_whe
         folder.mkdir()
         (folder / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{changes}{LAMP}{SAVE}"))
         subprocess.run([blender.command[0], str(folder / "make.py"), str(folder / "own.blend")], check=True)
-        write_job(folder, geometry, mask, light, scene=folder / "own.blend", settings=QUICK)
+        write_job(folder, geometry, mask, own_paint(geometry, light), scene=folder / "own.blend", settings=QUICK)
         rendered = render(blender, folder, partial(told_of, notes, name))
-        target = as_seen(read_picture(rendered), geometry.camera, mask)
+        target = as_seen([read_picture(rendered)], [geometry.camera], [mask])[0]
         seen.append(target.image[mask].max(axis=1))
     assert all((one > 0).mean() > 0.95 for one in seen)
     both = (seen[0] > 0) & (seen[1] > 0)
@@ -166,7 +166,9 @@ def test_a_scene_without_its_pictures_is_refused_by_their_name(tmp_path: Path, b
     geometry, light = ball()
     (tmp_path / "make.py").write_text(PAINT_SCENE.replace(SAVE, f"{MISSING}{SAVE}"))
     subprocess.run([blender.command[0], str(tmp_path / "make.py"), str(tmp_path / "bare.blend")], check=True)
-    write_job(tmp_path, geometry, known(geometry), light, scene=tmp_path / "bare.blend", settings=QUICK)
+    write_job(
+        tmp_path, geometry, known(geometry), own_paint(geometry, light), scene=tmp_path / "bare.blend", settings=QUICK
+    )
     with pytest.raises(WorkError, match=r"/nowhere/wood\.png does not exist"):
         render(blender, tmp_path, no_progress)
 
@@ -180,8 +182,8 @@ def test_every_scene_that_comes_along_covers_the_object_and_differs_from_the_oth
     for name in BUILTIN:
         folder = tmp_path / name
         folder.mkdir()
-        write_job(folder, geometry, mask, light, scene=name, settings=QUICK)
-        target = as_seen(read_picture(render(blender, folder, no_progress)), geometry.camera, mask)
+        write_job(folder, geometry, mask, own_paint(geometry, light), scene=name, settings=QUICK)
+        target = as_seen([read_picture(render(blender, folder, no_progress))], [geometry.camera], [mask])[0]
         assert np.isfinite(target.image).all()
         assert target.image.min() >= 0
         assert (target.image[mask].max(axis=1) > 0).mean() > 0.9
@@ -204,7 +206,7 @@ def test_a_stop_ends_blender_at_once(tmp_path: Path, blender: Blender) -> None:
     geometry, light = ball()
     mask = known(geometry)
     slow = dataclasses.replace(QUICK, samples=4096)
-    write_job(tmp_path, geometry, mask, light, scene="marble", settings=slow)
+    write_job(tmp_path, geometry, mask, own_paint(geometry, light), scene="marble", settings=slow)
 
     class Stopped(Exception):
         pass
@@ -231,7 +233,7 @@ def test_a_scene_that_blender_cannot_open_is_told_in_blenders_words(tmp_path: Pa
     mask = known(geometry)
     broken = tmp_path / "broken.blend"
     broken.write_bytes(b"not a scene")
-    write_job(tmp_path, geometry, mask, light, scene=broken, settings=QUICK)
+    write_job(tmp_path, geometry, mask, own_paint(geometry, light), scene=broken, settings=QUICK)
     with pytest.raises(WorkError, match="did not render the target") as raised:
         render(blender, tmp_path, no_progress)
     assert raised.value.code == "blender-failed"
@@ -259,7 +261,7 @@ def test_a_blender_that_is_named_and_not_there_is_said_so(monkeypatch: pytest.Mo
 def test_the_objects_own_paint_is_found_whatever_the_light(tmp_path: Path) -> None:
     geometry, light = ball()
     mask = known(geometry)
-    write_job(tmp_path, geometry, mask, light, scene="lowered-head", settings=QUICK)
+    write_job(tmp_path, geometry, mask, own_paint(geometry, light), scene="lowered-head", settings=QUICK)
     found = load_arrays(tmp_path / "mesh.npz")
     front = len(found["reflectance"]) // 2
     u, v = found["uv"][:front].T

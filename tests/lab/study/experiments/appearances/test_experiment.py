@@ -140,8 +140,8 @@ def test_a_picture_that_was_rendered_is_not_rendered_again_unless_the_job_change
         (folder / "picture.exr").write_bytes(b"a picture")
         return folder / "picture.exr"
 
-    def half_grey(picture: FloatImage, camera: object, mask: FloatImage) -> Target:
-        return Target(np.full((*mask.shape, 3), 0.5, np.float32), mask.astype(np.bool_))
+    def half_grey(pictures: object, cameras: object, masks: list[FloatImage]) -> list[Target]:
+        return [Target(np.full((*mask.shape, 3), 0.5, np.float32), mask.astype(np.bool_)) for mask in masks]
 
     monkeypatch.setattr(targets, "find_blender", lambda: Blender(("blender",)))
     monkeypatch.setattr(targets, "render", fake)
