@@ -36,7 +36,7 @@ from controller.stage.artefacts.geometry import (
 )
 from controller.stage.artefacts.mesh import RegisteredMesh
 from controller.stage.artefacts.solved import SolvedBase
-from controller.stage.artefacts.views import first_view, view_folders
+from controller.stage.artefacts.views import first_view, newest_view, view_folders
 
 _IMAGES: Final = ("points_m", "normals")
 """Of a geometry."""
@@ -93,6 +93,12 @@ class Calibrated:
     def camera_px(self) -> tuple[int, int] | None:
         """(width, height) of the camera's picture; None before the geometry is known."""
         return camera_px(self.folder)
+
+    @property
+    def lamps(self) -> FloatImage:
+        """(views, projectors): by what each projector's light changed, compared with the others', since a view was
+        photographed."""
+        return np.ones((1, len(self.projectors)), np.float32)
 
     @property
     def calibration(self) -> Calibration:
@@ -247,6 +253,12 @@ class AllViews(Calibrated):
     """
 
     _gains: list[FloatImage] | None = None
+    _lamps: FloatImage
+
+    @property
+    def lamps(self) -> FloatImage:
+        _ = self.gains
+        return self._lamps
 
     @functools.cached_property
     def _views(self) -> list[Calibrated]:
@@ -284,9 +296,10 @@ class AllViews(Calibrated):
     def gains(self) -> list[FloatImage]:
         """As of ``view_gains``; the views' calibrations are in common units from then on."""
         if self._gains is None:
-            self._gains = view_gains([view.calibration for view in self._views])
-            for view, gain in zip(self._views, self._gains, strict=True):
-                view._calibration = in_common_units(view.calibration, gain, self.folder)
+            each = [view.calibration for view in self._views]
+            self._gains, self._lamps = view_gains(each, newest_view(self.folder))
+            for view, gain, lamps in zip(self._views, self._gains, self._lamps, strict=True):
+                view._calibration = in_common_units(view.calibration, gain, lamps, self.folder)
         return self._gains
 
     @property

@@ -23,9 +23,12 @@ def view_folder(run: Path, name: str) -> Path:
     return run / VIEWS / safe_name(name)
 
 
-def write_view(folder: Path, name: str, number: int) -> Path:
-    """``view.json``, the last file of a view: with it, the view is whole. ``number``: its place in the order."""
-    return write_json(folder / _RECORD, {"name": name, "number": number})
+def write_view(folder: Path, name: str, number: int, session: str = "") -> Path:
+    """``view.json``, the last file of a view: with it, the view is whole. ``number``: its place in the order.
+
+    ``session``: in which it was photographed; begins with the date and time, as a run's name does
+    """
+    return write_json(folder / _RECORD, {"name": name, "number": number, "session": session})
 
 
 def reopen_view(folder: Path) -> None:
@@ -42,6 +45,13 @@ def first_view(run: Path) -> str:
     """The name of the view that is the run's folder itself."""
     record = run / _RECORD
     return str(read_json(record)["name"]) if record.is_file() else ONLY_CAMERA
+
+
+def newest_view(run: Path) -> int | None:
+    """The number of the view that was photographed last; None where all were at the same time."""
+    records = [folder / _RECORD for folder in view_folders(run).values()]
+    sessions = [str(read_json(one).get("session", "")) if one.is_file() else "" for one in records]
+    return None if len(set(sessions)) == 1 else sessions.index(max(sessions))
 
 
 def view_folders(run: Path) -> Mapping[str, Path]:

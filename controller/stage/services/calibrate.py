@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,7 +46,7 @@ from controller.stage.steps.appearance.publishing import BundleTarget, publish_s
 from controller.stage.steps.appearance.requests import requests_of, scene_request
 from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
 from controller.stage.steps.calibrate.dots import dot_steps
-from controller.stage.steps.calibrate.drift import swapped_views
+from controller.stage.steps.calibrate.drift import changed_lamps, swapped_views
 from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, gate_step, grade_figures
 from controller.stage.steps.calibrate.grade import verify_step
@@ -93,7 +94,7 @@ def calibrate(
         place.finish()
         run, last = place.run, None
     join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
-    for sentence in swapped_views(view_folders(run), before):
+    for sentence in (*swapped_views(view_folders(run), before), *changed_lamps(run, checked.names)):
         reporter.say(sentence, Level.WARNING)
     report_grade(checked, run, last, reporter, accept_grade=accept_grade)
     return {"run": str(run), **grade_figures(run), "photographs": photographs_sentence(run, checked.names)}
@@ -153,7 +154,7 @@ class _Place:
             reopen_view(folder)
             shutil.rmtree(folder)
             self.working.rename(folder)
-        write_view(folder, self.view, self.number)
+        write_view(folder, self.view, self.number, time.strftime("%Y%m%d-%H%M%S"))
 
 
 def calibrating(

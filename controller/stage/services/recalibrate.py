@@ -32,7 +32,7 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import marker
 from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.calibrate.dots import dot_steps
-from controller.stage.steps.calibrate.drift import drift_steps, swapped_views
+from controller.stage.steps.calibrate.drift import changed_lamps, drift_steps, swapped_views
 from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
 from controller.stage.steps.calibrate.quick import one_projector_steps, quick_steps
@@ -119,6 +119,8 @@ def recalibrate(
     run = session.run(checked, StageWork(name, steps, dark=True, views=True), reporter=reporter, cancel=cancel)
     _keep_views(run, last, reporter)
     join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
+    for sentence in changed_lamps(run, checked.names):
+        reporter.say(sentence, Level.WARNING)
     compare_with_last(run, last, reporter)
     if not passes(run, worst_grade(checked)):
         raise below_grade(run, worst_grade(checked))

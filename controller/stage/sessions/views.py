@@ -101,7 +101,7 @@ class OtherViews:
     def _begin(self, context: Context) -> Sequence[Path]:
         for name, error in self._absent.items():
             self._lose(name, error)
-        write_view(context.folder, self._rig.view, 0)
+        write_view(context.folder, self._rig.view, 0, context.folder.name)
         if self._beside and self._views:
             for seat in (self._rig.seat, *(view.seat for view in self._views)):
                 if seat is not None:
@@ -134,7 +134,7 @@ class OtherViews:
         try:
             reopen_view(view.folder)
             view.run(self._name, view.steps, self._deadline, _Named(view, self._reporter))
-            write_view(view.folder, name, view.number)
+            write_view(view.folder, name, view.number, self._journal.folder.name)
         except Cancelled:
             pass
         except CodedError as error:

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
@@ -23,16 +23,28 @@ FAINTEST: Final = 0.02
 """Of a projector's white: darker places are not compared."""
 FEWEST_SHARED: Final = 100
 """Projector pixels that tell how two views differ."""
+LAMP_CHANGED: Final = 0.03
+"""Smaller changes of one projector's light compared with the others' are as likely gloss."""
 UNMEASURED: Final = 1e-3
 """Weight of views' mean light, which decides for views that overlap no other one."""
 
 
-def view_gains(calibrations: Sequence[Calibration]) -> list[FloatImage]:
-    """By what each view's channels are multiplied, (3,) each, so that all are in the first one's units.
+_View: TypeAlias = tuple[FloatImage, Mask]
+_Views: TypeAlias = Sequence[Sequence[_View]]
+"""What ``_seen`` gives, of each view and projector."""
 
-    The views' projectors are the same, in the same order.
+
+def view_gains(calibrations: Sequence[Calibration], newest: int | None = None) -> tuple[list[FloatImage], FloatImage]:
+    """By what each view's channels are multiplied, (3,) each, so that all are in the first one's units; and each of its
+    projectors' light before, (views, projectors), up to 1.
+
+    The views' projectors are the same, in the same order. ``newest``: the view whose lamps are those of now; None where
+    all views were photographed with the same light
     """
     seen = [[_seen(part) for part in own.projectors] for own in calibrations]
+    lamps = np.ones((len(seen), len(seen[0])), np.float32) if newest is None else _lamps(seen, newest)
+    seen = [[(light * lamp, valid) for (light, valid), lamp in zip(*own, strict=True)]
+            for own in zip(seen, lamps, strict=True)]  # fmt: skip
     rows, right = [np.eye(len(seen))[0]], [np.zeros(3)]
     for one, other in combinations(range(len(seen)), 2):
         pairs = [(a[valid & also], b[valid & also])
@@ -44,22 +56,54 @@ def view_gains(calibrations: Sequence[Calibration]) -> list[FloatImage]:
         rows.append(weight * (np.eye(len(seen))[one] - np.eye(len(seen))[other]))
         right.append(weight * difference)
     logs = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
-    return list(np.exp(logs).astype(np.float32))
+    return list(np.exp(logs).astype(np.float32)), lamps
 
 
-def in_common_units(calibration: Calibration, gain: FloatImage, folder: Path) -> Calibration:
-    """The same calibration with each channel of light multiplied; large images are in nameless files of ``folder``."""
+def _lamps(seen: _Views, newest: int) -> FloatImage:
+    """(views, projectors): the lamps of the view ``newest`` over those of each view, where the least weakened has 1."""
+    changed = np.full((len(seen), len(seen[0])), np.nan)
+    changed[newest] = 0
+    for n, of in enumerate(changed.T):
+        # from the newest view to those that overlap it, and on from these
+        while True:
+            ratios = {(one, other): _ratio(seen[one][n], seen[other][n])
+                      for one in np.flatnonzero(np.isfinite(of)) for other in np.flatnonzero(np.isnan(of))}  # fmt: skip
+            linked = [(one, other, ratio) for (one, other), ratio in ratios.items() if ratio is not None]
+            if not linked:
+                break
+            one, other, ratio = linked[0]
+            of[other] = of[one] + ratio
+    changed -= np.nanmax(changed, axis=1, keepdims=True)
+    lamps = np.exp(np.nan_to_num(changed)).astype(np.float32)
+    lamps[lamps.min(axis=1) > 1 - LAMP_CHANGED] = 1
+    return lamps
 
-    def scaled(image: FloatImage) -> FloatImage:
+
+def _ratio(one: _View, other: _View) -> float | None:
+    """Logarithm of a projector's light in one view over that in another one; None where they share too little."""
+    both = one[1] & other[1]
+    if np.count_nonzero(both) < FEWEST_SHARED:
+        return None
+    return float(np.median(np.log(channels.mean(one[0])[both] / channels.mean(other[0])[both])))
+
+
+def in_common_units(calibration: Calibration, gain: FloatImage, lamps: FloatImage, folder: Path) -> Calibration:
+    """The same calibration with each channel of light multiplied by ``gain`` (3,), and each projector's by ``lamps``
+    (projectors,), too; large images are in nameless files of ``folder``.
+    """
+
+    def scaled(image: FloatImage, lamp: np.float32) -> FloatImage:
         product = array_in_file(folder, image.shape)
-        np.multiply(image, gain, out=product)
+        np.multiply(image, gain * lamp, out=product)
         return product
 
     parts = tuple(
         dataclasses.replace(
-            part, white=scaled(part.white), indirect=None if part.indirect is None else scaled(part.indirect)
+            part,
+            white=scaled(part.white, lamp),
+            indirect=None if part.indirect is None else scaled(part.indirect, lamp),
         )
-        for part in calibration.projectors
+        for part, lamp in zip(calibration.projectors, lamps, strict=True)
     )
     return dataclasses.replace(calibration, projectors=parts, black=calibration.black * gain)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from controller.core import channels
 from controller.core.arrays import ByteImage, FloatImage
+from controller.optics.calibrate.photometry.view_colours import LAMP_CHANGED
 from controller.optics.calibrate.verify.drift import DriftPhotographs, find_drift
 from controller.optics.capture.pattern_frames import device_frame, frame
 from controller.optics.capture.patterns import Pattern, PatternKind
@@ -21,7 +22,7 @@ from controller.optics.capture.profile import CameraProfile, load_profile
 from controller.optics.solve.scaling.dither import to_light
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
-from controller.stage.artefacts.calibrated import Calibrated
+from controller.stage.artefacts.calibrated import Calibrated, all_views
 from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.drift import write_drift
 from controller.stage.artefacts.geometry import read_geometry_figures
@@ -29,6 +30,7 @@ from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import DRIFT as TAKEN
 from controller.stage.artefacts.photographs import PATTERN as PATTERN_NAME
 from controller.stage.artefacts.projectors import IndirectFigures, Light
+from controller.stage.artefacts.views import newest_view
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.capture.exposure import bracket
@@ -165,6 +167,20 @@ def swapped_views(now: Mapping[str, Path], before: Mapping[str, Path]) -> list[s
             and _alike(seen[name], known[other]) > max(ALIKE, own + CLEARLY)
             and _alike(seen[other], known[name]) > max(ALIKE, _alike(seen[other], known[other]) + CLEARLY)
         ]  # fmt: skip
+    return found
+
+
+def changed_lamps(run: Path, projectors: Sequence[str]) -> list[str]:
+    """A sentence for each projector that is weaker now than when some views of a calibration were photographed."""
+    if newest_view(run) is None:
+        return []
+    calibrated, found = all_views(run, projectors), []
+    for name, lamps in zip(projectors, calibrated.lamps.T, strict=True):
+        if views := [view for view, lamp in zip(calibrated.names, lamps, strict=True) if lamp < 1 - LAMP_CHANGED]:
+            found.append(
+                f"Compared with the others, projector {name} has {1 - lamps.min():.0%} less light than when view"
+                f" {' and '.join(views)} was photographed. Appearances are solved for the light that it has now."
+            )
     return found
 
 

@@ -25,6 +25,7 @@ from controller.stage.artefacts.solved import SolvedBase, is_solved, read_solved
 from controller.stage.artefacts.views import view_folder, write_view
 from controller.stage.report.galleries import views_gallery
 from controller.stage.steps.appearance.solving import AppearanceRequest, solve_steps
+from controller.stage.steps.calibrate.drift import changed_lamps
 from hal.deadline import in_seconds
 from hal.notices import Level
 from lab.timings.tools.synthetic import NAMES, synthetic_calibration, write_synthetic_run
@@ -81,10 +82,11 @@ def test_colour_differences_are_measured_on_the_overlap_and_removed(tmp_path: Pa
     first = synthetic_calibration(projector=(40, 52), camera=(100, 140))
     matrix = np.diag([0.5, 1.4, 0.9]) @ np.array([[0.9, 0.1, 0.0], [0.05, 0.9, 0.05], [0.0, 0.15, 0.85]])
     second = other_units(synthetic_calibration(projector=(40, 52), camera=(150, 210)), matrix)
-    gains = view_gains([first, second])
+    gains, lamps = view_gains([first, second])
+    np.testing.assert_array_equal(lamps, 1)
     np.testing.assert_allclose(gains[0], 1, atol=1e-3)
     np.testing.assert_allclose(gains[1], 1 / matrix.sum(axis=1), rtol=0.02)
-    common = in_common_units(second, gains[1], tmp_path)
+    common = in_common_units(second, gains[1], lamps[1], tmp_path)
     lit = [np.median(one.projectors[1].white[one.object_mask], axis=0) for one in (first, common)]
     np.testing.assert_allclose(lit[1], lit[0], rtol=0.04)
 
@@ -93,7 +95,7 @@ def test_views_that_share_nothing_stay_as_they_are() -> None:
     first = synthetic_calibration(projector=(20, 26), camera=(50, 70))
     parts = [dataclasses.replace(part, metapixels=dataclasses.replace(
         part.metapixels, valid=np.zeros_like(part.metapixels.valid))) for part in first.projectors]  # fmt: skip
-    gains = view_gains([first, dataclasses.replace(first, projectors=tuple(parts))])
+    gains, _ = view_gains([first, dataclasses.replace(first, projectors=tuple(parts))])
     np.testing.assert_allclose(gains, 1, atol=1e-6)
 
 
@@ -171,6 +173,25 @@ def test_a_highlight_that_one_view_sees_is_a_difference(tmp_path: Path) -> None:
     assert np.nanmedian(found[place]) > 3
     assert share_above(found) > share_above(even)
     assert Calibrated(tmp_path, names).differences(white, mask, usual) is None
+
+
+def test_a_view_added_with_a_weaker_lamp_is_told_and_the_other_views_light_is_corrected(tmp_path: Path) -> None:
+    names, _ = two_views(tmp_path)
+    right = view_folder(tmp_path, "right")
+    weaker = Light.read(right, names[1])
+    dataclasses.replace(weaker, white=weaker.white * np.float32(0.9)).write(right, names[1])
+    np.testing.assert_array_equal(all_views(tmp_path, names).lamps, 1)
+    assert changed_lamps(tmp_path, names) == [], "both views were photographed at once"
+    write_view(right, "right", 1, "20261206-120000")
+    later = all_views(tmp_path, names)
+    np.testing.assert_allclose(later.lamps, [[1, 0.9, 1], [1, 1, 1]], atol=0.01)
+    own = Calibrated(tmp_path, names).calibration.projectors
+    first = later.views()[0]
+    for lamp, one, part in zip((1, 0.9, 1), own, later.calibration.projectors, strict=True):
+        np.testing.assert_allclose(first.part(part.white), lamp * one.white, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(later.gains[1], 1 / GAIN, rtol=0.01)
+    (said,) = changed_lamps(tmp_path, names)
+    assert f"projector {names[1]} has 10% less light than when view left was photographed" in said
 
 
 def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None:

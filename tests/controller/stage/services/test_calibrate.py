@@ -179,6 +179,7 @@ def photographed(stage: Path, view: str) -> None:
 @pytest.fixture
 def calibrated(stage: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr("controller.stage.services.calibrate.join_geometry", lambda *_: False)
+    monkeypatch.setattr("controller.stage.services.calibrate.changed_lamps", lambda *_: [])
     monkeypatch.setattr("controller.stage.services.calibrate.photographs_sentence", lambda *_: "")
     folder = run(stage, "20261129-120000-calibrate", "calibrated")
     described(folder, "camera")
