@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -66,15 +66,16 @@ def _lamps(seen: _Views, newest: int) -> FloatImage:
     for n, of in enumerate(changed.T):
         # from the newest view to those that overlap it, and on from these
         while True:
-            ratios = {(one, other): _ratio(seen[one][n], seen[other][n])
-                      for one in np.flatnonzero(np.isfinite(of)) for other in np.flatnonzero(np.isnan(of))}  # fmt: skip
-            linked = [(one, other, ratio) for (one, other), ratio in ratios.items() if ratio is not None]
-            if not linked:
+            known = np.isfinite(of)
+            pairs = [(one, other) for one, other in permutations(range(len(of)), 2) if known[one] and not known[other]]
+            ratios = ((one, other, _ratio(seen[one][n], seen[other][n])) for one, other in pairs)
+            linked = next(((one, other, ratio) for one, other, ratio in ratios if ratio is not None), None)
+            if linked is None:
                 break
-            one, other, ratio = linked[0]
+            one, other, ratio = linked
             of[other] = of[one] + ratio
-    changed -= np.nanmax(changed, axis=1, keepdims=True)
-    lamps = np.exp(np.nan_to_num(changed)).astype(np.float32)
+    changed -= np.fmax.reduce(changed, axis=1, keepdims=True)
+    lamps: FloatImage = np.exp(np.nan_to_num(changed)).astype(np.float32)
     lamps[lamps.min(axis=1) > 1 - LAMP_CHANGED] = 1
     return lamps
 

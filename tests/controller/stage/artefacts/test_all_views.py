@@ -184,7 +184,8 @@ def test_a_view_added_with_a_weaker_lamp_is_told_and_the_other_views_light_is_co
     assert changed_lamps(tmp_path, names) == [], "both views were photographed at once"
     write_view(right, "right", 1, "20261206-120000")
     later = all_views(tmp_path, names)
-    np.testing.assert_allclose(later.lamps, [[1, 0.9, 1], [1, 1, 1]], atol=0.01)
+    assert isinstance(later, AllViews)
+    np.testing.assert_allclose(later.lamps, np.array([[1, 0.9, 1], [1, 1, 1]]), atol=0.01)
     own = Calibrated(tmp_path, names).calibration.projectors
     first = later.views()[0]
     for lamp, one, part in zip((1, 0.9, 1), own, later.calibration.projectors, strict=True):
