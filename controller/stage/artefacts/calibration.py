@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask, array_in_file, strips
 from controller.core.channels import smallest
-from controller.optics.calibrate.geometry.background import room_pixels
+from controller.optics.calibrate.geometry.background import room_beside_planes, room_pixels
 from controller.optics.calibrate.values import Calibration, Correspondence, PhaseMap, ProjectorCalibration
 from controller.optics.capture.brackets import MergedBracket, merge_brackets
 from controller.optics.capture.raw import CAMERA_BLUR_PX
-from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures
+from controller.stage.artefacts.geometry import known_points_m, read_geometry_figures, read_shape
 from controller.stage.artefacts.outline import read_outline
 from controller.stage.artefacts.photographs import BLACK, TakenPhotograph, codes_of, light_of
 from controller.stage.artefacts.projectors import (
@@ -100,7 +100,8 @@ def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     if (drawn := _drawn(folder, mask.shape)) is not None:
         mask &= drawn
     elif (points_m := known_points_m(folder)) is not None:
-        mask &= ~room_pixels(points_m)
+        flat = read_shape(folder).shape == "plane"
+        mask &= ~(room_beside_planes(points_m, mask) if flat else room_pixels(points_m))
     return Calibration(tuple(parts), black, mask, light.camera_to_xyz, camera_blur_px, mosaic)
 
 

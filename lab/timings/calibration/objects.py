@@ -1,7 +1,8 @@
 """Which of the bench's objects are calibrated, as what shape, and how well they show a smooth picture.
 
 At last the same projector lights the same object twice: on a stage of its own, and as one of three that were
-calibrated together. All frames are judged in the light of the stage, without noise. ``BENCH_OBJECTS``,
+calibrated together. Where a stage of one has no shape, the object's outline is drawn, as docs/how-to/flat-objects.md
+says; without it is told, too. All frames are judged in the light of the stage, without noise. ``BENCH_OBJECTS``,
 ``BENCH_SEEDS`` and ``BENCH_ALONE`` choose some; ``BENCH_FOLDER`` keeps the stages, and measures kept ones again.
 """
 
@@ -28,12 +29,14 @@ from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.transport import build_transport
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.geometry import read_shape
+from controller.stage.artefacts.outline import Regions, keep_outline
 from controller.stage.sessions.check import check_stage
 from controller.stage.steps.appearance.solving import device_frames
 from controller.stage.steps.calibrate.gate import grade_figures
 from hal.errors import CodedError
 from lab.timings import Row, at_least, at_most
 from lab.timings.calibration.indirect import Judge, judged, worked
+from lab.timings.tools.truth import Truth
 from plugins.emulated.core.truth import read_truth
 
 OBJECTS: Final = "painting painting:3 relief corner cylinder sphere two-objects"
@@ -45,6 +48,9 @@ REFINED: Final = {0: (1.2, 6.0), 1: (0.9, 5.0)}
 """Goals at size medium, median and 95 % of CIEDE2000 in reach, by photographs of the result."""
 FEW, MANY = 1, 3
 SHARE: Final = 0.95
+DRAWN_PX: Final = 2.0
+SPECK_PX: Final = 500
+"""Square pixels of what nobody would draw around."""
 
 
 def measure(size: str) -> list[Row]:
@@ -102,15 +108,30 @@ def _one_projector(folder: Path, size: str, thing: str, seeds: Sequence[int]) ->
     """Medians and 95th percentiles on a stage of one projector, against the same one of three."""
     built_in = None if thing == VASE else thing
     found: dict[int, list[tuple[float, float]]] = {FEW: [], MANY: []}
+    plain: list[tuple[float, float]] = []
     for count, seed in ((count, seed) for count in found for seed in seeds):
         stage, run = _calibrated(folder, DemoStage(size, seed, built_in, projectors=count))
+        keep_outline(run, ())
         found[count].append(_alone(stage, run))
+        if count == FEW and read_shape(run).shape == "unknown":
+            plain.append(found[count].pop())
+            keep_outline(run, _silhouette(stage))
+            found[count].append(_alone(stage, run))
     rows = []
     for n, name in enumerate(("median", "95 %")):
         alone, among = (max(one[n] for one in found[count]) for count in (FEW, MANY))
         how = f"worst of {len(seeds)}; the same one of three: {among:.2f}"
+        how += f"; without an outline {max(one[n] for one in plain):.2f}" if plain else ""
         rows.append(at_most(f"{thing}, one projector, {name}", alone, round(among, 2), unit="CIEDE2000", how=how))
     return rows
+
+
+def _silhouette(stage: Path) -> Regions:
+    """What a person would draw around the object, 2 px from the truth at most."""
+    seen = np.isfinite(Truth(stage).points_m()[..., 2]).astype(np.uint8)
+    parts, _ = cv2.findContours(seen, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    drawn = [cv2.approxPolyDP(part, DRAWN_PX, True)[:, 0] for part in parts if cv2.contourArea(part) > SPECK_PX]
+    return [[(float(x) / seen.shape[1], float(y) / seen.shape[0]) for x, y in part] for part in drawn]
 
 
 def _alone(stage: Path, run: Path) -> tuple[float, float]:

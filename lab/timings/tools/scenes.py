@@ -1,5 +1,5 @@
 """Objects whose surfaces light each other: a bust in a painted corner, a bowl, a vase beside a bust, steps, a bust in a
-niche, a vase between walls, a fence before a wall."""
+niche, a vase between walls, a fence before a wall; and a board, on which nothing lights anything."""
 
 from __future__ import annotations
 
@@ -128,9 +128,16 @@ def fence() -> Part:
     return _together(*parts)
 
 
+def board() -> Part:
+    """A flat board in squares of two paints, turned by 12 degrees to its right."""
+    turn = np.deg2rad(12.0)
+    across = np.array([0.34 * np.cos(turn), 0.0, 0.34 * np.sin(turn)])
+    return _plane(-0.5 * across, across, np.array([0.0, 0.26, 0.0]), (0.72, 0.58, 0.42), (0.38, 0.46, 0.55), 6)
+
+
 SCENES: Final[Mapping[str, Callable[[], Part]]] = {
     "corner": corner, "bowl": bowl, "two-objects": two_objects, "steps": steps, "niche": niche, "alcove": alcove,
-    "fence": fence,
+    "fence": fence, "board": board,
 }  # fmt: skip
 
 

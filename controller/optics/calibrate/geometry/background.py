@@ -41,8 +41,29 @@ FOOT: Final = 0.05
 """Of the picture's height: so far from the object's middle parts, what is near a plane is its foot."""
 PART: Final = 0.02
 """A part of the object is at least this large, relative to its largest."""
+SCRAP: Final = 0.005
+"""Of the pixels on planes: what is smaller, beside them, is a fault of the measurement."""
 GAP: Final = 0.02
 """Of the picture's height: parts so near to each other are one; contours, where points are unknown, part them."""
+
+
+def room_beside_planes(points_m: FloatImage, lit: Mask) -> Mask:
+    """Pixels (rows, columns) that see the room around a flat object; ``points_m``: those of its planes.
+
+    Room is what projectors light (``lit``), lies on none of the planes, and reaches the picture's border; with it a
+    strip where a plane meets a floor; and what is ``room_pixels`` of the rest.
+    """
+    known = channels.finite(points_m)
+    disc = _disc(FOOT / 2, known.shape)
+    broad = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    # with the corners that a disc takes off
+    flat = known & (cv2.dilate(broad, _disc(GAP / 2, known.shape)) > 0)
+    beside = lit & ~flat
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(beside.astype(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= SCRAP * np.count_nonzero(known)
+    large[0] = False
+    reaching = np.isin(labels, np.unique(labels[_border(known.shape)])) & large[labels]
+    return np.asarray(reaching | room_pixels(np.where(reaching[..., None], np.float32(np.nan), points_m)))
 
 
 def room_pixels(points_m: FloatImage) -> Mask:
@@ -103,9 +124,7 @@ def _things(left: Mask, loose: Mask, border: Mask) -> Mask:
     """
 
     def wider(mask: Mask, share: float) -> npt.NDArray[np.uint8]:
-        side = 2 * round(share * mask.shape[0]) + 1
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-        return np.asarray(cv2.dilate(mask.astype(np.uint8), disc), np.uint8)
+        return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(share, mask.shape)), np.uint8)
 
     def joined(mask: Mask) -> npt.NDArray[np.int32]:
         return np.asarray(cv2.connectedComponents(wider(mask, GAP / 2), connectivity=8)[1] * mask, np.int32)
@@ -168,6 +187,12 @@ def _through(points: Floats) -> Floats:
     normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
     normal *= -np.sign(normal @ middle) or 1.0
     return np.append(normal, -normal @ middle)
+
+
+def _disc(share: float, shape: tuple[int, ...]) -> npt.NDArray[np.uint8]:
+    """``share``: its radius, of the picture's height."""
+    side = 2 * round(share * shape[0]) + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
 
 def _border(shape: tuple[int, ...]) -> Mask:

@@ -69,7 +69,10 @@ def shape_sentence(found: FoundShape) -> str:
     """For a technician: the shape, apart from why it is not a surface."""
     known = found.reconstruction
     if known is None:
-        return "No shape of the object is measured. Pictures, recolouring, live and refining work without one."
+        return (
+            "No shape of the object is measured. Pictures, recolouring, live and refining work without one. "
+            "Table and walls that are lit count as the object: draw an outline around it in the panel's Settings."
+        )
     if found.shape == "surface":
         return "The object's surface is measured."
     turned = "" if known.shape_rel_sigma < SURE else (

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.optics.calibrate.geometry.background import room_pixels
+from controller.optics.calibrate.geometry.background import room_beside_planes, room_pixels
 
 ROWS, COLUMNS = 120, 180
 Floats = npt.NDArray[np.float64]
@@ -111,3 +112,39 @@ def test_a_wall_behind_a_handle_is_the_rooms() -> None:
     found = room_pixels(points(WALL, handle))
     assert found[away < 18].all()
     assert not found[(away > 22) & (away < 34)].any()
+
+
+def board(*, wide: float = 0.5, turned: float = 0.1) -> npt.NDArray[np.bool_]:
+    """Where a board ends that stands in the middle of the picture."""
+    y, x = np.mgrid[:ROWS, :COLUMNS] / ROWS - 0.5
+    return np.asarray((np.abs(x - 0.25 + turned * y) < wide) & (np.abs(y + 0.05) < 0.4))
+
+
+def on_plane(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+    seen = points(plane((0.1, 0.05, 1.0), 1.0))
+    return np.where(where[..., None], seen, np.nan).astype(np.float32)
+
+
+def test_floor_and_wall_around_a_flat_board_are_the_rooms() -> None:
+    here, lit = board(), np.ones((ROWS, COLUMNS), np.bool_)
+    foot = np.zeros_like(here)
+    # where the board's plane meets the floor
+    foot[104:107] = True
+    found = room_beside_planes(on_plane(here | foot), lit)
+    assert found[~here].mean() > 0.98
+    assert found[here].mean() < 0.01
+
+
+def test_a_frame_and_a_dark_part_belong_to_a_flat_picture() -> None:
+    here, lit = board(), np.ones((ROWS, COLUMNS), np.bool_)
+    frame = cv2.dilate(here.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    dark = here.copy()
+    dark[40:60, 70:90] = False
+    lit[~frame] = False
+    assert not room_beside_planes(on_plane(dark), lit).any()
+
+
+def test_a_mural_that_fills_the_picture_keeps_its_holes_at_the_border() -> None:
+    here, lit = np.ones((ROWS, COLUMNS), np.bool_), np.ones((ROWS, COLUMNS), np.bool_)
+    here[50:58, :9] = here[:5, 100:112] = False
+    assert not room_beside_planes(on_plane(here), lit).any()
