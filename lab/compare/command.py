@@ -26,10 +26,20 @@ def compare(
     size: BenchSize = "small",
     out: Annotated[Path, typer.Option(help="Folder for the stages, the page and the results.")] = Path("comparison"),
     seed: Seeds = None,
+    photographs: Annotated[
+        Path | None,
+        typer.Option(help="Learned methods, on a folder of real photographs instead of scenes."),
+    ] = None,
 ) -> None:
     """Compare methods on fixed emulated scenes. Judges photographs of what they make. Continues unfinished work."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        if photographs is not None:
+            from lab.compare.entries import LEARNED, LEARNED_GROUP, entries
+            from lab.compare.photographs import compare_on_photographs
+
+            learned = entries(tuple(method or ()), LEARNED, LEARNED_GROUP)
+            return compare_on_photographs(learned, photographs, out, reporter, cancel)
         from lab.compare.service import compare
 
         return compare(

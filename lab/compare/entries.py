@@ -15,10 +15,12 @@ from typing import Any, Final
 
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
-from lab.compare import methods, planar
+from lab.compare import learned, methods, planar
 
 GROUP: Final = "velatura.methods"
 """Entry points of installed methods."""
+LEARNED_GROUP: Final = "velatura.learned"
+"""Those of learned ones."""
 NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 TARGET: Final = "target"
 """Pictures of the targets are kept under this name."""
@@ -26,7 +28,10 @@ TARGET: Final = "target"
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A method that takes part. ``method``: ``api.ComparisonMethod``; ``dots``: it needs photographs of dots."""
+    """A method that takes part. ``dots``: it needs photographs of dots.
+
+    ``method``: ``api.ComparisonMethod``; on photographs of others, ``learned.LearnedMethod``
+    """
 
     name: str
     method: Callable[[Any], Callable[[Any], Any]]
@@ -55,17 +60,19 @@ BUILT_IN: Final = (
     Entry("feathering", methods.feathering, cost_s=30.0),
     Entry("single", methods.single, cost_s=30.0),
     Entry("superresolution", planar.superresolution, cost_s=30.0),
+    Entry("regression", learned.learned_regression),
 )
+LEARNED: Final = (Entry("regression", learned.regression), Entry("uncorrected", learned.uncorrected))
 
 
-def entries(names: Sequence[str]) -> list[Entry]:
+def entries(names: Sequence[str], known_ones: Sequence[Entry] = BUILT_IN, group: str = GROUP) -> list[Entry]:
     """The methods of these names, in this order; without names all of this package and all installed ones.
 
     A name is that of a method, ``module:function`` or ``file.py:function``. Raises UsageError("method-unknown",
     "method-unreadable", "method-twice").
     """
-    known = {entry.name: entry for entry in BUILT_IN}
-    installed = {point.name: point for point in entry_points(group=GROUP) if point.name not in known}
+    known = {entry.name: entry for entry in known_ones}
+    installed = {point.name: point for point in entry_points(group=group) if point.name not in known}
     found = []
     for name in names or (*known, *installed):
         if name in known:

@@ -25,7 +25,7 @@ number = 3
 
 
 def test_without_names_all_that_are_shipped_take_part() -> None:
-    names = ["ours", "paper", "inversion", "feathering", "single", "superresolution"]
+    names = ["ours", "paper", "inversion", "feathering", "single", "superresolution", "regression"]
     assert [entry.name for entry in entries(())] == names
     assert [entry.name for entry in entries(("single", "ours"))] == ["single", "ours"]
     assert all(len(entry.about) > 40 for entry in BUILT_IN)
