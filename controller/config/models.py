@@ -312,6 +312,11 @@ class SolveTable(ConfigTable):
         description='the solver: "global" (all pixels together), or "regions" (the paper\'s: regions of 16 x 16 camera '
         "pixels, one after the other; much slower, nearly as good, on the processor alone)",
     )
+    unseen: Literal["smooth", "black"] = Field(
+        default="smooth",
+        description='what projector pixels show that light the object where no camera sees it: "smooth" (the light of '
+        'what is seen beside them), or "black"',
+    )
     device: Literal["auto", "cpu", "gpu"] = Field(
         default="auto",
         description='what solves: "cpu" (the processor), "gpu" (a graphics processor, also one in software), or "auto" '

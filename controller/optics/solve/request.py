@@ -7,14 +7,17 @@ machine, and gives the same.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
+import cv2
 import numpy as np
 
 from controller.core.arrays import FloatImage, Mask, moved_to_file
+from controller.core.blur import gaussian_blur, masked_blur, nearest_known
 from controller.optics.solve.appearance import (
     FINE_DETAIL,
     Appearance,
@@ -39,6 +42,7 @@ from controller.optics.solve.reach.feasibility import (
     target_radiance,
 )
 from controller.optics.solve.targets.values import Target
+from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import ReflectedLight
 
 ADVICE_FULL_SOLVE = (
@@ -52,6 +56,13 @@ FIRST_TOLERANCE: Final = 2 * APPEARANCE_TOLERANCE
 """Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
 
+Unseen: TypeAlias = Literal["smooth", "black"]
+SOFT_PX: Final = 3.0
+"""Light that is continued is smoothed by so many projector pixels: at the edge of what cameras see it is noisy."""
+WIDEST: Final = 0.15
+"""A gap between what cameras see, as a share of the picture's longer side, is still a part of the object."""
+
+
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
     """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3.
@@ -60,6 +71,7 @@ class SolveOptions:
     ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
     ``method``: which solver, so that a run knows; the engine of the context is the one that solves
     ``exposure``: instead of that by ``share``, where a target asks for one
+    ``unseen``: what projector pixels show that no camera sees, see ``continued``
     """
 
     share: float
@@ -69,12 +81,15 @@ class SolveOptions:
     adapt: float = 0.0
     method: Method = "global"
     exposure: float | None = None
+    unseen: Unseen = "black"
 
     def inputs(self) -> dict[str, str]:
         """What an appearance depends on, as the journal compares it."""
         inputs = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
         if self.adapt != 0:
             inputs["adapt"] = repr(self.adapt)
+        if self.unseen != "black":
+            inputs["unseen"] = self.unseen
         return inputs | self._method()
 
     def base_inputs(self) -> dict[str, str]:
@@ -133,8 +148,48 @@ def solve_appearance(
         "iterations": 0 if made.solution is None else made.solution.iterations,
         "kkt": None if made.solution is None else made.solution.kkt,
     }
+    frames = made.frames if options.unseen == "black" else continued(light.transport, made.frames)
     reachable, asked_reachable = (part.reachable & valid for part in (aim.possible, aim.asked_possible))
-    return AppearanceResult(made.frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
+    return AppearanceResult(frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
+
+
+def continued(transport: LightTransport, frames: Sequence[FloatImage]) -> tuple[FloatImage, ...]:
+    """Frames (rows, columns, 3) in which pixels that no camera sees have the light of the nearest one that is seen.
+
+    They are gaps between what cameras see of the object, and what lies between it and the room beside it. Next to the
+    room they stay dark, and so does what is open to the picture's border: it may light anything.
+    """
+    beside = np.zeros(transport.pixels, np.bool_) if transport.beside is None else transport.beside
+    whole = []
+    for n, frame in enumerate(frames):
+        span, shape = transport.span(n), transport.sizes[n]
+        room = beside[span].reshape(shape)
+        seen = (transport.per_weight[span] > 0).reshape(shape) & ~room
+        unseen = _within(seen, seen | room)
+        if not seen.any() or not unseen.any():
+            whole.append(frame)
+            continue
+        nearest = nearest_known(seen | room)[1]
+        light = np.where(seen[nearest][..., None], masked_blur(frame, seen, SOFT_PX)[nearest], 0)
+        soft = gaussian_blur(light.astype(np.float32), SOFT_PX)
+        whole.append(np.where(unseen[..., None], np.clip(soft, 0, 1), frame))
+    return tuple(whole)
+
+
+def _within(seen: Mask, known: Mask) -> Mask:
+    """(rows, columns): pixels that are not ``known``, but in gaps of what is ``seen``, or enclosed by what is known."""
+
+    def beyond(mask: Mask) -> FloatImage:
+        return np.asarray(
+            cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32
+        )
+
+    # a closing: what is not far from what is seen, less what is not far from what is
+    steps = max(1, round(WIDEST * max(seen.shape) / 2))
+    gaps = beyond(np.pad(beyond(seen) > steps, 1, constant_values=True))[1:-1, 1:-1] > steps
+    _, parts = cv2.connectedComponents((~known).astype(np.uint8), connectivity=4)
+    border = np.concatenate([parts[[0, -1]].ravel(), parts[:, [0, -1]].ravel()])
+    return np.asarray(~known & (gaps | ~np.isin(parts, border)))
 
 
 @dataclass(frozen=True, slots=True)

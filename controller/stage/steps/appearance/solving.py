@@ -43,7 +43,8 @@ MOSTLY: Final = 0.5
 
 def options_of(table: SolveTable) -> SolveOptions:
     """How appearances are solved by [solve] of stage.toml, wherever they are."""
-    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, table.method)
+    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, table.method,
+                        unseen=table.unseen)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

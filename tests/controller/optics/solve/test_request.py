@@ -167,3 +167,29 @@ def test_the_whole_picture_is_told_as_the_target(transport: LightTransport, base
     seen = STAGE.black + direct + indirect.forward(direct)
     there = found.reachable & transport.object_mask
     assert np.median(np.abs(seen - found.target)[there] / found.target[there]) < 0.01
+
+
+def test_what_no_camera_sees_continues_what_is_seen_beside_it() -> None:
+    hidden = [np.zeros(part.metapixels.valid.shape, np.bool_) for part in STAGE.projectors]
+    gap, corner = np.s_[10:30, 20:26], np.s_[:8, :8]
+    for unseen in hidden:
+        unseen[gap] = unseen[corner] = True
+    parts = [
+        replace(part, metapixels=replace(part.metapixels, valid=part.metapixels.valid & ~unseen))
+        for part, unseen in zip(STAGE.projectors, hidden, strict=True)
+    ]
+    light = StageLight(build_transport(replace(STAGE, projectors=tuple(parts))), STAGE.black)
+    smooth, black = (
+        solve_appearance(light, None, picture(40), replace(OPTIONS, unseen=unseen)).frames
+        for unseen in ("smooth", "black")
+    )
+    for n, (one, other) in enumerate(zip(smooth, black, strict=True)):
+        assert not other[gap].any()
+        around = np.concatenate([other[8:32, 16:20].reshape(-1, 3), other[8:32, 26:30].reshape(-1, 3)])
+        assert around.min() - 1e-3 <= one[gap].min()
+        assert one[gap].max() <= around.max() + 1e-3
+        steps = [np.abs(np.diff(part, axis=1)).mean() for part in (one[9:31, 19:27], other[9:31, 30:38])]
+        assert steps[0] < 1.5 * steps[1] + 0.01, "no edge, and no noise"
+        seen = (light.transport.per_weight[light.transport.span(n)] > 0).reshape(other.shape[:2])
+        np.testing.assert_array_equal(one[seen], other[seen])
+        assert not one[0, 0].any(), "what is open to the border may light anything"
