@@ -127,18 +127,20 @@ class ViewsTransport(LightTransport):
             by_row[:, :, box.top : box.bottom] = view.mixing_of(n)
         return by_row
 
-    def by_places(self, image: FloatImage, mask: Mask) -> tuple[FloatImage, FloatImage, Mask]:
+    def by_places(
+        self, image: FloatImage, mask: Mask, smooth_px: int = SMOOTH_PX
+    ) -> tuple[FloatImage, FloatImage, Mask]:
         """How views differ in an ``image`` of the sheet (rows, columns, 3), known in ``mask``: as the pixel's own view
         has it, as others have it by their ``trust``, and (rows, columns) which pixels' places others see.
 
-        Both are means over ``SMOOTH_PX`` projector pixels, so that no view differs by its sharpness.
+        Both are means over ``smooth_px`` projector pixels, so that no view differs by its sharpness.
         """
         planes = np.ascontiguousarray(np.where(mask[..., None], image, 0).transpose(2, 0, 1), np.float32)
         known = np.ascontiguousarray(np.broadcast_to(mask, planes.shape), np.float32)
         means = []
         for (view, part), (_, there) in zip(self._parts(planes), self._parts(known), strict=True):
             image_mean, share = (view.gaussian_mean_planes(np.ascontiguousarray(one)) for one in (part, there))
-            means.append(np.stack([_smooth(view, plane) for plane in (*image_mean, share[0])]))
+            means.append(np.stack([_smooth(view, plane, smooth_px) for plane in (*image_mean, share[0])]))
         total = np.sum([trust * own for trust, own in zip(self.trust, means, strict=True)], axis=0)
         seen = []
         for trust, own, view in zip(self.trust, means, self.views, strict=True):
@@ -263,10 +265,10 @@ def _samples(view: LightTransport) -> FloatImage:
     return _smooth(view, np.minimum(counted, np.float32(view.lit[0].size)))
 
 
-def _smooth(view: LightTransport, values: FloatImage) -> FloatImage:
+def _smooth(view: LightTransport, values: FloatImage, by_px: int = SMOOTH_PX) -> FloatImage:
     """(pixels,): means of ``values`` (pixels,) over the neighbours of each projector pixel."""
     return np.concatenate([
-        cv2.blur(values[view.span(n)].reshape(size), (SMOOTH_PX, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE).ravel()
+        cv2.blur(values[view.span(n)].reshape(size), (by_px, by_px), borderType=cv2.BORDER_REPLICATE).ravel()
         for n, size in enumerate(view.sizes)
     ])  # fmt: skip
 

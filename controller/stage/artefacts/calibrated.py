@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from controller.core import channels
 from controller.core.arrays import FloatImage, Mask, array_in_file
 from controller.core.errors import UsageError
 from controller.optics.calibrate.mesh import seen_at
@@ -40,6 +41,10 @@ from controller.stage.artefacts.views import first_view, newest_view, view_folde
 
 _IMAGES: Final = ("points_m", "normals")
 """Of a geometry."""
+MATT: Final = 0.03
+"""By so much less another view may see a place without highlights: no paint looks quite the same from all sides."""
+HIGHLIGHT_PX: Final = 1
+"""Projector pixels over which the light of two views is compared for highlights, which are narrow."""
 CLEARLY: Final = 3.0
 """CIEDE2000 above which a difference between views is easily seen."""
 
@@ -217,10 +222,16 @@ class Calibrated:
         return StageLight(self.transport, self.calibration.black, self.reflected, self.drive)
 
     @property
+    def matt(self) -> FloatImage | None:
+        """(rows, columns, 1): the share of the object's light that is no highlight: another camera sees it, too. None
+        for the only view."""
+        return None
+
+    @property
     def reflectance(self) -> FloatImage:
         """The object's own pattern (rows, columns, 3), NaN where it is not known."""
         if self._reflectance is None:
-            self._reflectance = own_reflectance(self.calibration, self.known_geometry)
+            self._reflectance = own_reflectance(self.calibration, self.known_geometry, self.matt)
         return self._reflectance
 
     def differences(self, image: FloatImage, mask: Mask, white: float) -> FloatImage | None:
@@ -345,6 +356,14 @@ class AllViews(Calibrated):
             _ = self.gains
             self._transport = ViewsTransport.of([view.transport for view in self._views])
         return self._transport
+
+    @functools.cached_property
+    def matt(self) -> FloatImage:
+        transport = self.transport
+        assert isinstance(transport, ViewsTransport)
+        own, others, seen = transport.by_places(transport.reach(), transport.object_mask, HIGHLIGHT_PX)
+        share = channels.mean(others) / np.maximum(channels.mean(own), np.finfo(np.float32).tiny)
+        return np.where(seen, np.minimum(share / (1 - MATT), 1), 1).astype(np.float32)[..., None]
 
     def differences(self, image: FloatImage, mask: Mask, white: float) -> FloatImage | None:
         transport = self.transport

@@ -26,11 +26,12 @@ ENOUGH_PIXELS: Final = 400_000
 """So many stand for a larger picture."""
 
 
-def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> FloatImage:
+def own_reflectance(calibration: Calibration, geometry: Geometry | None, matt: FloatImage | None = None) -> FloatImage:
     """(rows, columns, 3) float32, about 1 for the palest paint; NaN where it is not known.
 
     The white images over the light that falls there by the surface's slope and distance. Without ``geometry`` of
-    these projectors they are taken as they are, with their shading.
+    these projectors they are taken as they are, with their shading. ``matt`` (rows, columns, 1): the share of the
+    light that is no highlight; None: all of it
     """
     whites = np.stack([part.white for part in calibration.projectors])
     mask = calibration.object_mask
@@ -44,6 +45,7 @@ def own_reflectance(calibration: Calibration, geometry: Geometry | None) -> Floa
     known = mask & (channels.smallest(falling) > FAINTEST * float(np.median(falling[mask]) if mask.any() else 1.0))
     if not known.any():
         return np.full(calibration.black.shape, np.nan, np.float32)
+    light = light if matt is None else light * matt
     reflectance = np.divide(light, falling, out=np.full(light.shape, np.nan, np.float32), where=known[..., None])
     return np.asarray(reflectance / np.percentile(reflectance[known], WHITEST), np.float32)
 

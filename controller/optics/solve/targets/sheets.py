@@ -30,9 +30,12 @@ _BESIDE_PX: Final = 8
 """Pixels of a sheet around its parts that get their colours, so that a soft brush and a filter find no black there."""
 
 
-def as_it_is(transport: LightTransport) -> FloatImage:
-    """The object under white light (rows, columns, 3), scaled so that its brightest parts are 1."""
-    light = transport.reach()
+def as_it_is(transport: LightTransport, matt: FloatImage | None = None) -> FloatImage:
+    """The object under white light (rows, columns, 3), scaled so that its brightest parts are 1.
+
+    ``matt``: as of ``own_reflectance``
+    """
+    light = transport.reach() if matt is None else transport.reach() * matt
     brightest = np.percentile(light[transport.object_mask], 99)
     return np.asarray(np.clip(light / brightest, 0, 1), np.float32)
 

@@ -233,7 +233,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         made = [load_target(one, size, colour) for one, size in zip(_of_views(file, calibrated), sizes, strict=True)]
         return Target(calibrated.joined([one.image for one in made]), calibrated.joined([one.mask for one in made]))
     if kind == "recolour":
-        return recolour(as_it_is(calibrated.transport), mask, **options)
+        return recolour(as_it_is(calibrated.transport, calibrated.matt), mask, **options)
     if kind == "texture":
         assert file is not None
         sheet = np.maximum(read_picture(file, colour, soft=True), 0)
@@ -241,7 +241,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
             sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
         mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
         places = None if mesh is None else calibrated.places(mesh)
-        return texture(sheet, places, as_it_is(calibrated.transport), mask)
+        return texture(sheet, places, as_it_is(calibrated.transport, calibrated.matt), mask)
     geometry = calibrated.geometry
     if kind == "photograph":
         assert file is not None
@@ -276,7 +276,8 @@ def blender_request(
 
     def prepare(context: Context) -> Sequence[Path]:
         works = [render_folder(folder, name) for folder in (context.folder, *calibrated.folders[1:])]
-        paint = own_paint(calibrated.geometry, calibrated.transport.reach())
+        light, matt = calibrated.transport.reach(), calibrated.matt
+        paint = own_paint(calibrated.geometry, light if matt is None else light * matt)
         parts, geometries = [view.part for view in calibrated.views()], calibrated.geometries()
         masks = [part(calibrated.transport.object_mask) for part in parts]
         for work, geometry, mask, part in zip(works, geometries, masks, parts, strict=True):

@@ -173,3 +173,27 @@ def test_blender_renders_one_scene_for_each_camera(tmp_path: Path, calibrated: C
     off = np.abs(here - there)[both].mean(axis=1) / here[both].mean()
     assert np.median(off) < 0.03
     assert here[both].std() > 0.15 * here[both].mean(), "there is something to compare"
+
+
+def test_a_highlight_that_one_camera_sees_is_no_paint(tmp_path: Path) -> None:
+    grey = np.array([0.5, 0.4, 0.3])
+    made = []
+    for gloss in (0.0, 0.8):
+        run = tmp_path / f"{gloss}"
+        write_two_views(run, lambda wall: np.broadcast_to(grey, wall.shape).astype(np.float32), gloss)
+        together, alone = all_views(run, NAMES), Calibrated(view_folder(run, "side"), NAMES)
+        table = '\n[[appearances]]\nname = "x"\nkind = "recolour"\ntint = [1.0, 1.0, 1.0]\n'
+        stage = load(tmp_path, STAGE + table)
+        side = together.views()[1].part
+        targets = side(requests_of(stage, together)[0].target().image), requests_of(stage, alone)[0].target().image
+        made.append((side(together.reflectance), alone.reflectance, *targets))
+    wall = on_wall(POSES["side"], CAMERA)
+    peak = np.hypot(wall[..., 0] + 0.05, wall[..., 1]) < 0.02
+    matt, shining = ([np.nanmedian(image[peak]) / np.nanmedian(image) for image in images] for images in made)
+    bent = np.array(shining) / matt - 1
+    assert bent[[1, 3]].min() > 0.25, "one camera alone takes it for paint"
+    assert np.abs(bent[[0, 2]]).max() < 0.06
+    for images in list(zip(*made, strict=True))[::2]:
+        away = np.hypot(wall[..., 0] + 0.05, wall[..., 1]) > 0.12
+        known = away & np.isfinite(images[0][..., 0]) & (images[0][..., 0] > 0)
+        assert np.median(np.abs(images[1][known] / images[0][known] - 1)) < 0.02
