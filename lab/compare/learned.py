@@ -1,7 +1,7 @@
 """Learned methods: from pairs of a projected picture and its photograph, what to project for a wanted photograph.
 
-``regression`` is a small one of our own, to show the interface and as the least that a larger one must beat. It is
-told nothing of the stage but the pairs.
+``regression`` is a small one of our own, to show the interface and as the least that a larger one must beat. It
+knows the pairs and nothing else of the stage.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
 At last the same projector lights the same object twice: on a stage of its own, and as one of three that were
 calibrated together. Where a stage of one has no shape, the object's outline is drawn, as docs/how-to/flat-objects.md
-says; without it is told, too. All frames are judged in the light of the stage, without noise. ``BENCH_OBJECTS``,
-``BENCH_SEEDS`` and ``BENCH_ALONE`` choose some; ``BENCH_FOLDER`` keeps the stages, and measures kept ones again.
+says; the one without it is reported, too. All frames are judged in the light of the stage, without noise.
+``BENCH_OBJECTS``, ``BENCH_SEEDS`` and ``BENCH_ALONE`` choose some; ``BENCH_FOLDER`` keeps the stages, and measures
+kept ones again.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ FEW, MANY = 1, 3
 SHARE: Final = 0.95
 DRAWN_PX: Final = 2.0
 SPECK_PX: Final = 500
-"""Square pixels of what nobody would draw around."""
+"""Square pixels of what a person would not draw around."""
 
 
 def measure(size: str) -> list[Row]:
