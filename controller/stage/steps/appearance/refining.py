@@ -330,42 +330,51 @@ class _Refinement:
         """
         shown = device_frames(self.calibrated.calibration, self._in_order(frames))
         presented_s = self.rig.acquirer.show(self.rig.on_outputs(shown), deadline=self.context.deadline)
-        names, parts, stage, views = self.calibrated.names, self._parts(frames), self._stage, []
-        rigs = {other.name: self.rig.seen_by(other) for other in self.rig.others}
-        rigs[self.rig.view if self.rig.view in names else names[0]] = self.rig
-        for name, view in zip(names, self.calibrated.views(), strict=True):
-            own_mask, own = view.part(mask), view.part(predicted)
-            trusted, steady = np.zeros_like(own_mask), ResultPhotograph(*(np.full_like(own, np.nan),) * 4)
+        parts, stage, digest, seen = self._parts(frames), self._stage, frames_digest(shown), []
+        for name, view in zip(self.calibrated.names, self.calibrated.views(), strict=True):
+            of_view = RefinedStage(view.part(stage.black), view.part(stage.white))
+            expected = _Expected(view.part(predicted), of_view, view.part(mask), [view.part(part) for part in parts])
+            light = view.own_light(predicted)[expected.mask if expected.mask.any() else ...].reshape(-1, 3)
             try:
-                if name not in rigs:
-                    absent = self.rig.absent.get(name)
-                    what = "no camera stands there now." if absent is None else absent.what
-                    raise WorkError(NO_FILE, what=what, remedy="See to the camera, and run the same command again.")
-                light = view.own_light(predicted)[own_mask if own_mask.any() else ...].reshape(-1, 3)
-                taken = self._photograph(rigs[name], name, light, number, presented_s, frames_digest(shown))
+                taken = self._photograph(self._rig_of(name), name, light, number, presented_s, digest)
             except (DeviceError, WorkError) as error:
-                self._raise_if_for_all(error, rigs.get(name))
-                taken, refused = steady, error.what
+                self._raise_if_for_all(error, name)
+                one = expected.unseen(error.what)
             else:
-                taken = taken if view.gain is None else taken.times(view.gain)
-                of_view = RefinedStage(view.part(stage.black), view.part(stage.white))
-                lit = [view.part(part) for part in parts]
-                found = trusted_pixels(taken, own, of_view, own_mask, lit)
-                refused = refusal(taken, own, of_view, own_mask, found) or ""
-                if not refused:
-                    trusted, steady = found, without_flicker(taken, own, lit, of_view, found, self._flicker)
-            views.append(_SeenResult(taken, steady, trusted, refused))
-            if refused:
-                where = f" from view {name}" if len(names) > 1 else ""
-                text = f"A photograph of {self.name}{where} was not used: {refused.removesuffix('.')}."
-                self.context.reporter.say(text, Level.WARNING)
-        return views
+                one = expected.judged(taken if view.gain is None else taken.times(view.gain), self._flicker)
+            self._tell_if_refused(name, one)
+            seen.append(one)
+        return seen
 
-    def _raise_if_for_all(self, error: CodedError, rig: Rig | None) -> None:
+    @property
+    def _own_view(self) -> str:
+        """The view of the rig's own camera."""
+        names = self.calibrated.names
+        return self.rig.view if self.rig.view in names else names[0]
+
+    def _rig_of(self, view: str) -> Rig:
+        """With the camera of a view. Raises WorkError ``camera-no-file`` where that is not there."""
+        if view == self._own_view:
+            return self.rig
+        for other in self.rig.others:
+            if other.name == view:
+                return self.rig.seen_by(other)
+        absent = self.rig.absent.get(view)
+        what = "no camera stands there now." if absent is None else absent.what
+        raise WorkError(NO_FILE, what=what, remedy="See to the camera, and run the same command again.")
+
+    def _raise_if_for_all(self, error: CodedError, view: str) -> None:
         """Raise what concerns more than the camera of one view that is not the first."""
-        if isinstance(error, Cancelled) or rig is self.rig or (isinstance(error, WorkError) and error.code != NO_FILE):
+        of_work = isinstance(error, WorkError) and error.code != NO_FILE
+        if isinstance(error, Cancelled) or view == self._own_view or of_work:
             raise error
         self.rig.check_light(deadline=self.context.deadline)
+
+    def _tell_if_refused(self, view: str, seen: _SeenResult) -> None:
+        if seen.refused:
+            where = f" from view {view}" if len(self.calibrated.names) > 1 else ""
+            text = f"A photograph of {self.name}{where} was not used: {seen.refused.removesuffix('.')}."
+            self.context.reporter.say(text, Level.WARNING)
 
     def _joined(self, views: Sequence[ResultPhotograph]) -> ResultPhotograph:
         """One photograph of each view's."""
@@ -398,6 +407,33 @@ class _Refinement:
         merged = merge_brackets(images, exposures_s, noise=noise)
         first, last = (images[n] / np.float32(exposures_s[n]) for n in (0, -1))
         return ResultPhotograph(merged.radiance, merged.sigma, first, last)
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """What a view should see, by the model, in the units of all views.
+
+    ``light`` (rows, columns, 3), of which each projector gives one of ``parts``; ``mask``: where it is judged
+    """
+
+    light: FloatImage
+    stage: RefinedStage
+    mask: Mask
+    parts: Sequence[FloatImage]
+
+    def unseen(self, why: str) -> _SeenResult:
+        """Without a photograph."""
+        nothing = ResultPhotograph(*(np.full_like(self.light, np.nan),) * 4)
+        return _SeenResult(nothing, nothing, np.zeros_like(self.mask), why)
+
+    def judged(self, taken: ResultPhotograph, flicker: Sequence[float]) -> _SeenResult:
+        """What of a photograph counts; ``flicker`` of each projector."""
+        trusted = trusted_pixels(taken, self.light, self.stage, self.mask, self.parts)
+        refused = refusal(taken, self.light, self.stage, self.mask, trusted)
+        if refused:
+            return replace(self.unseen(refused), taken=taken)
+        steady = without_flicker(taken, self.light, self.parts, self.stage, trusted, flicker)
+        return _SeenResult(taken, steady, trusted, "")
 
 
 @dataclass(frozen=True, slots=True)
