@@ -155,9 +155,7 @@ def kinds_of(possible: Feasibility, asked: Mask, alike: Mask) -> dict[str, Mask]
     """Masks (rows, columns) that exclude each other, by the shares of ``Reach``; ``asked``: lit, and in the picture;
     ``alike``: no one sees that it is not quite in reach, as where the room has a little more light than a dark channel.
     """
-    from controller.optics.solve.reach.feasibility import FORGIVEN_DRIVE
-
-    bright, dark = (part.max(axis=2) > FORGIVEN_DRIVE for part in (possible.too_bright, possible.too_dark))
+    bright, dark = possible.too_bright, possible.too_dark
     reached = possible.reachable | alike
     out = asked & ~reached
     return {

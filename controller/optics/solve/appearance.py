@@ -253,6 +253,8 @@ def make_appearance(
     if mode == "scale":
         assert base is not None, "a scale needs a base"
         scaled = scale_frames(transport, base, target, black, engine=context.engine)
+        if settings.correction is not None:
+            scaled = scale_frames(transport, base, settings.correction(scaled), black, engine=context.engine)
         return Appearance(tuple(scaled), fine_detail(transport, base, target, black), None)
     solution = solve_bounded(transport, target, black, settings, context)
     return Appearance(solution.frames, None, solution)

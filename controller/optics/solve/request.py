@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
@@ -52,8 +51,6 @@ ADVICE_FULL_SOLVE = (
 
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
-FIRST_TOLERANCE: Final = 2 * APPEARANCE_TOLERANCE
-"""Of a solve that another one continues, without the momentum that makes up most of the KKT residual by then."""
 
 
 Unseen: TypeAlias = Literal["smooth", "black"]
@@ -248,29 +245,18 @@ def aim_at(
 
 
 def _solved(light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:
-    """Frames for an aim; with indirect light by two solves."""
-    wanted = target_radiance(aim.wanted, light.black, 1.0)
-    weights = appearance_weights(wanted, aim.possible.reachable, aim.exposure)
-    del wanted
-    settings = SolveSettings(options.smoothness, weights, tolerance=APPEARANCE_TOLERANCE)
-    solve = partial(_solved_directly, light, base, aim, options, context)
-    if light.indirect is None:
-        return solve(aim.direct, settings)
-    first = solve(aim.direct, replace(settings, tolerance=FIRST_TOLERANCE))
-    # what can't be reached throws back other light than was wanted of it
-    indirect = light.indirect.forward(light.transport.forward(first.frames))
-    left = target_radiance(aim.wanted - indirect, light.black, 1.0)
-    del indirect
-    settings = replace(settings, start=first.frames)
-    return solve(left, settings)
+    """Frames for an aim; its direct light is corrected once for what the frames' own light throws back."""
+    black, reflected = light.black, light.indirect
+    weights = appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure)
 
+    def left(frames: Sequence[FloatImage]) -> FloatImage:
+        # what can't be reached throws back other light than was wanted of it
+        assert reflected is not None
+        return target_radiance(aim.wanted - reflected.forward(light.transport.forward(frames)), black, 1.0)
 
-def _solved_directly(
-    light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext,
-    target: FloatImage, settings: SolveSettings,
-) -> Appearance:  # fmt: skip
-    """Frames for a ``target`` radiance (rows, columns, 3), in direct light."""
+    correction = None if reflected is None else left
+    settings = SolveSettings(options.smoothness, weights, tolerance=APPEARANCE_TOLERANCE, correction=correction)
     if base is not None and options.base == "high-pass" and options.mode == "scale":
-        image = high_pass_base(light.transport, base.image, target, light.black)
-        base = solve_base(light.transport, image, light.black, SolveSettings(options.smoothness), context)
-    return make_appearance(light, base, target, settings, context, mode=options.mode)
+        image = high_pass_base(light.transport, base.image, aim.direct, black)
+        base = solve_base(light.transport, image, black, SolveSettings(options.smoothness), context)
+    return make_appearance(light, base, aim.direct, settings, context, mode=options.mode)

@@ -44,23 +44,7 @@ _PROCESS: Final = re.compile(r"^(RssAnon|RssFile|RssShmem):\s+(\d+)", re.MULTILI
 
 def measure(size: str) -> list[Row]:
     """Bytes a projector pixel at the peak of each step, and what the run said that it would need."""
-    if run := os.environ.get("BENCH_RUN"):
-        return _rows(Path(run), projectors_of(Path(run)))
-    with tempfile.TemporaryDirectory(prefix="velatura-memory-", dir=os.environ.get("BENCH_FOLDER")) as folder:
-        # made by a process of its own: formulas need more memory than a solve
-        made = [sys.executable, "-m", "lab.timings.tools.synthetic", folder, size]
-        names = subprocess.run(made, check=True, capture_output=True, text=True).stdout.split()
-        return _rows(Path(folder), names)
-
-
-def _rows(run: Path, names: list[str]) -> list[Row]:
-    ran = subprocess.run(
-        [sys.executable, "-m", "lab.timings.solving.memory", str(run), *names],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    found = solved_apart(size)
     pixels, rows = found["pixels"], []
     for step, peak, kept, seconds in found["steps"]:
         how = f"{peak / 1e9:.2f} GB; {kept / pixels:.0f} kept after it; {seconds:.1f} s"
@@ -79,6 +63,23 @@ def _rows(run: Path, names: list[str]) -> list[Row]:
     rows.append(at_most("told before it begins, by the process", told / resident, None, unit="x",
                         how=f"{told / 1e9:.2f} GB"))  # fmt: skip
     return rows
+
+
+def solved_apart(size: str) -> dict[str, Any]:
+    """What a process of its own found, as ``one_run``, on a stage of that size."""
+    if run := os.environ.get("BENCH_RUN"):
+        return _apart(Path(run), projectors_of(Path(run)))
+    with tempfile.TemporaryDirectory(prefix="velatura-memory-", dir=os.environ.get("BENCH_FOLDER")) as folder:
+        # made by a process of its own: formulas need more memory than a solve
+        made = [sys.executable, "-m", "lab.timings.tools.synthetic", folder, size]
+        return _apart(Path(folder), subprocess.run(made, check=True, capture_output=True, text=True).stdout.split())
+
+
+def _apart(run: Path, names: list[str]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "lab.timings.solving.memory", str(run), *names]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True)
+    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    return found
 
 
 class _Watch:

@@ -48,9 +48,13 @@ def measure(size: str) -> list[Row]:
     began = time.perf_counter()
     transport = build_transport(calibration)
     build_s = time.perf_counter() - began
-    paper = size == "paper"
-    rows = [at_most("light transport, build", build_s, None, unit="s", how="once, compiling included")]
-    rows += _products(transport, paper=paper)
+    build = at_most("light transport, build", build_s, None, unit="s", how="once, compiling included")
+    return [build, *of_stage(transport, calibration, paper=size == "paper")]
+
+
+def of_stage(transport: LightTransport, calibration: Calibration, *, paper: bool) -> list[Row]:
+    """The same of a stage whose transport is there."""
+    rows = _products(transport, paper=paper)
     reflectance = synthetic_target(transport.camera_shape)
     exposure, _ = exposures(DriveLevels.of_transport(transport), reflectance, calibration.black)
     target = target_radiance(reflectance, calibration.black, exposure)
@@ -80,7 +84,7 @@ def _products(transport: LightTransport, *, paper: bool) -> list[Row]:
         at_most(
             "T p + T' r by one pass over all of T",
             pair.median * bandwidth / stored,
-            5.0 if paper else None,
+            8.0 if paper else None,
             unit="x",
             how=f"{stored / 1e6:.0f} MB, {stored / max(samples, 1):.1f} bytes a sample and projector; pair {pair}",
         ),
@@ -110,12 +114,12 @@ def _solve(transport: LightTransport, calibration: Calibration, target: FloatIma
     traced(transport, target, black, 1)
     image = base_image(calibration, "white")
     of_base = traced(transport, image, black, BASE_SWEEPS, most_s=MOST_S)
-    rows = _near("base solve", of_base, NEAR_BEST, 15.0 if paper else None)
+    rows = _near("base solve", of_base, NEAR_BEST, 4.0 if paper else None)
     rows.append(at_most("one sweep over the projectors", of_base.sweep.minimum, None, unit="s", how=str(of_base.sweep)))
     rows.append(at_most("before the first sweep", of_base.setup.seconds, None, unit="s", how=_processor(of_base.setup)))
     whole = traced(transport, target, black, LONG_SWEEPS, most_s=MOST_S)
-    rows += _near("appearance", whole, NEAR_BEST, None)
-    rows += _near("appearance", whole, NEAR_ENOUGH, 5.0 if paper else None)
+    rows += _near("appearance", whole, NEAR_BEST, 3.0 if paper else None)
+    rows += _near("appearance", whole, NEAR_ENOUGH, 1.0 if paper else None)
     rows.append(at_most("peak memory of the process", peak_bytes() / 1e9, 3.0 if paper else None, unit="GB",
                         how="the calibration, its pictures and the solves, resident"))  # fmt: skip
     base = solve_base(transport, image, black)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -21,6 +21,7 @@ import numpy as np
 from controller.core.arrays import FloatImage
 from controller.core.errors import WorkError
 from controller.optics.solve.bounded.equations import (
+    FIRST_TOLERANCE,
     Problem,
     Solution,
     SolveInput,
@@ -131,6 +132,19 @@ def _write_forward(transport: LightTransport, x: FloatImage, buffer: FloatImage)
         transport.accumulate_forward(n, x, buffer)
 
 
+def first_control(given: SolveInput, control: IterationControl) -> IterationControl:
+    """Until when to sweep for the target as it is given."""
+    return control if given.correction is None else replace(control, tolerance=FIRST_TOLERANCE * control.tolerance)
+
+
+def corrected(engine: Engine, given: SolveInput, control: IterationControl) -> SolveInput:
+    """``given`` with its correction made, where it has one, for engines that solve from the start again."""
+    if given.correction is None:
+        return given
+    first = engine.solve(replace(given, correction=None), first_control(given, control))
+    return replace(given, target=given.correction(first.frames), start=first.frames, correction=None)
+
+
 class Engine(Protocol):
     """The heavy loops of solving and scaling. All engines solve the same problem, to the same KKT residual.
 
@@ -188,7 +202,11 @@ class Processor:
         problem = build_problem(transport, given.target, given.black, given.smoothness, given.weights)
         x = initial_point(problem) if given.start is None else np.clip(frame_planes(given.start), 0, 1)
         x[problem.majoriser == 0] = 0
-        x, kkt, iterations = block_coordinate_descent(problem, x, control)
+        x, kkt, iterations = block_coordinate_descent(problem, x, first_control(given, control))
+        if given.correction is not None:
+            problem = problem.aimed_at(given.correction(plane_frames(x, transport.sizes)))
+            x, kkt, more = block_coordinate_descent(problem, x, control)
+            iterations += more
         objective = objective_of(problem, x, transport.forward_planes(x))
         del problem
         frames = tuple(plane_frames(x, transport.sizes))

@@ -7,8 +7,8 @@ down where the target or the object changes between them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -31,6 +31,11 @@ APPEARANCE_TOLERANCE: Final = 1.5e-4
 """KKT residual at which an appearance is done, in half of the sweeps: those on to 1e-4, a sixth more, change the median
 of CIEDE2000 by less than 0.01 and its 95th percentile by less than 0.02 (docs/decisions/0008)."""
 MOST_ITERATIONS: Final = 1000
+FIRST_TOLERANCE: Final = 2.0
+"""Of a solve that continues with a corrected target, in tolerances: there it has no momentum, which makes up most of
+the KKT residual by then."""
+Correction = Callable[[Sequence[FloatImage]], FloatImage]
+"""From the frames for a target, what to aim at instead: a radiance (rows, columns, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,11 @@ class Problem:
     strength_per_step: float
     majoriser: FloatImage
 
+    def aimed_at(self, picture: FloatImage) -> Problem:
+        """The same with another ``picture`` that is nearly alike: weights, smoothness and majoriser stay."""
+        light = planes_above(picture, self.black)
+        return replace(self, picture=picture, right_hand_side=self.transport.right_hand_side(light, self.weights))
+
     def target(self) -> FloatImage:
         """(3, camera rows, columns): the light to be made. A new array each time: a sweep does not need it."""
         return planes_above(self.picture, self.black)
@@ -71,6 +81,7 @@ class SolveSettings:
     ``start``: frames to start from, for example those of a similar target; None: ``initial_estimate``
     ``tolerance``: stop when the rms scaled projected gradient step falls below it
     ``most_iterations``: and at the latest after so many sweeps
+    ``correction``: of the target, to be made once there are frames for it
     """
 
     smoothness: float = SMOOTHNESS
@@ -78,6 +89,7 @@ class SolveSettings:
     start: Sequence[FloatImage] | None = None
     tolerance: float = TOLERANCE
     most_iterations: int = MOST_ITERATIONS
+    correction: Correction | None = None
 
 
 DEFAULT_SETTINGS: Final = SolveSettings()
@@ -93,6 +105,7 @@ class SolveInput:
     smoothness: float
     weights: FloatImage | None
     start: Sequence[FloatImage] | None
+    correction: Correction | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,14 @@ import scipy.sparse as sp
 
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError, WorkError
-from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext, kkt_residual
+from controller.optics.solve.bounded.engine import (
+    ALONE,
+    IterationControl,
+    Processor,
+    SolveContext,
+    corrected,
+    kkt_residual,
+)
 from controller.optics.solve.bounded.equations import (
     DEFAULT_SETTINGS,
     Problem,
@@ -406,6 +413,7 @@ class RegionsEngine(Processor):
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """As ``Engine.solve``."""
+        given = corrected(self, given, control)
         result = solve_regions(
             given.transport,
             given.target,

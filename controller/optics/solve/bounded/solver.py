@@ -39,7 +39,8 @@ def solve_bounded(
     UsageError  "image-wrong-size", "target-not-finite", "solve-arguments"
     WorkError   "solve-cancelled"
     """
-    given = SolveInput(transport, target, black, settings.smoothness, settings.weights, settings.start)
+    chosen = settings.smoothness, settings.weights, settings.start, settings.correction
+    given = SolveInput(transport, target, black, *chosen)
     check_input(given)
     control = IterationControl(settings.tolerance, settings.most_iterations, context.progress, context.cancelled)
     return (context.engine or Processor()).solve(given, control)

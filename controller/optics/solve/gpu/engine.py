@@ -20,6 +20,7 @@ from controller.optics.solve.bounded.engine import (
     RECOMPUTE_EVERY,
     IterationControl,
     Processor,
+    corrected,
 )
 from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.solve.gpu.device import Buffer, Clear, Copy, Device, DeviceRefused, Held, Step, Work, groups_of
@@ -231,6 +232,7 @@ class GpuEngine:
 
     def solve(self, given: SolveInput, control: IterationControl) -> Solution:
         """As ``Engine.solve``."""
+        given = corrected(self, given, control)
         try:
             stage = self._on_device(given.transport)
             if stage is not None:

@@ -88,13 +88,6 @@ class DriveLevels:
         _levels(self.matrices, self.segment_share, light, self.mask, first, out)
         return out
 
-    def light(self, levels: FloatImage, rows: slice = ALL) -> FloatImage:
-        """The light (rows, columns, 3) float32 of such a colour (rows, columns, 3): the inverse of ``of``."""
-        out = np.empty(levels.shape, np.float32)
-        first = rows.indices(len(self.mask))[0]
-        _lights(self.matrices, self.segment_share, np.ascontiguousarray(levels, np.float32), first, out)
-        return out
-
 
 @compiled(parallel=True)
 def _levels(
@@ -108,18 +101,6 @@ def _levels(
                 found = levels_at(matrices, segment_share, first + y, x, light[y, x, 0], light[y, x, 1], light[y, x, 2])
                 for c in range(3):
                     out[y, x, c] = found[c]
-
-
-@compiled(parallel=True)
-def _lights(matrices: FloatImage, segment_share: FloatImage, levels: FloatImage, first: int, out: FloatImage) -> None:
-    """``light_at`` each pixel; ``levels`` and ``out`` begin at row ``first``."""
-    rows, columns = levels.shape[:2]
-    for y in prange(rows):
-        for x in range(columns):
-            one, two, three = levels[y, x, 0], levels[y, x, 1], levels[y, x, 2]
-            found = light_at(matrices, segment_share, first + y, x, one, two, three)
-            for c in range(3):
-                out[y, x, c] = found[c]
 
 
 @compiled()
@@ -148,21 +129,3 @@ def levels_at(
         own = np.float32(1) - share
         return (one - white) / own, (two - white) / own, (three - white) / own
     return one, two, three
-
-
-@compiled()
-def light_at(
-    matrices: FloatImage, segment_share: FloatImage, y: int, x: int, one: np.float32, two: np.float32, three: np.float32
-) -> Colour:
-    """The light of such a colour at a pixel: the inverse of ``levels_at``."""
-    if segment_share.shape[0]:
-        share = segment_share[y, x]
-        white = share * max(min(one, two, three), np.float32(0))
-        own = np.float32(1) - share
-        one, two, three = own * one + white, own * two + white, own * three + white
-    B = matrices[:, :, y, x]
-    return (
-        B[0, 0] * one + B[0, 1] * two + B[0, 2] * three,
-        B[1, 0] * one + B[1, 1] * two + B[1, 2] * three,
-        B[2, 0] * one + B[2, 1] * two + B[2, 2] * three,
-    )

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from controller.core.arrays import FloatImage, Mask, strips
 from controller.core.channels import finite, largest, smallest
@@ -25,33 +24,21 @@ SMALL_PART: Final = 0.1
 """Of the object: a part so small that decides how bright all is, is named."""
 HELD_BACK: Final = 1.05
 """From so many times as bright on, as all could be without that part."""
-MOST_BEYOND: Final = 6e4
-"""float16 ends at 65504."""
 
 
 @dataclass(frozen=True, slots=True)
 class Feasibility:
     """Which part of a target radiance the projectors can make.
 
-    ``beyond`` (rows, columns, 3) float16: by how much the channels of the projectors would have to be driven above
-    white, negative: below black; 1 is all of a channel's light
+    ``too_bright``, ``too_dark`` (rows, columns) bool: a channel would have to be driven above white, below black
     ``reachable`` (rows, columns) bool: on the object, and neither too bright, too dark nor too saturated
     ``share``: the part of the object's pixels that is reachable
     """
 
-    beyond: npt.NDArray[np.float16]
+    too_bright: Mask
+    too_dark: Mask
     reachable: Mask
     share: float
-
-    @property
-    def too_bright(self) -> npt.NDArray[np.float16]:
-        """(rows, columns, 3), >= 0."""
-        return np.maximum(self.beyond, np.float16(0))
-
-    @property
-    def too_dark(self) -> npt.NDArray[np.float16]:
-        """(rows, columns, 3), >= 0."""
-        return np.maximum(-self.beyond, np.float16(0))
 
 
 def feasibility(
@@ -63,14 +50,14 @@ def feasibility(
     """
     mask = drive.mask
     check_target(mask.shape, target)
-    beyond, reachable = np.empty(target.shape, np.float16), np.empty(mask.shape, np.bool_)
+    bright, dark = np.empty(mask.shape, np.bool_), np.empty(mask.shape, np.bool_)
     for rows in strips(len(target)):
         needed = drive.of(target[rows] - black[rows], rows)
-        off = needed - np.clip(needed, 0, 1)
-        reachable[rows] = mask[rows] & (largest(np.abs(off)) <= margin)
-        beyond[rows] = np.clip(off, -MOST_BEYOND, MOST_BEYOND)
+        # asked so that what is no number counts as too bright
+        bright[rows], dark[rows] = ~(largest(needed) <= 1 + margin), smallest(needed) < -margin
+    reachable = mask & ~bright & ~dark
     share = float(reachable[mask].mean()) if mask.any() else 0.0
-    return Feasibility(beyond, reachable, share)
+    return Feasibility(bright, dark, reachable, share)
 
 
 def exposures(

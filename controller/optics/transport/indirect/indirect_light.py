@@ -13,6 +13,7 @@ y = (I + N)(I + D) d, the camera sees y + S up F down y.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
@@ -148,10 +149,13 @@ class IndirectLight:
         most = NOTHING if reach is None else np.ascontiguousarray(reach, np.float32)
         unpainted = self.unpainted()
         direct = np.zeros(total.shape, np.float32)
-        size = self._approach(direct, total, unpainted, np.zeros((*self.grid, 3), np.float32), NOTHING)
+        falling, pairs = np.zeros((*self.grid, 3), np.float32), list[tuple[FloatImage, FloatImage]]()
+        size = self._approach(direct, total, unpainted, falling, NOTHING)
         for _ in range(ROUNDS):
-            change = self._approach(direct, total, unpainted, *self._falling_shown(direct, most))
-            if change < CONVERGED * max(size, 1e-30):
+            answer, spread = self._falling_shown(direct, most)
+            pairs = [*pairs[-2:], (falling, answer)]
+            falling = _where_they_lead(pairs)
+            if self._approach(direct, total, unpainted, falling, spread) < CONVERGED * max(size, 1e-30):
                 break
         return direct
 
@@ -182,6 +186,14 @@ class IndirectLight:
         paint = {} if self.paint is None else {"paint": self.paint}
         surface = {} if self.surface is None else self.surface.arrays()
         return {"factors": self.factors, "scale": self.scale, "lit": self.lit, "grid": shape} | paint | surface
+
+
+def _where_they_lead(pairs: Sequence[tuple[FloatImage, FloatImage]]) -> FloatImage:
+    """Where an array would be its own answer, by those that were tried and the answer to each (Anderson 1965)."""
+    tried, given = (np.array(part) for part in zip(*pairs, strict=True))
+    missed = (given - tried).reshape(len(pairs), -1)
+    shares = np.linalg.lstsq(np.diff(missed, axis=0).T, missed[-1])[0]
+    return np.asarray(given[-1] - np.tensordot(shares, np.diff(given, axis=0), axes=1), np.float32)
 
 
 def _times(matrices: Colours, image: FloatImage) -> FloatImage:

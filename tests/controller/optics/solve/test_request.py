@@ -10,7 +10,8 @@ import pytest
 from controller.core.arrays import FloatImage
 from controller.optics.solve import request
 from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
-from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings
+from controller.optics.solve.bounded.engine import IterationControl, Processor, SolveContext, corrected
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, Solution, SolveInput, SolveSettings
 from controller.optics.solve.request import SolveOptions, solve_appearance
 from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.solve.targets.values import Target
@@ -134,6 +135,22 @@ def test_indirect_light_is_left_room_for(transport: LightTransport, base: Base, 
         error = (seen - found.target)[there] / found.target[there]
         errors[name] = float(np.sqrt(np.mean(error**2)))
     assert errors["truth"] < errors["known"] < 0.5 * errors["none"]
+
+
+class Again(Processor):
+    """Solves a corrected target from the equations on, as engines do that have no equations to keep."""
+
+    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
+        return super().solve(corrected(Processor(), given, control), control)
+
+
+def test_a_target_that_is_corrected_keeps_the_equations(transport: LightTransport, base: Base) -> None:
+    light, target = StageLight(transport, STAGE.black, thrown_back(near=0.5, strength=0.4)), picture(20)
+    seen = []
+    for engine in (Processor(), Again()):
+        found = solve_appearance(light, base, target, replace(OPTIONS, share=0.6), SolveContext(engine))
+        seen.append(transport.forward(found.frames) / np.float32(found.figures["exposure"] or 0))
+    np.testing.assert_allclose(seen[0], seen[1], atol=0.01)
 
 
 def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightTransport, base: Base) -> None:

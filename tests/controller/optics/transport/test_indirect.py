@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from controller.core.arrays import Float64, FloatImage, Mask
 from controller.optics.calibrate.values import Calibration, PhaseMap
 from controller.optics.capture.patterns import plan_patterns
+from controller.optics.transport.indirect import indirect_light
 from controller.optics.transport.indirect.blocks import BlockGrid, down_up
 from controller.optics.transport.indirect.fit import beside, fit_indirect
 from controller.optics.transport.indirect.form_factors import form_factors
@@ -87,6 +88,18 @@ def test_paint_changes_light_before_it_falls_on_other_surfaces() -> None:
     total = painted + replace(some(1), lit=np.ones(SHAPE, np.bool_)).forward(painted)
     np.testing.assert_allclose(d + light.forward(d), total, atol=1e-5)
     np.testing.assert_allclose(light.direct_target(total.astype(np.float32)), d, atol=1e-4)
+
+
+def test_a_third_of_the_light_from_other_surfaces_is_found_in_seven_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Round by round, without looking where they lead, it takes twelve."""
+    y, x = np.divmod(np.arange(30), 6)
+    near = np.exp(-0.5 * (np.subtract.outer(y, y) ** 2 + np.subtract.outer(x, x) ** 2))
+    factors = (near / near.sum(axis=1, keepdims=True)).astype(np.float32)
+    light = replace(some(1, strength=1.0), factors=factors, lit=np.ones(SHAPE, np.bool_))
+    d = picture(5)
+    total = (d + light.forward(d)).astype(np.float32)
+    monkeypatch.setattr(indirect_light, "ROUNDS", 7)
+    np.testing.assert_allclose(light.direct_target(total), d, atol=1e-4)
 
 
 def test_light_is_one_number_for_even_light() -> None:
