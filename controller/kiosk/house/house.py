@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -29,7 +29,15 @@ from controller.kiosk.backup import Folder as BackupFolder
 from controller.kiosk.house.member import Order, Report
 from controller.kiosk.install.system import System
 from controller.kiosk.operations.dispatch import CALLER
-from controller.kiosk.operations.house import HOUSE_FILE, UPDATE_FILE, HouseEvent, HouseNow, StageNow
+from controller.kiosk.operations.house import (
+    HOUSE_FILE,
+    UPDATE_FILE,
+    HouseEvent,
+    HouseNow,
+    Rollout,
+    StageNow,
+    StageUpdate,
+)
 from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventLevel
 from controller.stage.link.joining import admit
@@ -94,6 +102,21 @@ class _Stage:
     offered: str = ""
     """The update that it got from this process."""
     events: deque[HouseEvent] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+
+
+@dataclass(frozen=True, slots=True)
+class _Package:
+    """The update that the house offers. ``digest``: SHA-256, as stages name it."""
+
+    file: Path
+    digest: str
+    version: str
+
+
+@lru_cache(maxsize=1)
+def _package_of(file: Path, changed_ns: int) -> _Package:
+    version = System(lambda line: None).look("dpkg-deb", "--field", str(file), "Version") or "unknown"
+    return _Package(file, sha256_of(file), version.strip())
 
 
 class House:
@@ -245,14 +268,13 @@ class House:
 
     def plan(self, stages: str) -> str:
         """Raises UsageError("house-no-update", "house-stages-unknown")."""
-        package = self._stage / UPDATE_FILE
-        if not package.is_file():
+        package = self._package()
+        if package is None:
             raise UsageError("house-no-update", what=f"There is no {UPDATE_FILE} beside {HOUSE_FILE}.",
                              remedy="Put the signed package of the new version there.")  # fmt: skip
         first, *others = (f"{name} ({stage.version})" for name in self._named(stages) if (stage := self._now(name)))
-        version = System(lambda line: None).look("dpkg-deb", "--field", str(package), "Version") or "unknown"
         then = f" Once it has proved itself there: {', '.join(others)}." if others else ""
-        return f"Version {version.strip()} goes to {first}.{then}"
+        return f"Version {package.version} goes to {first}.{then}"
 
     def update(self, stages: str) -> None:
         """Begin; it continues also after a restart. Raises as ``plan``."""
@@ -260,36 +282,60 @@ class House:
         write_atomically(self._stage / ROLLOUT, "\n".join(self._named(stages)).encode())
         self._pool.submit(self.roll_out)
 
+    def stop_update(self) -> None:
+        (self._stage / ROLLOUT).unlink(missing_ok=True)
+
+    def _package(self) -> _Package | None:
+        with contextlib.suppress(OSError):
+            file = self._stage / UPDATE_FILE
+            return _package_of(file, file.stat().st_mtime_ns)
+        return None
+
+    def rollout(self) -> Rollout:
+        package, begun = self._package(), self._stage / ROLLOUT
+        names = begun.read_text().split() if begun.exists() else []
+        ordered = [*(name for name in names if name in self._stages), *sorted(self._stages.keys() - set(names))]
+        rows = tuple(self._update_of(name, package, "waits" if name in names else "") for name in ordered)
+        return Rollout(package.version if package is not None else "", begun.exists(), rows)
+
+    def _update_of(self, name: str, package: _Package | None, before: str) -> StageUpdate:
+        """``before``: its state until it has the package."""
+        stage = self._stages[name]
+        if stage.report is None:
+            return StageUpdate(name, "", before)
+        told = stage.report.update
+        if package is not None and told.name == package.digest:
+            return StageUpdate(name, stage.report.version, told.state, told.why)
+        comes = before and package is not None and stage.offered == package.digest
+        return StageUpdate(name, stage.report.version, "comes" if comes else before)
+
     def roll_out(self) -> None:
         """Bring the update to the first stage, and to the others once that reports that it is well. Raises OSError."""
-        rollout, package = self._stage / ROLLOUT, self._stage / UPDATE_FILE
         with self._rolling:
-            if not rollout.exists():
+            now, package = self.rollout(), self._package()
+            stages = [stage for stage in now.stages if stage.state]
+            if not now.begun or package is None:
                 return
-            digest = sha256_of(package)
-            stages = {name: self._stages[name] for name in rollout.read_text().split() if name in self._stages}
-            told = {name: one.report.update for name, one in stages.items() if one.report is not None}
-            state = {name: one.state if one.name == digest else "" for name, one in told.items()}
-            if failed := [name for name in stages if state.get(name) == "failed"]:
-                self._give_up(f"{failed[0]} went back. {told[failed[0]].why}")
+            if failed := [stage for stage in stages if stage.state == "failed"]:
+                self._give_up(f"{failed[0].name} went back. {failed[0].why}")
                 return
-            if all(state.get(name) == "done" for name in stages):
-                rollout.unlink()
-                self._record("house-updated", f"The update is on {', '.join(stages)}.", "info")
+            if all(stage.state == "done" for stage in stages):
+                self.stop_update()
+                names = ", ".join(stage.name for stage in stages)
+                self._record("house-updated", f"The update is on {names}.", "info")
                 return
-            proved = state.get(next(iter(stages))) == "done"
             try:
-                for name, stage in list(stages.items())[: None if proved else 1]:
-                    if stage.linked and not state.get(name) and stage.offered != digest:
-                        self._offer(name, package)
-                        stage.offered = digest
+                for stage in stages[: None if stages[0].state == "done" else 1]:
+                    if stage.state == "waits" and self._stages[stage.name].linked:
+                        self._offer(stage.name, package.file)
+                        self._stages[stage.name].offered = package.digest
             except WorkError as error:
                 # a stage that does not answer is asked again
                 if error.code != "link-no-answer":
                     self._give_up(error.what)
 
     def _give_up(self, why: str) -> None:
-        (self._stage / ROLLOUT).unlink()
+        self.stop_update()
         self._record("house-update-failed", f"The update goes to no more stages. {why}", "error")
 
     def _offer(self, name: str, package: Path) -> None:

@@ -83,6 +83,29 @@ class Invitation:
     valid_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class StageUpdate:
+    """What an update is to a stage. ``version``: what it has now; ``state``: "" (not its update), "waits", "comes" (it
+    gets the package), "trial", "done" or "failed", and ``why``.
+    """
+
+    name: str
+    version: str
+    state: str
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """An update of stages. ``version``: that of update.deb, empty without one; ``begun``: it is under way;
+    ``stages``: its own in their order, then the others.
+    """
+
+    version: str
+    begun: bool
+    stages: tuple[StageUpdate, ...]
+
+
 class Stagehouse(Protocol):
     """The house's side; ``controller.kiosk.house.house`` has it."""
 
@@ -94,6 +117,8 @@ class Stagehouse(Protocol):
     def remove(self, stage: str) -> None: ...
     def plan(self, stages: str) -> str: ...
     def update(self, stages: str) -> None: ...
+    def stop_update(self) -> None: ...
+    def rollout(self) -> Rollout: ...
 
 
 class Membership(Protocol):
@@ -186,6 +211,13 @@ def house_update(house: House, stages: Stages) -> None:
     house.open().update(stages)
 
 
+@operation("DELETE /house/update", Role.TECHNICIAN, Effect.CHANGES, done="The update goes to no more stages.",
+           names=Names(command="house update-stop"))  # fmt: skip
+def house_update_stop(house: House) -> None:
+    """Bring the update to no more stages. One that has it already keeps it, or goes back, by itself."""
+    house.open().stop_update()
+
+
 @operation("POST /house/stages", Role.TECHNICIAN, Effect.CHANGES, done="The stage belongs to the house now.",
            names=Names(command="house add"))  # fmt: skip
 def house_add(house: House, address: Address, code: Code) -> None:
@@ -218,5 +250,5 @@ def house_leave(house: House) -> None:
 
 HOUSE_OPERATIONS: Final = (
     house_state, house_picture, house_events, house_open, house_close, house_play, house_add, house_remove,
-    house_update_plan, house_update, house_join, house_leave,
+    house_update_plan, house_update, house_update_stop, house_join, house_leave,
 )  # fmt: skip

@@ -48,8 +48,9 @@ LEADS_TO: Final = {
     "outline-target": "/appearances/new/{target}",
     "lay-mesh": "/mesh",
     "set-schedule": "/schedule",
-    **dict.fromkeys(("house-open", "house-close", "house-play", "house-add", "house-remove", "house-update"), "/house"),
+    **dict.fromkeys(("house-open", "house-close", "house-play", "house-add", "house-remove"), "/house"),
     **dict.fromkeys(("house-join", "house-leave"), "/house"),
+    **dict.fromkeys(("house-update", "house-update-stop"), "/house/update"),
     "test-shots": "/aiming",
     "save-settings": "/settings",
 }

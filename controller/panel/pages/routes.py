@@ -118,6 +118,7 @@ class Pages:
             ("/doctor", Role.OPERATOR, "doctor.html", self._doctor),
             ("/changes", Role.OPERATOR, "changes.html", lambda _: {"found": self._panel.kiosk.changes()}),
             ("/aiming", Role.TECHNICIAN, "aiming.html", self._aiming),
+            ("/house/update", Role.TECHNICIAN, "update.html", self._house_update),
             ("/settings", Role.TECHNICIAN, "settings.html", self._settings),
             ("/care", Role.TECHNICIAN, "care.html", lambda _: {}),
             ("/accounts", Role.TECHNICIAN, "accounts.html", self._accounts),
@@ -246,6 +247,10 @@ class Pages:
         now, rows = house.now(), house.events()[-HOUSE_EVENTS:][::-1]
         names = sorted({name for stage in now.stages for name in stage.appearances})
         return {"house": now, "names": names, "rows": rows}
+
+    def _house_update(self, _: Request) -> dict[str, Any]:
+        house = self._panel.house.open()
+        return {"rollout": house.rollout(), "groups": house.now().groups}
 
     async def _late_house(self, _: Request, visitor: Visitor) -> Response:
         """The stages again, for an open page."""

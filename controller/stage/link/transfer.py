@@ -87,7 +87,7 @@ class Arrivals:
 
     def path(self, name: str) -> Path:
         """Where the file of this name is. Raises WorkError("file-not-here")."""
-        path = self._folder / f"{name}.vel"
+        path = self._folder / f"{name}.whole"
         if not path.exists():
             raise WorkError("file-not-here", what="The file has not come whole.", remedy="Wait until it has.")
         return path
@@ -97,7 +97,7 @@ class Arrivals:
         WorkError("file-part-damaged").
         """
         with self._lock:
-            if (self._folder / f"{offer.name}.vel").exists():
+            if (self._folder / f"{offer.name}.whole").exists():
                 self._check(self.path(offer.name))
                 return ()
             if self._offer != offer:
@@ -149,9 +149,9 @@ class Arrivals:
             raise
         with coming.open("rb") as file:
             os.fsync(file.fileno())
-        coming.rename(self._folder / f"{offer.name}.vel")
+        coming.rename(self._folder / f"{offer.name}.whole")
         sync_folder(self._folder)
-        others = sorted(self._folder.glob("*.vel"), key=lambda path: path.stat().st_mtime)
+        others = sorted(self._folder.glob("*.whole"), key=lambda path: path.stat().st_mtime)
         for path in [*others[:-_KEPT], *self._folder.glob("*.coming")]:
             path.unlink(missing_ok=True)
 

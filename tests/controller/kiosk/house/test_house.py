@@ -201,7 +201,9 @@ def test_the_backups_of_all_stages_are_in_one_place(museum: Museum, monkeypatch:
     assert file.read_bytes() == before
 
 
-def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(museum: Museum, tmp_path: Path) -> None:
+def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(
+    museum: Museum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     roots = {name: tmp_path / name / "root" for name in ("knight", "vase")}
     offered = {name: root / OFFERED.relative_to("/") for name, root in roots.items()}
     for root in roots.values():
@@ -220,13 +222,34 @@ def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(museum:
         wait_for(lambda: museum.stage(name).update.startswith(state))
 
     assert re.match(r"Version 2-1 goes to knight .* proved itself there: vase", museum.house.plan("east wing"))
+    with page(museum) as panel, panel.entered("tina", PASSWORD) as tina:
+        text = tina.get("/house/update").text
+        assert "Version 2-1" in text
+        form = {"csrf": csrf(text), "stages": "east wing"}
+        assert "Update east wing?" in tina.post("/do/house-update", data=form).text
+        assert tina.post("/do/house-update", data={**form, "sure": "yes"}).headers["location"] == "/house/update"
+        text = tina.get("/house/update").text
+        assert re.findall(r"<h2>(\w+)(?: <small>(\w+)</small>)?</h2>", text) == [
+            ("knight", "first"),
+            ("vase", ""),
+            ("bust", ""),
+        ]
+        wait_for(lambda: "Gets the package" in tina.get("/house/update").text)
+        assert "Waits" in text
+        # It can be stopped, and begun again.
+        assert tina.post("/do/house-update-stop", data={"csrf": form["csrf"]}).headers["location"] == "/house/update"
+        assert not museum.house.rollout().begun
+        assert "Begin the update" in tina.get("/house/update").text
     museum.house.update("east wing")
     wait_for(offered["knight"].exists)
     assert offered["knight"].read_bytes() == package.read_bytes()
+    hashed: list[Path] = []
+    monkeypatch.setattr("controller.kiosk.house.house.sha256_of", hashed.append)
     for state in ("trial", "done"):
         assert not offered["vase"].exists()
         tell("knight", state)
         museum.house.roll_out()
+    assert hashed == [], "it was hashed once"
     assert offered["vase"].read_bytes() == package.read_bytes()
     tell("vase", "failed")
     museum.house.roll_out()
@@ -234,11 +257,12 @@ def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(museum:
         "house-update-failed",
         "The update goes to no more stages. vase went back. It is dark.",
     )
+    monkeypatch.undo()
     # What a stage does not trust ends it, too.
     sign_package(package, OTHER_KEY, package)
     museum.house.update("vase")
     wait_for(lambda: "No key that this computer trusts" in museum.recorded[-1][1])
-    assert not (tmp_path / "house/update-stages").exists()
+    assert not museum.house.rollout().begun
 
 
 def test_the_page_has_every_stage_and_asks_before_it_closes_all(museum: Museum) -> None:
