@@ -63,7 +63,7 @@ _PREINST: Final = f"""#!/bin/sh
 set -e
 # The program that an update has put there is of another package: none of its files may stay among those of this one.
 if [ "$1" = upgrade ] && [ -e /{PREFIX}/.update ]; then rm -rf /{PREFIX}/lib /{PREFIX}/.update; fi
-rm -f /{PREFIX}.package /{PREFIX}.trial
+rm -f /{PREFIX}.package /{PREFIX}.trial /var/lib/velatura/stage/keys/players/update.deb
 """
 _PRERM: Final = f"""#!/bin/sh
 set -e

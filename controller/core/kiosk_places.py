@@ -9,6 +9,8 @@ from typing import Final
 USER: Final = "velatura"
 STATE: Final = Path("/var/lib/velatura")
 STAGE: Final = STATE / "stage"
+PLAYERS: Final = STAGE / "keys" / "players"
+"""There if the stage has outputs on other computers."""
 RUNTIME: Final = Path("/run/velatura")
 PLAYER_SOCKET: Final = RUNTIME / "player.sock"
 PLAYER_OPTIONS: Final = STATE / "player.options"

@@ -1,9 +1,141 @@
-"""Another version of the package on a booted kiosk that plays, and back."""
+"""Another version on a booted kiosk that plays, and back: by an update that takes itself back, and by `dpkg`."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+from typing import Any, Final
+
+from nacl.signing import SigningKey
+
+from controller.bundle.signing import write_public_key
+from controller.kiosk.install.update import MARK, OTHER, PACKAGE, PROGRAM, RESULT, STARTS, TRIAL, WITHIN_S, sign_package
 from tests.booted.kiosk import SERVICES, Kiosk
 from tests.campaigns.power_cuts import kept, lost
+
+KEY: Final = SigningKey(bytes([1] * 32))
+PUBLIC: Final = Path("/opt/updates.pub")
+BENCH: Final = f'[ "$1" != emulate ] || exec {OTHER}/bin/python -m controller "$@"'
+"""The devices stand outside of the kiosk: they use the version that works."""
+
+
+def told(kiosk: Kiosk) -> dict[str, Any]:
+    """The outcome of the last update."""
+    file = kiosk.machine.at(RESULT)
+    return dict(json.loads(file.read_text())) if file.exists() else {}
+
+
+def offer(kiosk: Kiosk, package: Path) -> str:
+    """Sign this package, and update the kiosk by it; its SHA-256."""
+    machine, place = kiosk.machine, Path("/opt/update.deb")
+    sign_package(package, KEY, machine.at(place))
+    if not machine.at(PUBLIC).exists():
+        write_public_key(machine.at(PUBLIC), bytes(KEY.verify_key))
+        refused = machine.called("velatura", "kiosk", "update", place)
+        assert "No key that this computer trusts" in refused.stdout + refused.stderr
+        machine.call("velatura", "kiosk", "install", "--trust", PUBLIC)
+    machine.call("velatura", "kiosk", "update", place)
+    with machine.at(place).open("rb") as file:
+        name = hashlib.file_digest(file, "sha256").hexdigest()
+    machine.at(place).unlink()
+    machine.wait_for(lambda: told(kiosk).get("name") == name)
+    return name
+
+
+def broken(folder: Path, install: str) -> Path:
+    """A package whose program only does this when it is installed."""
+    programs, about = folder / "opt/velatura/bin", folder / "DEBIAN"
+    programs.mkdir(parents=True)
+    about.mkdir()
+    for name, script in (("python", "exit 1"), ("velatura", f'{BENCH}\n[ "$2" != install ] || {install}')):
+        (programs / name).write_text(f"#!/bin/sh\n{script}\n")
+        (programs / name).chmod(0o755)
+    fields = "Package: velatura\nVersion: 3-1\nArchitecture: all\nMaintainer: x\nDescription: x\n"
+    (about / "control").write_text(fields)
+    made = folder.with_suffix(".deb")
+    subprocess.run(["dpkg-deb", "-Znone", "--build", folder, made], check=True, stdout=subprocess.DEVNULL)
+    return made
+
+
+def program(kiosk: Kiosk) -> str:
+    """Which update the program there is of; empty for one that `dpkg` has installed."""
+    mark = kiosk.machine.at(PROGRAM / MARK)
+    return mark.read_text() if mark.exists() else ""
+
+
+def running(kiosk: Kiosk) -> list[str]:
+    """The commands of all processes."""
+    commands = "for one in /proc/[0-9]*/cmdline; do tr '\\0' ' ' < $one && echo; done"
+    return kiosk.machine.called("sh", "-c", commands).stdout.splitlines()
+
+
+def back_to(kiosk: Kiosk, name: str) -> None:
+    """Wait until the update has ended as failed, and the program of this name plays."""
+    machine = kiosk.machine
+    machine.wait_for(lambda: not machine.at(TRIAL).exists() and told(kiosk)["state"] != "trial")
+    machine.wait_for(kiosk.shows)
+    machine.wait_for(lambda: kiosk.state == "playing")
+    assert told(kiosk)["state"] == "failed"
+    assert program(kiosk) == name
+    assert not machine.at(PACKAGE).exists()
+
+
+def test_an_update_proves_itself_and_the_picture_stays(playing: Kiosk) -> None:
+    machine, before = playing.machine, kept(playing)
+    with machine.watched() as seen:
+        name = offer(playing, playing.packages[1])
+        machine.wait_for(lambda: machine.at(TRIAL).exists() and program(playing) == name)
+        exchanged_s = machine.at(TRIAL).stat().st_mtime
+        machine.wait_for(
+            lambda: machine.at(STARTS).read_text() == "0" and machine.at(STARTS).stat().st_mtime > exchanged_s
+        )
+        machine.wait_for(lambda: playing.answers() and playing.state == "playing")
+    assert {what for _, what in seen[:-1]} == {seen[0][1]} != {"black"}, "it was never black, nor anything else"
+    judges = [line for line in running(playing) if "--carry-out" in line]
+    assert [line.split()[0] for line in judges] == [f"{OTHER}/bin/python"], "it is the former version that judges"
+    assert "trial" in machine.call("velatura", "kiosk", "update"), "who only asks gets an answer at once"
+    assert [line for line in running(playing) if "--carry-out" in line] == judges
+    # The power fails, and is back a day later.
+    machine.cut_off()
+    changed = told(playing)
+    changed["began_unix_s"] -= WITHIN_S
+    machine.at(RESULT).write_text(json.dumps(changed))
+    machine.switch_on()
+    machine.wait_for(playing.shows)
+    machine.wait_for(lambda: told(playing)["state"] != "trial")
+    assert (told(playing)["state"], told(playing)["why"], program(playing)) == ("done", "", name)
+    assert lost(playing, before) == []
+
+
+def test_a_version_that_does_not_start_is_taken_back_and_the_picture_stays(playing: Kiosk, tmp_path: Path) -> None:
+    before, former = kept(playing), program(playing)
+    with playing.machine.watched() as seen:
+        offer(playing, broken(tmp_path / "no", "exec systemctl restart velatura-player velatura-controller"))
+        back_to(playing, former)
+    assert len({what for _, what in seen[:-1]}) == 1
+    assert "systemctl status velatura-controller.service" in told(playing)["why"]
+    assert lost(playing, before) == []
+
+
+def test_a_version_with_which_the_kiosk_never_answers_is_taken_back_after_some_power_cuts(
+    playing: Kiosk, tmp_path: Path
+) -> None:
+    machine, before, former = playing.machine, kept(playing), program(playing)
+    name = offer(
+        playing, broken(tmp_path / "no", "exec systemctl restart --no-block velatura-player velatura-controller")
+    )
+    machine.wait_for(lambda: program(playing) == name)
+    for starts in ("1", "2", "3"):
+        machine.wait_for(lambda starts=starts: machine.at(STARTS).read_text() == starts)  # type: ignore[misc]
+        # Once it waits: a program that ends because systemd ends is a failure only here, where the machine lives on.
+        machine.wait_for(lambda: not any("kiosk install" in line for line in running(playing)))
+        machine.cut_off()
+        machine.switch_on()
+    back_to(playing, former)
+    assert "started 3 times" in told(playing)["why"]
+    assert lost(playing, before) == []
 
 
 def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kiosk) -> None:

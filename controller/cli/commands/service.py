@@ -128,11 +128,16 @@ def agent(
     """Keep players of this computer in step with a stage on another computer. It joins by a code that it shows."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.kiosk.install.steps import only_plays
+        from controller.kiosk.install.system import System
+        from controller.kiosk.install.update import Packages
         from controller.stage.hosts.agent import admitted, keep
 
         if admit:
             return admitted(stage, admit, code)
-        return keep(keys, name, partial(_on_screen, reporter.say), cancel)
+        system = System(reporter.say)
+        updates = partial(Packages, system) if only_plays(system) else None
+        return keep(keys, name, partial(_on_screen, reporter.say), cancel, updates)
 
     work(do)
 
@@ -192,7 +197,7 @@ def install(
     if backup is not None:
         restored.restore(system, backup.absolute(), ask=lambda text: str(typer.prompt(text)), say=console.say)
     elif player:
-        steps.install_player(system, say=console.say)
+        steps.install_player(system, say=console.say, restart=restart)
     else:
         steps.install(system, outputs_again=outputs, restart=restart, say=console.say)
     text = "The kiosk runs, and starts with this computer."
@@ -203,9 +208,10 @@ def install(
 
 def update(
     package: Annotated[
-        Path | None, typer.Argument(help="A signed package; without one, what is offered is done.", dir_okay=False)
+        Path | None, typer.Argument(help="A signed package; without one, the last update is shown.", dir_okay=False)
     ] = None,
     dry_run: DryRun = False,
+    carry_out: Annotated[bool, typer.Option(hidden=True)] = False,
     sign: Annotated[
         Path | None, typer.Option(help="Only sign this package, with a key made by `velatura bundle key`.")
     ] = None,
@@ -227,8 +233,9 @@ def update(
     if package is not None:
         update.check_package(package, system.at(steps.TRUSTED))
     if package is None:
-        if not dry_run:
-            update.Updates(system, status=lambda: dict(call_kiosk(STAGE, "status"))).run()
+        if carry_out:
+            plays, asked = steps.only_plays(system), lambda: dict(call_kiosk(STAGE, "status"))
+            update.Updates(system, status=(lambda: update.status_of_player(system)) if plays else asked).run()
         console.show_result(dataclasses.asdict(update.outcome(system)))
     elif dry_run:
         console.show_result(update.changes(system, package))

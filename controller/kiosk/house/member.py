@@ -9,16 +9,14 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
-from controller.core.kiosk_places import STATE, is_installed
-from controller.kiosk.install.steps import TRUSTED
+from controller.core.kiosk_places import is_installed
 from controller.kiosk.install.system import System
-from controller.kiosk.install.update import OFFERED, Outcome, check_package, outcome
+from controller.kiosk.install.update import Outcome, Packages, outcome
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.dispatch import local_values
 from controller.kiosk.operations.house import MEMBERSHIP, Invitation
@@ -28,7 +26,7 @@ from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
 from controller.stage.link.membership import Membership, leave, membership
 from controller.stage.link.session import EVERYWHERE, Link, member_link
-from controller.stage.link.transfer import Arrivals, Offer
+from controller.stage.link.transfer import Offer
 from hal.errors import CodedError
 
 PAUSE_S: Final = 2.0
@@ -156,10 +154,7 @@ class _Reports:
         self._link.answer(f"{self._key}/do", Order, self._do)
         self._link.answer(f"{self._key}/part", int, self._part)
         if computer is not None:
-            trusted = computer.at(TRUSTED)
-            self._packages = Arrivals(computer.at(STATE / "updates"), lambda file: check_package(file, trusted))
-            self._packages.listen(self._link, f"{self._key}/package")
-            self._link.answer(f"{self._key}/update", str, partial(self._update, computer))
+            Packages(computer, self._link, self._key)
         self._link.appear(f"{self._key}/here")
         self._thread = threading.Thread(target=self._publish, name="house", daemon=True)
         self._thread.start()
@@ -196,12 +191,6 @@ class _Reports:
 
     def _outcome(self) -> Outcome:
         return Outcome() if self._computer is None else replace(outcome(self._computer), before={})
-
-    def _update(self, computer: System, name: str) -> None:
-        """Offer what has come to this computer's own service, which checks it again."""
-        if self._outcome().state == "trial":
-            raise WorkError("update-on-trial", what="An update is on trial.", remedy="Wait until it has ended.")
-        self._packages.path(name).replace(computer.at(OFFERED))
 
     def _whole(self, _: bytes) -> Report:
         return self._report(tuple(self._kiosk.events())[-MOST_EVENTS:])

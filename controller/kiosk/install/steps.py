@@ -79,8 +79,17 @@ READY_S: Final = 60.0
 _X: Final = {"DISPLAY": ":0", "XAUTHORITY": "/run/velatura-x11/cookie"}
 
 
-def install_player(system: System, *, say: Callable[[str], None], prefix: Path = Path(sys.prefix)) -> None:
-    """Make this computer one with outputs of another one's stage: X server and agent. Raises as ``install``."""
+def only_plays(system: System) -> bool:
+    """Whether this computer is one of ``install_player``."""
+    return os.path.lexists(system.at(Path(f"/etc/systemd/system/{TARGET}.wants/{AGENT}.service")))
+
+
+def install_player(
+    system: System, *, say: Callable[[str], None], restart: bool = False, prefix: Path = Path(sys.prefix)
+) -> None:
+    """Make this computer one with outputs of another one's stage: X server and agent. ``restart``: the program is
+    another version; the outputs stay. Raises as ``install``.
+    """
     check(system, prefix)
     system.folder(CONFIGURATION)
     _packages(system, "chrony")
@@ -90,9 +99,9 @@ def install_player(system: System, *, say: Callable[[str], None], prefix: Path =
     _folders(system)
     system.run("systemctl", "daemon-reload")
     system.run("systemctl", "mask", "--quiet", "--now", *SERVICES[1:])
-    system.run("systemctl", "enable", "--quiet", TARGET, AGENT)
-    system.run("systemctl", "start", "velatura-x11")
-    _outputs(system, again=True, say=say)
+    system.run("systemctl", "enable", "--quiet", TARGET, AGENT, UPDATES)
+    system.run("systemctl", "start", "velatura-x11", UPDATES)
+    _outputs(system, again=not restart, say=say)
     system.run("systemctl", "restart", AGENT)
 
 

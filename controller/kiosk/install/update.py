@@ -20,16 +20,19 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from nacl.signing import SigningKey
 
 from controller.bundle.signing import BLOCK_BYTES, check_signature, load_public_key, sign
-from controller.core.errors import BundleError, UsageError, VelaturaError
-from controller.core.kiosk_places import STATE
+from controller.core.errors import BundleError, UsageError, VelaturaError, WorkError
+from controller.core.kiosk_places import PLAYERS, RUNTIME, STATE
 from controller.core.storage import stream_atomically, sync_folder, write_atomically
-from controller.kiosk.install.steps import SHIPPED_PREFIX, TRUSTED
+from controller.kiosk.install.steps import SHIPPED_PREFIX, TRUSTED, only_plays
 from controller.kiosk.install.system import System
+
+if TYPE_CHECKING:  # Zenoh is an extra
+    from controller.stage.link.session import Link
 
 PROGRAM: Final = Path(SHIPPED_PREFIX)
 OTHER: Final = PROGRAM.with_suffix(".other")
@@ -43,10 +46,13 @@ RESULT: Final = PROGRAM.with_suffix(".update")
 MARK: Final = ".update"
 """In a program's folder: which update it is."""
 OFFERED: Final = STATE / "update.deb"
+PLAYS: Final = RUNTIME / "plays"
+"""Of a computer that only plays: what its agent reported last."""
 START_S: Final = 600.0
 """So long a new version may need until it is as well as the former one was. It may compile its kernels first."""
 WITHIN_S: Final = 26 * 3600.0
 _LOOK_S, _WELL_S = 5.0, 60.0
+_OLD_S: Final = 10.0
 _MOST_STARTS: Final = 3
 _EXCHANGE: Final = 2
 _SIGNED: Final = b"velatura update 1\0"
@@ -115,7 +121,7 @@ def changes(system: System, package: Path) -> dict[str, Any]:
     """What an update would change here: ``version``, ``needs`` (Debian packages that are missing), and the files of
     the program that are ``new``, ``changed`` and ``gone``. Raises WorkError("kiosk-step-failed").
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:  # /tmp may be memory
         system.run("dpkg-deb", "--extract", str(package), folder)
         theirs, ours = (_files(root) for root in (Path(folder, *PROGRAM.parts[1:]), system.at(PROGRAM)))
     fields = system.look("dpkg-deb", "--field", str(package), "Version", "Depends") or ""
@@ -139,6 +145,39 @@ def _files(root: Path) -> dict[str, bytes]:
     }
 
 
+class Packages:
+    """The updates that the other side of a link offers to this computer, below ``key``."""
+
+    def __init__(self, system: System, link: Link, key: str) -> None:
+        from controller.stage.link.transfer import Arrivals
+
+        self._system = system
+        self._arrivals = Arrivals(system.at(STATE / "updates"), lambda file: check_package(file, system.at(TRUSTED)))
+        self._arrivals.listen(link, f"{key}/package")
+        link.answer(f"{key}/update", str, self._offer)
+
+    def _offer(self, name: str) -> None:
+        """Give what has come to this computer's own service, which checks it again."""
+        if outcome(self._system).state == "trial":
+            raise WorkError("update-on-trial", what="An update is on trial.", remedy="Wait until it has ended.")
+        self._arrivals.path(name).replace(self._system.at(OFFERED))
+
+    def plays(self, state: str) -> tuple[str, str, str]:
+        """Note the state of a computer that only plays, for the service. Returns name, state and why of its update."""
+        with contextlib.suppress(VelaturaError):
+            write_atomically(self._system.at(PLAYS), state.encode())
+        told = outcome(self._system)
+        return told.name, told.state, told.why
+
+
+def status_of_player(system: System) -> Mapping[str, Any] | None:
+    """What ``Updates`` asks for, of a computer that only plays; None while its agent does not run."""
+    file = system.at(PLAYS)
+    if not file.exists() or time.time() - file.stat().st_mtime > _OLD_S:
+        return None
+    return {"state": file.read_text()}
+
+
 class Updates:
     """The service; ``run`` it as root. ``status``: what the kiosk reports now; None, or a VelaturaError, if it does not
     answer.
@@ -152,18 +191,33 @@ class Updates:
         self._program, self._other, self._trial, self._package = map(system.at, (PROGRAM, OTHER, TRIAL, PACKAGE))
 
     def run(self) -> None:
-        """Carry out what is offered, judge what is on trial, or finish what a power cut interrupted."""
-        while self._wanted():
-            name = self._name()
-            if not self._installed(name) and not self._install(name):
-                continue
-            if self._trial.exists() and (why := self._judged()):
-                self._end(name, "failed", why)
-            else:
-                self._trial.unlink(missing_ok=True)
-                sync_folder(self._trial.parent)  # else a power cut could bring it back, without the package
-                self._end(name, "done", "")
-            self._go_back()
+        """Exchange both for what is offered, or judge what is on trial, or finish what a power cut interrupted.
+
+        A process does one of these: what it has not loaded yet is of another version afterwards. While anything is
+        left, `velatura-update.path` starts the next one.
+        """
+        if not self._wanted():
+            return
+        name = self._name()
+        if not self._installed(name):
+            self._install(name)
+            return
+        if self._trial.exists() and (why := self._judged()):
+            self._end(name, "failed", why)
+        else:
+            self._trial.unlink(missing_ok=True)
+            sync_folder(self._trial.parent)  # else a power cut could bring it back, without the package
+            self._give_to_players()
+            self._end(name, "done", "")
+        self._go_back()
+
+    def _give_to_players(self) -> None:
+        """Let the conductor bring what has proved itself to the other computers of the stage."""
+        players = self._system.at(PLAYERS)
+        if players.is_dir():
+            with contextlib.suppress(VelaturaError, OSError), self._package.open("rb") as source:
+                copy = players / OFFERED.name
+                stream_atomically(copy, lambda file: shutil.copyfileobj(source, file, 1 << 20), mode=0o644)
 
     def _status(self) -> Mapping[str, Any] | None:
         with contextlib.suppress(VelaturaError):
@@ -196,8 +250,8 @@ class Updates:
     def _installed(self, name: str) -> bool:
         return self._system.read(PROGRAM / MARK) == name
 
-    def _install(self, name: str) -> bool:
-        """Unpack it, and exchange both; whether that was possible."""
+    def _install(self, name: str) -> None:
+        """Unpack it, and exchange both."""
         unpacked = self._other.with_name(f"{self._other.name}.new")
         try:
             for folder in (unpacked, self._other):
@@ -216,8 +270,6 @@ class Updates:
         except (VelaturaError, OSError) as error:
             self._end(name, "failed", error.what if isinstance(error, VelaturaError) else str(error))
             self._trial.unlink(missing_ok=True)
-            return False
-        return True
 
     def _exchange(self) -> None:
         """Raises OSError; then nothing has changed."""
@@ -229,7 +281,8 @@ class Updates:
 
     def _begin(self) -> None:
         """Start the version that is there now, with its own units."""
-        self._system.run(str(PROGRAM / "bin" / "velatura"), "kiosk", "install", "--restart")
+        as_player = ("--player",) if only_plays(self._system) else ()
+        self._system.run(str(PROGRAM / "bin" / "velatura"), "kiosk", "install", *as_player, "--restart")
 
     def _judged(self) -> str:
         """Wait until the new version has proved itself; why not, "" if it has."""

@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.storage import runtime_folder
 from controller.stage.hosts.clock import HostClock
-from controller.stage.hosts.remote import Asked, Report, key, placed_rows
+from controller.stage.hosts.remote import NO_UPDATE, Asked, Report, key, placed_rows
 from controller.stage.hosts.screen import Screen, Setup
 from controller.stage.link.joining import Joining, admit
 from controller.stage.link.membership import Authority, membership
@@ -30,11 +30,19 @@ PORT: Final = 7449
 _NEVER_S: Final = -1e9
 
 
+class Updates(Protocol):
+    """The program's, of this computer; ``controller.kiosk.install.update`` has it."""
+
+    def plays(self, state: str) -> tuple[str, str, str]: ...
+
+
 def keep(
-    keys: Path, name: str | None, show: Callable[[str], AbstractContextManager[None]], cancel: threading.Event
-) -> dict[str, Any]:
+    keys: Path, name: str | None, show: Callable[[str], AbstractContextManager[None]], cancel: threading.Event,
+    updates: Callable[[Link, str], Updates] | None,
+) -> dict[str, Any]:  # fmt: skip
     """An agent on this computer until ``cancel``; without a membership in ``keys`` it first joins by a code, which
-    ``show`` shows meanwhile.
+    ``show`` shows meanwhile. ``updates``: takes those of the program that the link brings; None where
+    the program is not an installed one.
 
     Raises as ``Joining`` and ``member_link``.
     """
@@ -53,6 +61,8 @@ def keep(
 
     with member_link(own) as link:
         agent = Agent(link, own.name, keys.with_name("bundles"), clock, screen)
+        if updates is not None:
+            agent.updates = updates(link, key(own.name, "program"))
         agent.run(cancel)
     return {"name": own.name}
 
@@ -83,6 +93,7 @@ class Agent:
         self._bundles = Arrivals(folder, self._check)
         self._pictures: dict[tuple[str, str], Any] = {}
         self._heard_s = _NEVER_S
+        self.updates: Updates | None = None
         self._lock = threading.Lock()
         link.answer(key(name, "prepare"), dict[str, Setup], self._prepare)
         link.answer(key(name, "ask"), Asked, self._ask)
@@ -104,7 +115,9 @@ class Agent:
         silent_s = time.monotonic() - self._heard_s
         with self._lock:
             states = {name: one.step(one.setup.keep_s - silent_s) for name, one in self._screens.items()}
-        self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states))
+        plays = "playing" if all(state.status is not None for state in states.values()) else "fault"
+        told = self.updates.plays(plays if states else "off") if self.updates is not None else NO_UPDATE
+        self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states, told))
 
     def _beat(self, _: bytes) -> None:
         self._heard_s = time.monotonic()

@@ -359,7 +359,8 @@ def _players(
     for number, ((host, screen), setup) in enumerate(setups.items()):
         if link is not None and host:
             its = {place[1]: one for place, one in setups.items() if place[0] == host}
-            players.append(Remote(link, host, screen, its))
+            package = options.keys / "update.deb" if screen == next(iter(its)) else None
+            players.append(Remote(link, host, screen, its, package))
         else:
             here = Screen(options.socket.parent / f"screen-{number}", clock, display=screen)
             here.prepare(setup)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from controller.core.errors import UsageError, WorkError
+from controller.core.storage import sha256_of
 from controller.play.control.notify import log
 from controller.stage.hosts.screen import Pictures, Setup, State
 from controller.stage.link.membership import Authority
@@ -22,6 +23,7 @@ from controller.stage.link.session import Link, house_link
 from controller.stage.link.transfer import send
 from hal.errors import CodedError
 
+NO_UPDATE: Final = "", "", ""
 _ROWS_BYTES: Final = 4 << 20
 """Of pixels in one message, before they are packed."""
 
@@ -42,11 +44,14 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The state of a computer twice a second. ``trouble``: of its clock, "" if it has none."""
+    """The state of a computer twice a second. ``trouble``: of its clock, "" if it has none; ``update``: name, state
+    and why of the last one of its program.
+    """
 
     common_s: float
     trouble: str
     states: dict[str, State] = field(default_factory=dict)
+    update: tuple[str, str, str] = NO_UPDATE
 
 
 def rows_of(screen: str, output: str, pixels: npt.NDArray[np.uint8]) -> Iterator[bytes]:
@@ -77,6 +82,8 @@ SILENT_S: Final = 3.0
 _START_S: Final = 25.0
 _PART_S: Final = 10.0
 _AGAIN_S: Final = 1.0
+_UPDATE_AGAIN_S: Final = 30.0
+_LATER: Final = ("link-no-answer", "update-on-trial")
 
 
 def opened_link(keys: Path | None, port: int) -> Link:
@@ -92,8 +99,12 @@ def opened_link(keys: Path | None, port: int) -> Link:
 class Remote:
     """As ``screen.Player``. It counts as there once it has its setup, until nothing is heard of it for ``SILENT_S``."""
 
-    def __init__(self, link: Link, host: str, screen: str, setups: dict[str, Setup]) -> None:
-        """``setups``: of all screens of that computer."""
+    def __init__(
+        self, link: Link, host: str, screen: str, setups: dict[str, Setup], package: Path | None = None
+    ) -> None:
+        """``setups``: of all screens of that computer; ``package``: where the update for its program is, once there is
+        one; None where another screen of it brings that.
+        """
         self._link, self.host, self._screen, self._setups = link, host, screen, setups
         self._state, self.trouble = State(), ""
         self._reports: list[tuple[float, float, str | None]] = []
@@ -104,6 +115,7 @@ class Remote:
         self._wanted: Path | None = None
         self._has: str | None = None
         self._share = 0.0
+        self._package, self._offered_ns = package, 0
         link.subscribe(key(host, "state"), Report, self._heard)
 
     # -- what is heard
@@ -111,7 +123,9 @@ class Remote:
     def _heard(self, report: Report) -> None:
         fresh = time.monotonic() - self._heard_s > SILENT_S
         self._heard_s = time.monotonic()
-        self.trouble = report.trouble
+        there, update, why = report.update
+        self.trouble = report.trouble or (f"Its update was taken back: {why}" if update == "failed" else "")
+        self._look_for_update(there)
         self._state = report.states.get(self._screen, State())
         self._reports += self._state.reports
         if (fresh or not report.states) and not self._busy.locked():
@@ -124,6 +138,31 @@ class Remote:
             self._asked_at, self._has = None, None
             self._prepared = True
             log(f"The computer {self.host} is here.")
+
+    def _look_for_update(self, there: str) -> None:
+        """Bring an update there that has come since the last look, in a thread. ``there``: the last one it has got."""
+        with contextlib.suppress(OSError):
+            changed_ns = self._package.stat().st_mtime_ns if self._package is not None else 0
+            if changed_ns != self._offered_ns:
+                self._offered_ns = changed_ns
+                threading.Thread(target=self._bring_update, args=(self._package, there), daemon=True).start()
+
+    def _bring_update(self, package: Path, there: str) -> None:
+        with contextlib.suppress(OSError):
+            changed_ns = self._offered_ns
+            if sha256_of(package) == there:
+                return
+            while changed_ns == self._offered_ns:
+                try:
+                    name = send(self._link, key(self.host, "program/package"), package)
+                    self._link.ask(key(self.host, "program/update"), name, type(None))
+                    log(f"The computer {self.host} has the update.")
+                    return
+                except CodedError as error:
+                    if error.code not in _LATER:
+                        log(f"The computer {self.host} does not take the update. {error.what}")
+                        return
+                time.sleep(_UPDATE_AGAIN_S)
 
     @property
     def setup(self) -> Setup:

@@ -176,10 +176,16 @@ def test_a_computer_with_outputs_of_another_stage_runs_the_agent_and_nothing_els
     system = Recorded(debian, FRESH)
     steps.install_player(system, say=system.told.append, prefix=PREFIX)
     assert "systemctl mask --quiet --now velatura-player velatura-controller" in system.ran
-    assert "systemctl enable --quiet velatura.target velatura-agent" in system.ran
+    assert "systemctl enable --quiet velatura.target velatura-agent velatura-update.path" in system.ran
     assert any(line.startswith("apt-get install") and "chrony" in line for line in system.ran)
     assert (debian / "etc/systemd/system/velatura-agent.service").exists()
     assert not (debian / "etc/velatura/controller.env").exists()
+    # Another version leaves the outputs, also where a projector is off just then.
+    outputs = (debian / steps.X_OUTPUTS.relative_to("/")).read_text()
+    other = Recorded(debian, {**FRESH, "xrandr": ""})
+    steps.install_player(other, say=other.told.append, restart=True, prefix=PREFIX)
+    assert (debian / steps.X_OUTPUTS.relative_to("/")).read_text() == outputs
+    assert other.ran[-1] == "systemctl restart velatura-agent"
 
 
 def test_the_player_of_a_stage_with_other_computers_may_use_the_network(debian: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -81,8 +82,11 @@ class Computer(System):
         self.waited_s += seconds
 
     def boot(self) -> None:
-        """What the service does: offered, unfinished or not."""
-        Updates(self, status=self.status, wait=self._wait, now=lambda: 1.8e9 + self.waited_s).run()
+        """What the service does as long as its path unit starts it: offered, unfinished or not."""
+        unit = steps.shipped(PROGRAM)[Path("/etc/systemd/system") / steps.UPDATES]
+        places = [self.at(Path(place)) for place in re.findall(r"^PathExists=(\S+)$", unit, re.MULTILINE)]
+        while any(map(os.path.lexists, places)):
+            Updates(self, status=self.status, wait=self._wait, now=lambda: 1.8e9 + self.waited_s).run()
 
 
 def offered(root: Path, package: Path) -> None:
@@ -115,6 +119,8 @@ def test_a_signed_package_is_one_that_dpkg_still_reads(package: Path) -> None:
 
 def test_an_update_starts_proves_itself_and_stays(tmp_path: Path, package: Path) -> None:
     offered(tmp_path, package)
+    players = tmp_path / "var/lib/velatura/stage/keys/players"
+    players.mkdir(parents=True)
     computer = Computer(tmp_path, {"1": [BEFORE], "2": [None, report(state="warming"), BEFORE, CHECKED]})
     assert update.changes(computer, package)["changed"] == sorted(FILES)
     computer.boot()
@@ -125,6 +131,8 @@ def test_an_update_starts_proves_itself_and_stays(tmp_path: Path, package: Path)
     left = sorted(path.name for path in (tmp_path / "opt").iterdir())
     assert left == ["velatura", "velatura.other", "velatura.starts", "velatura.update"]
     assert not computer.at(OFFERED).exists()
+    # The other computers of its stage get it now.
+    assert (players / "update.deb").read_bytes() == package.read_bytes()
     # Another one takes the place of the former version.
     shutil.copy(package, computer.at(OFFERED))
     computer.boot()
@@ -159,6 +167,18 @@ def test_without_a_check_a_version_that_plays_stays_after_a_day(tmp_path: Path, 
     computer.boot()
     assert (computer.version, outcome(computer).state) == ("2", "done")
     assert computer.waited_s == pytest.approx(update.WITHIN_S, abs=120)
+
+
+def test_a_computer_that_only_plays_stays_one(tmp_path: Path, package: Path) -> None:
+    offered(tmp_path, package)
+    wanted = tmp_path / "etc/systemd/system/velatura.target.wants"
+    wanted.mkdir(parents=True)
+    (wanted / "velatura-agent.service").symlink_to("/etc/systemd/system/velatura-agent.service")
+    # Its agent is back, then its player.
+    computer = Computer(tmp_path, {"1": [{"state": "playing"}], "2": [None, {"state": "off"}, {"state": "playing"}]})
+    computer.boot()
+    assert (computer.version, outcome(computer).state) == ("2", "done")
+    assert "2: /opt/velatura/bin/velatura kiosk install --player --restart" in computer.told
 
 
 def test_what_no_trusted_key_has_signed_changes_nothing(tmp_path: Path, package: Path) -> None:

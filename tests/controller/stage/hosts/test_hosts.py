@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from controller.bundle.signing import write_public_key
+from controller.kiosk.install.system import System
+from controller.kiosk.install.update import OFFERED, Packages, status_of_player
+from controller.stage.hosts.agent import Agent
 from controller.stage.hosts.clock import HostClock, Tracking, tracking
 from controller.stage.hosts.conductor import Skew
+from controller.stage.hosts.remote import Remote, key
+from controller.stage.hosts.screen import Screen
+from controller.stage.link.membership import membership
+from controller.stage.link.session import house_link, member_link
 from controller.stage.link.transfer import PART_BYTES, Arrivals, Offer
 from hal.deadline import in_seconds
 from hal.errors import CodedError, DeviceError
 from plugins.display.player import PlayerDisplay
 from tests.campaigns.in_step import compared
+from tests.controller.kiosk.install.test_update import KEY, debian_package
 from tests.controller.play.conftest import write_noise
 from tests.controller.play.wire import Frames, Wire, noise, same
 from tests.controller.stage.hosts.computers import Computers, running
@@ -140,6 +151,41 @@ def test_a_bundle_that_is_not_trusted_there_never_counts(tmp_path: Path, file: P
     with pytest.raises(CodedError, match="not signed"):
         arrivals.offered(offer)
     assert list((tmp_path / "there").iterdir()) == []
+
+
+# The program of the other computers
+
+
+def test_an_update_is_brought_once_and_one_that_was_taken_back_is_said(tmp_path: Path) -> None:
+    computers, root = Computers(tmp_path, ["left"], None), tmp_path / "root"
+    computers.join()
+    for place in ("opt", "etc/velatura/update-keys", "run/velatura"):
+        (root / place).mkdir(parents=True)
+    write_public_key(root / "etc/velatura/update-keys/house.pub", bytes(KEY.verify_key))
+    system, offered = System(lambda line: None, root=root), root / OFFERED.relative_to("/")
+    own = membership(tmp_path / "keys-left")
+    assert own is not None
+    with house_link(computers.authority, host="127.0.0.1", port=computers.port) as here, member_link(own) as there:
+        remote = Remote(here, "left", "", {}, tmp_path / "update.deb")
+        agent = Agent(there, "left", tmp_path / "bundles", HostClock(), lambda name: Screen(tmp_path, HostClock()))
+        agent.updates = Packages(system, there, key("left", "program"))
+        package = debian_package(tmp_path, "2").rename(tmp_path / "update.deb")
+
+        def reported(so: Callable[[], bool]) -> bool:
+            agent.step()
+            return so()
+
+        eventually(lambda: reported(offered.exists))
+        assert offered.read_bytes() == package.read_bytes()
+        assert status_of_player(system) == {"state": "off"}
+        told = {"name": hashlib.sha256(package.read_bytes()).hexdigest(), "state": "failed", "why": "It is dark."}
+        (root / "opt/velatura.update").write_text(json.dumps(told))
+        offered.unlink()
+        eventually(lambda: reported(lambda: remote.trouble == "Its update was taken back: It is dark."))
+        # Nor does a conductor that starts later offer it.
+        again = Remote(here, "left", "", {}, package)
+        eventually(lambda: reported(lambda: again.trouble != ""))
+        assert not offered.exists()
 
 
 # Clocks
