@@ -21,7 +21,7 @@ import numpy.typing as npt
 from controller.config.defaults import SMOOTHNESS
 from controller.core.arrays import ByteImage, Float64, Mask
 from controller.core.plotting import figure_of, picture_of
-from controller.optics.plan.search import PlacementPlan
+from controller.optics.plan.search import Candidate, PlacementPlan
 from controller.optics.plan.values import Illumination, Placement, PlanGoal, Surface
 
 MEAN: Final = 0.5
@@ -192,6 +192,16 @@ def figures_of(best: PlacementPlan, surface: Surface, goal: PlanGoal) -> dict[st
         "detail_mm_p95": _finite(_weighted(detail, weight, 0.95)),
         **_finest_waves([one.lit for one in best.candidates], [one.useful for one in best.candidates], weight),
         "projectors": [_placed(one.placement) | _alone(one.useful, one.lit, weight) for one in best.candidates],
+    }
+
+
+def camera_figures(cameras: Sequence[Candidate], best: PlacementPlan, surface: Surface) -> dict[str, Any]:
+    """Places of cameras, and which share of what is lit each and all of them see."""
+    lit = surface.area_m2 * np.any([one.useful for one in best.candidates], axis=0)
+    lit /= lit.sum()
+    return {
+        "cameras": [_placed(one.placement) | {"share_seen": float(lit @ one.useful)} for one in cameras],
+        "share_seen": float(lit @ np.any([one.useful for one in cameras], axis=0)),
     }
 
 

@@ -59,6 +59,14 @@ class ProjectorsTable(ConfigTable):
     )
 
 
+class CamerasTable(ConfigTable):
+    name: Name = Field(description="the camera's name, 1 to 64 printable characters")
+    count: int = Field(default=1, ge=1, le=8, description="how many such cameras there are, from 1 to 8")
+    width_px: Size = Field(description="the picture's width in pixels, a whole number from 1 to 16384")
+    height_px: Size = Field(description="the picture's height in pixels, a whole number from 1 to 16384")
+    focal_length_px: Positive = Field(description="the focal length in pixels, above 0")
+
+
 class PlacesTable(ConfigTable):
     name: Name = Field(description="the place's name, different for every place")
     position_m: Metres3 = Field(
@@ -82,6 +90,9 @@ class PlanTables(ConfigTable):
     projectors: Annotated[tuple[ProjectorsTable, ...], Field(strict=False, min_length=1, max_length=16)] = Field(
         description="a list of [[projectors]] tables, one for each model"
     )
+    cameras: Annotated[tuple[CamerasTable, ...], Field(strict=False, max_length=8)] = Field(
+        default=(), description="a list of [[cameras]] tables; optional"
+    )
     places: Annotated[tuple[PlacesTable, ...], Field(strict=False, max_length=MOST_POINTS)] = Field(
         default=(), description="a list of [[places]] tables with name and position_m"
     )
@@ -99,6 +110,14 @@ class PlanTables(ConfigTable):
             for table in tables
             for _ in range(table.count)
         ]  # fmt: skip
+
+    def camera_models(self) -> list[ProjectorModel]:
+        """One for each camera, which sees what a projector would light."""
+        return [
+            ProjectorModel(table.name, (table.width_px, table.height_px), 1.0, (throw, throw), (0.0, 0.0), 0.0, 0.0)
+            for table in self.cameras
+            for throw in [table.focal_length_px / table.width_px] * table.count
+        ]
 
     def mounting_points(self) -> list[MountingPoint]:
         """Every place, those of the shell named by their angles and distance."""
@@ -178,6 +197,14 @@ lumens = 3000.0
 throw_ratio = [1.6, 2.0]
 lens_shift = [0.0, 0.55]
 pupil_mm = 15.0
+
+# Placed last, where they see most of the light; leave them out if yours have their places.
+[[cameras]]
+name = "camera"
+count = 2
+width_px = 3888
+height_px = 2592
+focal_length_px = 5200.0
 
 # Places that there are, by name ...
 [[places]]

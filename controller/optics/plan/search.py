@@ -273,6 +273,41 @@ def _exchanged(
     return picked, tried
 
 
+CAMERA_BODY_M: Final = 0.1
+"""A camera's radius."""
+
+
+def choose_cameras(
+    models: Sequence[ProjectorModel], mounting_points: Sequence[MountingPoint], scene: PlanScene, goal: PlanGoal,
+    projectors: Sequence[Candidate],
+) -> tuple[Candidate, ...]:  # fmt: skip
+    """Places of cameras, one for each model, that see most of what ``projectors`` light, and see it from in front.
+
+    They stand in no light. Raises UsageError("plan-no-place", "plan-too-crowded").
+    """
+    surface, narrow = scene.surface, goal.model_copy(update={"body_m": CAMERA_BODY_M})
+    lit = surface.area_m2 * np.any([one.useful for one in projectors], axis=0)
+    lenses = np.stack([one.placement.position_m for one in projectors])
+    picked: list[Candidate] = []
+    best = np.zeros(len(lit))
+    for group in candidates_of(models, mounting_points, scene, narrow):
+        seen = np.stack([np.where(one.useful, one.lit.cosine, 0.0) for one in group])
+        for k in np.argsort(-np.maximum(seen, best) @ lit, kind="stable"):
+            at = group[k].placement.position_m
+            apart_m = [np.linalg.norm(at - one.placement.position_m) for one in (*projectors, *picked)]
+            if min(apart_m) >= goal.apart_m and not in_the_way(at, lenses, surface, CAMERA_BODY_M):
+                picked.append(group[k])
+                best = np.maximum(best, seen[k])
+                break
+        else:
+            raise UsageError(
+                "plan-too-crowded",
+                what="There is no room for all cameras: they stand too near the projectors or in their light.",
+                remedy="Add positions, or use a smaller [goal] apart_m.",
+            )
+    return tuple(picked)
+
+
 class _Fits:
     """Whether candidates can stand beside each other; what was found is kept."""
 

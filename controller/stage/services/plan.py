@@ -13,10 +13,10 @@ import numpy as np
 from controller.core.arrays import Float64
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
-from controller.optics.plan.figures import combined_light, figures_of, layout, value_map
+from controller.optics.plan.figures import camera_figures, combined_light, figures_of, layout, value_map
 from controller.optics.plan.optics import lit_by
 from controller.optics.plan.plan_file import EXAMPLE, PlanTables, read_plan
-from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_placements
+from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_cameras, choose_placements
 from controller.optics.plan.target_object import AudienceView, TargetObject, read_target_object, sampled, seen_from
 from controller.optics.plan.values import Placement, PlanGoal, Surface
 from controller.run.progress import Reporter, Tracker
@@ -66,6 +66,8 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
     tracker.end()
     tracker.begin(3)
     figures = figures_of(best, surface, goal)
+    if models := tables.camera_models():
+        figures |= camera_figures(choose_cameras(models, places, scene, goal, best.candidates), best, surface)
     out.mkdir(parents=True, exist_ok=True)
     page = _page(tables, len(places), target_object, best, surface, audience, figures)
     write_atomically(out / MACHINE, (json.dumps(figures, indent=2, allow_nan=False) + "\n").encode())
@@ -117,6 +119,8 @@ def _goals(figures: Mapping[str, Any], goal: PlanGoal) -> list[Goal]:
               f"{goal.detail_mm:g} mm; the median is {'-' if detail is None else format(detail, '.2f')} mm"),
         share("Overlap", "share_overlapped", f"{goal.overlap} projectors at each point"),
         share("Covered", "share_reached", "by at least one projector"),
+        *([Goal("Seen", f"{100 * figures['share_seen']:.0f} % of what is lit", "by at least one camera")]
+          if "cameras" in figures else []),
     ]  # fmt: skip
 
 
@@ -131,6 +135,12 @@ def _stands(figures: Mapping[str, Any]) -> dict[str, str]:
             f"tilt {one['tilt_up_degrees']:+.1f}°, throw {one['throw_ratio']:.2f}, focus at {one['focus_m']:.2f} m. "
             f"Reaches {100 * one['share_reached']:.0f} %, {one['lux_median']:.0f} lx, {detail}; "
             f"{100 * (one['grazing_loss_mean'] or 0):.0f} % lost by oblique incidence."
+        )
+    for number, one in enumerate(figures.get("cameras", ()), start=1):
+        x, y, z = one["position_m"]
+        stands[f"Camera {number}: {one['model']}"] = (
+            f"{one['place']} (x {x:.2f}, y {y:.2f}, z {z:.2f} m); turn {one['pan_degrees']:+.1f}°, "
+            f"tilt {one['tilt_up_degrees']:+.1f}°. Sees {100 * one['share_seen']:.0f} % of what is lit."
         )
     one, every = figures["wave_mm_one"], figures["wave_mm_all"]
     if one is not None:

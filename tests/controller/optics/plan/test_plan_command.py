@@ -40,7 +40,9 @@ def test_the_example_with_a_mesh_becomes_a_page_and_figures(tmp_path: Path, ball
     assert "nothing is superimposed" not in page
     assert not re.search(r"https?:|<script|<link", page)
     assert page.count("data:image/") == 1 + 5
-    assert all(one["place"] in page for one in figures["projectors"])
+    assert all(one["place"] in page for one in (*figures["projectors"], *figures["cameras"]))
+    assert len(figures["cameras"]) == 2
+    assert f"{100 * figures['share_seen']:.0f} % of what is lit" in page
 
 
 @pytest.mark.filterwarnings("error")
@@ -49,6 +51,7 @@ def test_a_sheet_that_one_place_of_the_audience_sees_edge_on_is_planned_and_that
     file = tmp_path / "plan.toml"
     write_example(file)
     text = re.sub(r"positions_m = .*", "positions_m = [[0.0, 0.0, -1.5], [0.5, -0.2, -1.4]]", file.read_text())
+    text = re.sub(r"(?s)\[\[cameras\]\].*(?=# Places that)", "", text)
     one_shelf = re.sub(r"(?s)\[shell\].*(?=\[goal\])", "", text.replace("count = 3", "count = 1"))
     one_shelf = re.sub(r"position_m = .*", "position_m = [0.6, -1.0, -1.2]", one_shelf)  # beside the sheet's plane
     file.write_text(one_shelf + "points = 100\n")
