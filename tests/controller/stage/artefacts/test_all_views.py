@@ -20,7 +20,7 @@ from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views, share_above
-from controller.stage.artefacts.projectors import Light
+from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.artefacts.solved import SolvedBase, is_solved, read_solved
 from controller.stage.artefacts.views import view_folder, write_view
 from controller.stage.report.galleries import views_gallery
@@ -122,6 +122,42 @@ def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_pa
         assert np.median(off) < 0.06 * np.median(solved.target[solved.reachable])
     again = all_views(tmp_path, names)
     np.testing.assert_allclose(again.base.image, calibrated.base.image)
+
+
+def solved_grey(calibrated: Calibrated, names: list[str]) -> list[float]:
+    """By how much each view's light is off from an even target, relative."""
+    shapes = [view.part(calibrated.transport.object_mask).shape for view in calibrated.views()]
+    grey = Target(
+        calibrated.joined([np.full((*shape, 3), 0.4, np.float32) for shape in shapes]),
+        calibrated.joined([np.ones(shape, np.bool_) for shape in shapes]),
+    )
+    with Journal(calibrated.folder) as journal:
+        request = AppearanceRequest("grey", "Grey", lambda: grey, {})
+        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+        Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
+    off = []
+    for folder in calibrated.folders:
+        solved, own = read_solved(folder, "grey", names), Calibrated(folder, names)
+        light = own.predicted_light([solved.linear[name] for name in names]) + own.calibration.black
+        wanted = solved.target[solved.reachable]
+        off.append(float(np.median(np.abs(light[solved.reachable] - wanted)) / np.median(wanted)))
+    return off
+
+
+def test_a_camera_that_makes_jpeg_files_only_spoils_no_view_of_one_with_raw_files(tmp_path: Path) -> None:
+    names, raw = two_views(tmp_path / "raw")
+    of_raw = solved_grey(raw, names)
+    names, mixed = two_views(tmp_path / "mixed")
+    right = view_folder(tmp_path / "mixed", "right")
+    for name in names:
+        # each of its pixels has three colours, in steps of 8 bits
+        pixels, light = Pixels.read(right, name), Light.read(right, name)
+        dataclasses.replace(pixels, mosaic=np.zeros((0, 0), np.int64)).write(right, name)
+        levels = np.rint(255 * np.sqrt(light.white / light.white.max())) / 255
+        dataclasses.replace(light, white=(levels**2 * light.white.max()).astype(np.float32)).write(right, name)
+    alone, together = solved_grey(Calibrated(right, names), names), solved_grey(mixed, names)
+    assert together[0] < 1.02 * of_raw[0]
+    assert together[1] < 1.1 * alone[0]
 
 
 def test_where_views_ask_for_different_colours_is_told_and_kept(tmp_path: Path) -> None:
