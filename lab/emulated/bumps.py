@@ -14,9 +14,11 @@ white_segment = 0.25    # its colour wheel has a white segment, see ``truth``
 misconverged_px = 0.5   # its red lies that many pixels to the right, its blue as many below
 flicker = 0.02          # spread of its light in short exposures
 shadow = 0.15           # a visitor stands in that share of its picture's width
+dent = 0.15             # its medium levels lack that share of their light
 
-More for the others: ``noise`` times all noise of the camera, ``gloss`` of the object, ``factor`` times the ambient
-light and ``indirect`` for the share of all light that comes back from object and room (see ``truth``).
+More for the others: ``noise`` times all noise of the camera, ``blur_px`` more blur of its lens, ``gloss`` and ``metal``
+of the object, ``factor`` times the ambient light and ``indirect`` for the share of all light that comes back from
+object and room (see ``truth``).
 
 The file holds everything that is otherwise than in ``bench.toml``; without it, all is as it was set up.
 """
@@ -63,10 +65,10 @@ class Bump:
     ``shift_px``: where a point of the object lies in the device's image, the image's middle exactly, moves by that;
     ``turn_deg``, ``move_mm``: about and along the device's own axes, the object's are the world's; ``dim``,
     ``dim_channels``: shares of a projector's light that are lost; ``defocus_mm``: how much farther away its focus lies;
-    ``gamma``: factor of its response's exponents; ``white_segment``, ``flicker``, ``shadow``: as in ``truth``;
+    ``gamma``: factor of its response's exponents; ``white_segment``, ``flicker``, ``shadow``, ``dent``: see ``truth``;
     ``misconverged_px``: how far its red is shifted to the right and its blue down; ``noise``: factor of all noise of
-    the camera; ``factor``: of the ambient light; ``indirect``, ``gloss``: as in ``truth``, of the stage where ``what``
-    is "ambient", and of the "object".
+    the camera, ``blur_px``: standard deviation added to its lens'; ``factor``: of the ambient light; ``indirect``,
+    ``gloss``, ``metal``: as in ``truth``, of the stage where ``what`` is "ambient", and of the "object".
     """
 
     what: str
@@ -86,6 +88,9 @@ class Bump:
     misconverged_px: Annotated[float, Between(-3.0, 3.0)] = 0.0
     flicker: Annotated[float, Between(0.0, 0.3)] = 0.0
     shadow: Annotated[float, Between(0.0, 1.0)] = 0.0
+    dent: Annotated[float, Between(0.0, 0.2)] = 0.0
+    metal: Annotated[float, Between(0.0, 1.0)] = 0.0
+    blur_px: Annotated[float, Between(0.0, 9.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,10 +175,17 @@ def _bumped(truth: BenchTruth, bump: Bump) -> BenchTruth:
     if bump.what == "camera":
         camera = truth.camera
         sensor = dataclasses.replace(camera.sensor, noise=camera.sensor.noise * bump.noise)
-        camera = dataclasses.replace(camera, pose=_device(camera.pose, camera.lens, bump), sensor=sensor)
+        camera = dataclasses.replace(
+            camera,
+            pose=_device(camera.pose, camera.lens, bump),
+            sensor=sensor,
+            psf_sigma_px=float(np.hypot(camera.psf_sigma_px, bump.blur_px)),
+        )
         return dataclasses.replace(truth, camera=camera)
     if bump.what == "object":
-        glossy = dataclasses.replace(truth.object, gloss=truth.object.gloss + bump.gloss)
+        glossy = dataclasses.replace(
+            truth.object, gloss=truth.object.gloss + bump.gloss, metal=max(truth.object.metal, bump.metal)
+        )
         moved = _object_moved(truth, bump) if any((*bump.turn_deg, *bump.move_mm)) else truth
         return dataclasses.replace(moved, object=glossy)
     projectors = tuple(_projector(one, bump) if one.name == bump.name else one for one in truth.projectors)
@@ -191,6 +203,7 @@ def _projector(projector: ProjectorTruth, bump: Bump) -> ProjectorTruth:
         gamma=three(bump.gamma * np.asarray(light.gamma)),
         white_segment=light.white_segment + bump.white_segment,
         shadow=max(light.shadow, bump.shadow),
+        dent=max(light.dent, bump.dent),
     )
     focus = dataclasses.replace(
         projector.focus, distance_m=max(0.01, projector.focus.distance_m + 1e-3 * bump.defocus_mm)

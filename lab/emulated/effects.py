@@ -1,5 +1,5 @@
-"""What real devices do beyond those of a demo: flaws of sensors, depth of field, dithered panels, varnish; the room
-``hard``.
+"""What real devices do beyond those of a demo: flaws of sensors, depth of field, dithered panels, varnish, polished
+metal; the room ``hard``.
 
 ``plugins.emulated.optics`` asks for this module where a stage has such effects (``plugins.emulated.core.extensions``);
 ``Spread``, ``colours`` and ``xyz_to_camera`` are part of it.
@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from lab.emulated.spectra import colours, xyz_to_camera
 from lab.emulated.subsurface import Spread
 from plugins.emulated.core.truth import BenchTruth, CameraTruth, Dithering, Panels, ProjectorTruth, Subsurface
 from plugins.emulated.optics.effects import SensorFlaws
-from plugins.emulated.optics.objects import StageObject
+from plugins.emulated.optics.objects import Scene, StageObject
 from plugins.emulated.optics.shapes import dot
 
 FILTERS_NM: Final = ((600.0, 38.0), (535.0, 38.0), (460.0, 28.0))
@@ -37,6 +37,8 @@ LARGEST_PX: Final = 24.0
 STEP: Final = 1.25
 """Between the blurs of two layers; a pixel's light is divided between the two that are next to its own."""
 SMALLEST_PX: Final = 0.3
+CLEAR_M: Final = 1e-4
+"""So far above metal mirrored rays start."""
 
 
 def sensor_flaws(camera: CameraTruth, seed: int) -> SensorFlaws | None:
@@ -170,6 +172,39 @@ def _unshadowed(cosine: Floats, square: float) -> Floats:
     return np.asarray(2.0 * cosine / (cosine + np.sqrt(square + (1.0 - square) * cosine**2)))
 
 
+class Mirrors:
+    """A scene for rays of the camera that continue from polished metal, and so see in it what is around.
+
+    ``share``: of the object's height, from its top, that is metal. What it throws on other surfaces is left out.
+    """
+
+    def __init__(self, scene: Any, things: Scene, share: float) -> None:
+        self._scene, self._things = scene, things
+        faces = things.faces[: things.object_faces]
+        heights = things.vertices[np.unique(faces), 1]
+        self._until_m = float(heights.min() + share * np.ptp(heights))
+
+    def run(self, origins: FloatImage, rays: FloatImage, **how: Any) -> Any:
+        """As the scene; where it is asked for more than faces, with ``ray``: the direction that met them."""
+        hits = self._scene.run(origins, rays, **how)
+        if "output" not in how:
+            return hits
+        faces, things = np.maximum(hits["primID"], 0), self._things
+        weights = np.stack((1.0 - hits["u"] - hits["v"], hits["u"], hits["v"]), axis=-1)
+        points = np.einsum("nk,nkc->nc", weights, things.vertices[things.faces[faces]])
+        normals = np.einsum("nk,nkc->nc", weights, things.normals[faces])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+        metal = (hits["primID"] >= 0) & (faces < things.object_faces) & (points[:, 1] < self._until_m)
+        cosine = dot(rays[metal], normals[metal])[:, None]
+        seen = rays.copy()
+        seen[metal] -= 2.0 * cosine * normals[metal]
+        above = points[metal] - CLEAR_M * np.sign(cosine) * normals[metal]
+        again = self._scene.run(above.astype(np.float32), seen[metal], **how)
+        for key, values in again.items():
+            hits[key][metal] = values
+        return {**hits, "ray": seen.astype(np.float64)}
+
+
 def hard(truth: BenchTruth, thing: StageObject) -> BenchTruth:
     """A stage in the room ``room``, with all the rest as strong as with real devices."""
     rng = np.random.default_rng([truth.seed, 8])
@@ -193,6 +228,6 @@ def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> Proj
 
 
 __all__ = (
-    "Spread", "colours", "confusion_px", "defocused", "exposed_s", "fresnel", "hard", "mean_light", "reflected",
-    "seen_of_turns", "sensor_flaws", "xyz_to_camera",
+    "Mirrors", "Spread", "colours", "confusion_px", "defocused", "exposed_s", "fresnel", "hard", "mean_light",
+    "reflected", "seen_of_turns", "sensor_flaws", "xyz_to_camera",
 )  # fmt: skip

@@ -187,7 +187,8 @@ class LightTruth:
     ``gamma``, ``s_curve``: response per channel, see ``render.response``; ``black_level``: share of white at value 0;
     ``glare``: share of the light that the lens spreads over the whole picture; ``white_segment``: of a colour wheel,
     which adds so many times the least of the three channels to each of them, so that colours do not add up to white;
-    ``shadow``: share of the picture's width, from its left, in which a visitor's body keeps the light;
+    ``shadow``: share of the picture's width, from its left, in which a visitor's body keeps the light; ``dent``: share
+    of the light that its medium levels lack (``render.DENT``);
     ``bands_nm``: the light of its channels by wavelength, where the camera has bands, too: white light then has the
     colour of ``mixing``, the rest of which does not count
     """
@@ -203,6 +204,7 @@ class LightTruth:
     glare: Annotated[float, Between(0.0, 0.5)] = 0.0
     white_segment: Annotated[float, Between(0.0, 2.0)] = 0.0
     shadow: Annotated[float, Between(0.0, 1.0)] = 0.0
+    dent: Annotated[float, Between(0.0, 0.2)] = 0.0
     bands_nm: Annotated[Bands, Between(0.0, 2000.0)] = NO_BANDS
 
 
@@ -271,7 +273,7 @@ class ObjectTruth:
 
     ``gloss``: strength of its highlights (Blinn and Phong, normalised): light added where the surface mirrors a lens
     into the camera, relative to a perfect white; ``gloss_exponent``: how small they are. ``varnish`` and
-    ``subsurface``: see ``effects``
+    ``subsurface``: see ``effects``; ``metal``: share of its height, from its top, that is polished like a mirror
     """
 
     kind: str
@@ -281,6 +283,7 @@ class ObjectTruth:
     gloss_exponent: Annotated[float, Between(1.0, 1e4)] = 60.0
     varnish: Varnish = BARE
     subsurface: Subsurface = OPAQUE
+    metal: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,6 +88,8 @@ def cast(truth: BenchTruth, stage_object: StageObject, progress: Progress) -> Sa
     things = scene_of(stage_object, truth.surfaces)
     scene = rtcore_scene.EmbreeScene(robust=True)
     TriangleMesh(scene, things.vertices, things.faces)
+    if truth.object.metal > 0.0:
+        scene = rare("The metal of bench.toml").Mirrors(scene, things, truth.object.metal)
     width, height = truth.camera.lens.size_px
     rows = max(1, RAYS_AT_ONCE // (width * truth.subsamples**2))
     spans = [(first, min(first + rows, height)) for first in range(0, height, rows)]
@@ -149,7 +151,7 @@ def _cast_rows(truth: BenchTruth, things: Scene, scene: Any, first: int, last: i
     hits = scene.run(origin, ray.astype(np.float32), output=1)
     hit = hits["primID"] >= 0
     counts = hit.reshape(-1, s * s).sum(axis=1)
-    ray, faces = ray[hit], hits["primID"][hit]
+    ray, faces = hits.get("ray", ray)[hit], hits["primID"][hit]
     weights = np.stack((1.0 - hits["u"][hit] - hits["v"][hit], hits["u"][hit], hits["v"][hit]), axis=-1)
     points = np.einsum("nk,nkc->nc", weights.astype(np.float64), things.vertices[things.faces[faces]])
     normals = np.einsum("nk,nkc->nc", weights, things.normals[faces]).astype(np.float64)
@@ -269,7 +271,7 @@ def key_of(truth: BenchTruth, stage_object: StageObject) -> str:
     for part in (truth.camera.pose, truth.camera.lens, *projectors):
         digest.update(dump(part).encode())
     digest.update(f"{truth.subsamples} {truth.object.gloss} {truth.object.gloss_exponent}".encode())
-    digest.update(f"{dump(truth.object.varnish)} {_needs_points(truth)}".encode())
+    digest.update(f"{dump(truth.object.varnish)} {truth.object.metal} {_needs_points(truth)}".encode())
     for array in scene.fingerprint():
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

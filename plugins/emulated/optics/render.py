@@ -29,6 +29,8 @@ LAYERS_BYTES: Final = 1 << 30
 """Of all projectors; at least one layer of each is kept."""
 SHADOW_EDGE: Final = 0.04
 """Width of a shadow's soft edge, in picture widths: who stands near the lens is far out of its focus."""
+DENT: Final = (0.55, 0.06)
+"""Middle and width of a dent, as shares of the device values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +48,12 @@ ALWAYS: Final = Shutter()
 def response(light: LightTruth) -> npt.NDArray[np.float64]:
     """Linear light (256, 3) of each device value before black level and mixing: 0 at 0, 1 at 255, rising.
 
-    A power law u = v^gamma, bent into a mild S by u + s u (1 - u) (2 u - 1).
+    A power law u = v^gamma, bent into a mild S by u + s u (1 - u) (2 u - 1), less a dent.
     """
-    power = (np.arange(256) / 255.0)[:, None] ** np.asarray(light.gamma)
-    return np.asarray(power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0))
+    values = (np.arange(256) / 255.0)[:, None]
+    power = values ** np.asarray(light.gamma)
+    bent = power + np.asarray(light.s_curve) * power * (1.0 - power) * (2.0 * power - 1.0)
+    return np.asarray(bent * (1.0 - light.dent * np.exp(-(((values - DENT[0]) / DENT[1]) ** 2))))
 
 
 def channels(

@@ -58,7 +58,8 @@ def unsteady(name: str, flicker: float, sigma: float = 0.0) -> str | None:
     return (
         f"The light of projector {name} is not steady: it differs by {100 * flicker:.1f} % (standard deviation) from "
         "one photograph to the next. Patterns are corrected for that; white images and brightness stay uncertain by as "
-        "much. Let the lamp warm up longer, switch its automatic and dynamic lamp modes off, and calibrate again."
+        "much. Let the lamp warm up longer, switch its automatic and dynamic lamp modes off, and calibrate again. If "
+        "it stays, choose another picture mode: one that bends the response looks alike."
     )
 
 

@@ -29,8 +29,9 @@ WORDS: Final[dict[ErrorCause, tuple[str, str, str]]] = {
         "a shiny, very dark or barely lit surface; make it matt, or add light from another side",
     ),
     ErrorCause.EDGE: (
-        "edge of two surfaces", "camera pixels see two surfaces at once at a depth edge",
-        "usually no action is needed; move the projector or the camera if such lines disturb",
+        "edge of two surfaces", "camera pixels see two surfaces at once, at a depth edge or in a mirror",
+        "make polished metal matt; at edges usually no action is needed: move the projector or the camera if such "
+        "lines disturb",
     ),
     ErrorCause.MOVED: ("moved", "the pattern lies elsewhere than predicted", "something moved: run `velatura drift`"),
     ErrorCause.DIMMED: (
