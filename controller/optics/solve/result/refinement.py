@@ -374,10 +374,13 @@ def solve_again(
 ) -> tuple[FloatImage, ...]:
     """Frames for ``aimed`` from the present ones, ``settings.start``, in full, weighted for the appearance ``target``.
 
-    Raises as ``solve_bounded``.
+    What no camera sees stays as it is. Raises as ``solve_bounded``.
     """
+    transport, before = light.transport, settings.start or ()
     wanted = target_radiance(target, light.black, 1.0)
     possible = feasibility(light.levels(), target, light.black)
     weights = appearance_weights(wanted, possible.reachable, exposure)
     radiance = target_radiance(aimed, light.black, 1.0)
-    return solve_bounded(light.transport, radiance, light.black, replace(settings, weights=weights), context).frames
+    frames = solve_bounded(transport, radiance, light.black, replace(settings, weights=weights), context).frames
+    seen = [transport.per_weight[transport.span(n)].reshape(*size, 1) > 0 for n, size in enumerate(transport.sizes)]
+    return tuple(np.where(*one) for one in zip(seen, frames, before, strict=True))

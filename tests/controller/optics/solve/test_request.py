@@ -10,10 +10,11 @@ import pytest
 from controller.core.arrays import FloatImage
 from controller.optics.solve import request
 from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
-from controller.optics.solve.bounded.engine import IterationControl, Processor, SolveContext, corrected
+from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext, corrected
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, Solution, SolveInput, SolveSettings
 from controller.optics.solve.request import SolveOptions, solve_appearance
 from controller.optics.solve.result.metrics import colour_difference
+from controller.optics.solve.result.refinement import solve_again
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
 from controller.optics.transport.indirect.indirect_light import IndirectLight
@@ -210,3 +211,9 @@ def test_what_no_camera_sees_continues_what_is_seen_beside_it() -> None:
         seen = (light.transport.per_weight[light.transport.span(n)] > 0).reshape(other.shape[:2])
         np.testing.assert_array_equal(one[seen], other[seen])
         assert not one[0, 0].any(), "what is open to the border may light anything"
+    settings = SolveSettings(OPTIONS.smoothness, start=smooth)
+    grey = np.full((120, 160, 3), 0.2, np.float32)
+    again = solve_again(light, grey, grey, settings, ALONE, exposure=1.0)
+    for one, before in zip(again, smooth, strict=True):
+        np.testing.assert_array_equal(one[gap], before[gap])
+        assert np.abs(one - before).max() > 0.05, "the rest was solved"
