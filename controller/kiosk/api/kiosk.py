@@ -125,7 +125,10 @@ class StageKiosk(AttachedKiosk):
     def reach(self, target: Path) -> Reach:
         from controller.kiosk.preview.reach import reach
 
-        return reach(self.service.checked, target)
+        service = self.service
+        if service.jobs.running is None:
+            self._previews.begin(service.checked, target)
+        return reach(service.checked, target)
 
     def computed(self, target: Path) -> Computed:
         service = self.service

@@ -38,21 +38,29 @@ class ComputedPreviews:
         self._stage = ""
         self._idle: threading.Timer | None = None
 
+    def begin(self, checked: Checked, target: Path) -> None:
+        """Let the process read the calibration for ``target`` already, unless it solves, or its result is kept."""
+        run = finished_calibration(checked.stage.folder)
+        if _kept(*kept_at(checked, run, target)) is None and self._one_at_a_time.acquire(blocking=False):
+            try:
+                self._ready(_stage_line(checked, run))
+                self._rest()
+            finally:
+                self._one_at_a_time.release()
+
     def of(self, checked: Checked, target: Path) -> Computed:
         """Solve ``target`` (PNG or EXR); kept until target, calibration or settings change.
 
         Seconds, more at the first target. Raises UsageError("not-calibrated", "target-unreadable"),
         WorkError("memory-too-small", "preview-ended", "preview-slow"), and what ``choose_engine`` raises.
         """
-        table = checked.stage.tables.solve
         run = finished_calibration(checked.stage.folder)
         folder, about = kept_at(checked, run, target)
         with self._one_at_a_time:
             if (known := _kept(folder, about)) is not None:
                 return known
             folder.mkdir(parents=True, exist_ok=True)
-            stage = json.dumps({"run": str(run), "names": checked.names, "solve": table.model_dump(mode="json")})
-            found = self._asked(stage, {"target": str(target), "picture": str(folder / PICTURE)})
+            found = self._asked(_stage_line(checked, run), {"target": str(target), "picture": str(folder / PICTURE)})
             write_atomically(folder / FIGURES, json.dumps({"of": about, "figures": found}).encode())
             return _read(found, folder)
 
@@ -131,6 +139,11 @@ class ComputedPreviews:
             self._idle = threading.Timer(IDLE_S, self.end)
             self._idle.daemon = True
             self._idle.start()
+
+
+def _stage_line(checked: Checked, run: Path) -> str:
+    solve = checked.stage.tables.solve.model_dump(mode="json")
+    return json.dumps({"run": str(run), "names": checked.names, "solve": solve})
 
 
 def _ended() -> WorkError:

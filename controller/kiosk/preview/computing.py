@@ -7,6 +7,7 @@ in the middle of a solve.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -63,7 +64,7 @@ class Task:
 
 
 class Solver:
-    """A calibration, read at the first target and kept. Raises what ``choose_engine`` raises.
+    """A calibration, read and kept. Raises what ``choose_engine`` and ``check_memory`` raise.
 
     Also where appearances are solved by regions, previews are not: both come near the same optimum, regions in minutes.
     """
@@ -73,16 +74,18 @@ class Solver:
         self._engine = choose_engine(table.device, lambda note: None)
         self._options = options_of(table)
         self._calibrated = Calibrated(Path(stage.run), stage.names, self._engine)
-        self._begun = False
+        check_memory(solve_peak_bytes(stage_size(self._calibrated.calibration)), free_bytes())
+        if self._options.mode == "scale":
+            self._calibrated.keep_base(solved_base(self._calibrated, self._options))
+        self._light = self._calibrated.light
 
     def answer(self, task: Task) -> dict[str, Any]:
-        """Solve a target and draw the result. Raises as ``solve_appearance``, ``load_target`` and ``check_memory``."""
+        """Solve a target and draw the result. Raises as ``solve_appearance`` and ``load_target``."""
         began_s = time.perf_counter()
-        self._begin()
         calibrated = self._calibrated
         calibration = calibrated.calibration
         made = solve_appearance(
-            calibrated.light,
+            self._light,
             calibrated.base if self._options.mode == "scale" else None,
             self._target(Path(task.target)),
             self._options,
@@ -94,13 +97,6 @@ class Solver:
             "seconds": time.perf_counter() - began_s,
             "device": self._engine.worked,
         }
-
-    def _begin(self) -> None:
-        if not self._begun:
-            check_memory(solve_peak_bytes(stage_size(self._calibrated.calibration)), free_bytes())
-            if self._options.mode == "scale":
-                self._calibrated.keep_base(solved_base(self._calibrated, self._options))
-            self._begun = True
 
     def _target(self, file: Path) -> Target:
         rows, columns = self._calibrated.transport.camera_shape
@@ -156,13 +152,16 @@ def _failed(error: VelaturaError) -> dict[str, Any]:
 
 
 def serve(source: TextIO, out: TextIO) -> None:
-    """Answer tasks, one after the other."""
+    """Answer tasks, one after the other; the calibration is read before the first one comes."""
     lines = _lines(source)
-    stage = next(lines)
+    given = next(lines)
+    stage = Stage(given["run"], tuple(given["names"]), given["solve"])
     solver: Solver | None = None
+    with contextlib.suppress(Exception):  # the answer to a task reports it
+        solver = Solver(stage)
     for line in lines:
         try:
-            solver = solver or Solver(Stage(stage["run"], tuple(stage["names"]), stage["solve"]))
+            solver = solver or Solver(stage)
             answer = solver.answer(Task(**line))
         except VelaturaError as error:
             answer = _failed(error)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,3 +37,25 @@ def test_an_error_of_the_other_process_keeps_its_code_and_its_sentences(
         assert caught.value.code == code
     finally:
         previews.end()
+
+
+def test_the_process_that_has_begun_to_read_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[subprocess.Popen[str]] = []
+
+    def counted(*args: Any, **options: Any) -> subprocess.Popen[str]:
+        begun.append(start(*args, **options))
+        return begun[-1]
+
+    start = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", counted)
+    stage = a_stage(tmp_path / "stage", "cpu")
+    checked, target, previews = check_stage(stage), stage / "target.png", ComputedPreviews()
+    try:
+        previews.begin(checked, target)
+        assert len(begun) == 1
+        with pytest.raises(VelaturaError, match="array"):
+            previews.of(checked, target)
+        assert len(begun) == 1
+    finally:
+        previews.end()
+    assert begun[0].returncode is not None
