@@ -63,6 +63,10 @@ _PREINST: Final = f"""#!/bin/sh
 set -e
 # The program that an update has put there is of another package: none of its files may stay among those of this one.
 if [ "$1" = upgrade ] && [ -e /{PREFIX}/.update ]; then rm -rf /{PREFIX}/lib /{PREFIX}/.update; fi
+[ ! -d /run/systemd/system ] || systemctl stop velatura-update.service 2> /dev/null || true
+if [ -e /{PREFIX}.trial ]; then
+  sed -i 's/"state": "trial", "why": ""/"state": "failed", "why": "Another version was installed."/' /{PREFIX}.update
+fi
 rm -f /{PREFIX}.package /{PREFIX}.trial /var/lib/velatura/stage/keys/players/update.deb
 """
 _PRERM: Final = f"""#!/bin/sh

@@ -82,6 +82,13 @@ def back_to(kiosk: Kiosk, name: str) -> None:
     assert not machine.at(PACKAGE).exists()
 
 
+def on_trial(kiosk: Kiosk, folder: Path) -> None:
+    """Exchange the program with one that seems to be installed well, and never answers."""
+    restarting = "{ systemctl restart velatura-player velatura-controller; exit 0; }"
+    name = offer(kiosk, broken(folder / "no", restarting))
+    kiosk.machine.wait_for(lambda: program(kiosk) == name)
+
+
 def test_an_update_proves_itself_and_the_picture_stays(playing: Kiosk) -> None:
     machine, before = playing.machine, kept(playing)
     with machine.watched() as seen:
@@ -123,16 +130,15 @@ def test_a_version_with_which_the_kiosk_never_answers_is_taken_back_after_some_p
     playing: Kiosk, tmp_path: Path
 ) -> None:
     machine, before, former = playing.machine, kept(playing), program(playing)
-    name = offer(
-        playing, broken(tmp_path / "no", "exec systemctl restart --no-block velatura-player velatura-controller")
-    )
-    machine.wait_for(lambda: program(playing) == name)
+    on_trial(playing, tmp_path)
     for starts in ("1", "2", "3"):
         machine.wait_for(lambda starts=starts: machine.at(STARTS).read_text() == starts)  # type: ignore[misc]
         # Once it waits: a program that ends because systemd ends is a failure only here, where the machine lives on.
         machine.wait_for(lambda: not any("kiosk install" in line for line in running(playing)))
         machine.cut_off()
         machine.switch_on()
+    machine.wait_for(lambda: not machine.at(TRIAL).exists())
+    machine.call("systemctl", "restart", "bench")  # the folder of its program is another one now
     back_to(playing, former)
     assert "started 3 times" in told(playing)["why"]
     assert lost(playing, before) == []
@@ -154,3 +160,14 @@ def test_another_version_is_installed_while_it_plays_and_taken_back(playing: Kio
         assert shown != ["black"]
         assert lost(playing, before) == []
         assert {machine.restarts(name) for name in SERVICES[1:]} == {0}
+
+
+def test_a_version_on_trial_gives_way_to_a_package_and_blocks_no_other(playing: Kiosk, tmp_path: Path) -> None:
+    machine = playing.machine
+    on_trial(playing, tmp_path)
+    machine.install(playing.packages[0])
+    machine.wait_for(playing.shows)
+    machine.wait_for(lambda: playing.state == "playing")
+    assert (told(playing)["state"], told(playing)["why"]) == ("failed", "Another version was installed.")
+    assert program(playing) == ""
+    assert not any("--carry-out" in line for line in running(playing))
