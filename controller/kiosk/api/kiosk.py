@@ -125,10 +125,9 @@ class StageKiosk(AttachedKiosk):
     def reach(self, target: Path) -> Reach:
         from controller.kiosk.preview.reach import reach
 
-        service = self.service
-        if service.jobs.running is None:
-            self._previews.begin(service.checked, target)
-        return reach(service.checked, target)
+        if self.service.jobs.running is None:
+            self._previews.begin(self.service.checked, target)
+        return reach(self.service.checked, target)
 
     def computed(self, target: Path) -> Computed:
         service = self.service

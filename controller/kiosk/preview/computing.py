@@ -154,8 +154,7 @@ def _failed(error: VelaturaError) -> dict[str, Any]:
 def serve(source: TextIO, out: TextIO) -> None:
     """Answer tasks, one after the other; the calibration is read before the first one comes."""
     lines = _lines(source)
-    given = next(lines)
-    stage = Stage(given["run"], tuple(given["names"]), given["solve"])
+    stage = Stage(**next(lines))
     solver: Solver | None = None
     with contextlib.suppress(Exception):  # the answer to a task reports it
         solver = Solver(stage)

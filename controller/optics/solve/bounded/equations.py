@@ -32,8 +32,7 @@ APPEARANCE_TOLERANCE: Final = 1.5e-4
 of CIEDE2000 by less than 0.01 and its 95th percentile by less than 0.02 (docs/decisions/0008)."""
 MOST_ITERATIONS: Final = 1000
 FIRST_TOLERANCE: Final = 2.0
-"""Of a solve that continues with a corrected target, in tolerances: there it has no momentum, which makes up most of
-the KKT residual by then."""
+"""In tolerances, before a target is corrected: after it there is no momentum, most of the KKT residual by then."""
 Correction = Callable[[Sequence[FloatImage]], FloatImage]
 """From the frames for a target, what to aim at instead: a radiance (rows, columns, 3)."""
 
