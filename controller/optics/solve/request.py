@@ -11,12 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from controller.core.arrays import FloatImage, Mask, moved_to_file
-from controller.core.blur import gaussian_blur, masked_blur, nearest_known
 from controller.optics.solve.appearance import (
     FINE_DETAIL,
     Appearance,
@@ -54,8 +56,10 @@ ADAPTATIONS: Final = 2
 
 
 Unseen: TypeAlias = Literal["smooth", "black"]
-SOFT_PX: Final = 3.0
-"""Light that is continued is smoothed by so many projector pixels: at the edge of what cameras see it is noisy."""
+BESIDE: Final = 32
+"""Light is continued from so many pixels: at the edge of what cameras see it is noisy."""
+RIM_PX: Final = 4
+"""Farthest of these from the edge."""
 WIDEST: Final = 0.15
 """A gap between what cameras see, as a share of the picture's longer side, is still a part of the object."""
 
@@ -150,27 +154,47 @@ def solve_appearance(
     return AppearanceResult(frames, aim.wanted, reachable, aim.asked, asked_reachable, valid, figures)
 
 
+@dataclass(frozen=True, slots=True)
+class _Gap:
+    """``at`` (pixels,): those of a projector that no camera sees; ``beside`` (pixels, nearest): others next to them,
+    which are seen, or light the room. Both are indices into its picture, row by row.
+    """
+
+    at: npt.NDArray[np.intp]
+    beside: npt.NDArray[np.intp]
+
+
+_gaps: Final[WeakKeyDictionary[LightTransport, Sequence[_Gap]]] = WeakKeyDictionary()
+
+
 def continued(transport: LightTransport, frames: Sequence[FloatImage]) -> tuple[FloatImage, ...]:
-    """Frames (rows, columns, 3) in which pixels that no camera sees have the light of the nearest one that is seen.
+    """Frames (rows, columns, 3) in which pixels that no camera sees have the mean light of those next to them.
 
     They are gaps between what cameras see of the object, and what lies between it and the room beside it. Next to the
-    room they stay dark, and so does what is open to the picture's border: it may light anything.
+    room they fade. What is open to the picture's border stays dark: it may light anything.
     """
-    beside = np.zeros(transport.pixels, np.bool_) if transport.beside is None else transport.beside
+    if transport not in _gaps:
+        _gaps[transport] = [_gap(transport, n) for n in range(len(transport.sizes))]
     whole = []
-    for n, frame in enumerate(frames):
-        span, shape = transport.span(n), transport.sizes[n]
-        room = beside[span].reshape(shape)
-        seen = (transport.per_weight[span] > 0).reshape(shape) & ~room
-        unseen = _within(seen, seen | room)
-        if not seen.any() or not unseen.any():
-            whole.append(frame)
-            continue
-        nearest = nearest_known(seen | room)[1]
-        light = np.where(seen[nearest][..., None], masked_blur(frame, seen, SOFT_PX)[nearest], 0)
-        soft = gaussian_blur(light.astype(np.float32), SOFT_PX)
-        whole.append(np.where(unseen[..., None], np.clip(soft, 0, 1), frame))
+    for frame, gap in zip(frames, _gaps[transport], strict=True):
+        filled = np.array(frame, np.float32)
+        pixels = filled.reshape(-1, 3)
+        pixels[gap.at] = pixels[gap.beside].mean(axis=1)
+        whole.append(filled)
     return tuple(whole)
+
+
+def _gap(transport: LightTransport, n: int) -> _Gap:
+    span, shape = transport.span(n), transport.sizes[n]
+    room = np.zeros(shape, np.bool_) if transport.beside is None else transport.beside[span].reshape(shape)
+    seen = (transport.per_weight[span] > 0).reshape(shape) & ~room
+    unseen = _within(seen, seen | room)
+    near = cv2.dilate(unseen.astype(np.uint8), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)) > 0
+    rim, at = np.argwhere((seen | room) & near), np.argwhere(unseen)
+    if not len(rim) or not seen.any():
+        return _Gap(np.empty(0, np.intp), np.empty((0, 1), np.intp))
+    nearest = np.asarray(cKDTree(rim).query(at, min(BESIDE, len(rim)))[1], np.intp).reshape(len(at), -1)
+    return _Gap(np.flatnonzero(unseen), (rim @ (shape[1], 1))[nearest])
 
 
 def _within(seen: Mask, known: Mask) -> Mask:
