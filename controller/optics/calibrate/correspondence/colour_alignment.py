@@ -92,7 +92,8 @@ FAINTEST: Final = 0.02
 FEWEST_PIXELS: Final = 500
 SOME_PIXELS: Final = 200_000
 NAMED_PX: Final = 0.1
-"""A colour that lies so many pixels beside green is named; it is measured to a hundredth."""
+"""A colour that lies so many pixels beside green, also at the picture's edge alone, is named; it is measured to a
+hundredth."""
 COLOURS: Final = ("red", "green", "blue")
 PARTS: Final = 16
 LEAST_PX: Final = 0.02
@@ -101,8 +102,6 @@ MOST_PX: Final = 1.5
 """Phases repeat after 5 px: a larger shift might as well be one of 3.5 px the other way."""
 SURE: Final = 4.0
 """Standard errors that a shift needs to be corrected, and a size to be named."""
-NAMED_SIZE: Final = 1e-4
-"""Relative difference of a colour's size that is named; it is measured to a hundred-thousandth."""
 OUTLIER: Final = 3.0
 ROUNDS: Final = 6
 
@@ -242,7 +241,8 @@ def misaligned(name: str, shifts: ColourShifts) -> str | None:
 
 def fringed(name: str, sizes: ColourSizes, size_px: tuple[int, int]) -> str | None:
     """What a technician should know of ``colour_sizes`` of a projector of ``size_px``; None where they are alike."""
-    sure = np.abs(sizes.larger) > np.maximum(SURE * sizes.error, NAMED_SIZE)
+    reach_px = max(size_px) / 2
+    sure = np.abs(sizes.larger) > np.maximum(SURE * sizes.error, NAMED_PX / reach_px)
     if not sure.any():
         return None
     parts = [
@@ -250,7 +250,7 @@ def fringed(name: str, sizes: ColourSizes, size_px: tuple[int, int]) -> str | No
         for colour, by, named in zip(COLOURS, sizes.larger, sure, strict=True)
         if named
     ]
-    edge_px = float(np.max(np.abs(sizes.larger[sure]))) * max(size_px) / 2
+    edge_px = float(np.max(np.abs(sizes.larger[sure]))) * reach_px
     return (
         f"Colours of projector {name} lie apart towards the edges of its picture, by up to {edge_px:.2f} pixels: "
         f"{' and '.join(parts)} (lateral chromatic aberration of its lens or of the camera's). Nothing has to be done "

@@ -112,21 +112,22 @@ def test_colours_of_another_size_are_found_beside_shifts_and_named(larger: tuple
     made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), larger=np.array(larger))
     found = colour_sizes(apart(made), places())
     np.testing.assert_allclose(found.larger, np.array(larger) - larger[1], atol=6e-5)
-    said = fringed("left", found, (96, 72))
+    said = fringed("left", found, (1400, 1050))
     assert said is not None
     assert ("red's picture" in said) == (larger[0] != larger[1])
     assert ("blue's picture" in said) == (larger[2] != larger[1])
     assert "camera's" in said
+    assert fringed("left", found, (int(0.19 / np.abs(found.larger).max()), 72)) is None, "less than a tenth of a pixel"
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])
 def test_shifted_colours_of_one_size_are_not_named_as_fringes(noise: float) -> None:
     made = pictures(np.array([[0.2, -0.1], [0.0, 0.0], [-0.1, 0.2]]), noise)
-    assert fringed("left", colour_sizes(apart(made), places()), (96, 72)) is None
+    assert fringed("left", colour_sizes(apart(made), places()), (1400, 1050)) is None
 
 
 def test_a_size_that_is_not_sure_is_not_named() -> None:
-    assert fringed("left", ColourSizes(np.array([3e-4, 0, 0]), np.full(3, 1e-4)), (96, 72)) is None
+    assert fringed("left", ColourSizes(np.array([3e-4, 0, 0]), np.full(3, 1e-4)), (1400, 1050)) is None
     assert fringed("left", ColourSizes(np.full(3, np.nan), np.full(3, np.nan)), (96, 72)) is None
 
 
