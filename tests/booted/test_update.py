@@ -170,5 +170,5 @@ def test_a_version_on_trial_gives_way_to_a_package_and_blocks_no_other(playing: 
     machine.wait_for(lambda: playing.state == "playing")
     assert (told(playing)["state"], told(playing)["why"]) == ("failed", "Another version was installed.")
     assert program(playing) == ""
-    # it has told the outcome, and may be about to end
+    # its outcome is written, and it may be about to end
     machine.wait_for(lambda: not any("--carry-out" in line for line in running(playing)))
