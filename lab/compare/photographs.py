@@ -24,6 +24,7 @@ from controller.core.colour import Unsuitable, srgb_to_linear
 from controller.core.errors import UsageError, VelaturaError, WorkError
 from controller.core.pictures import read_picture_file
 from controller.core.storage import write_atomically
+from controller.optics.capture.raw import SRGB_TO_XYZ
 from controller.optics.solve.result.metrics import colour_difference
 from controller.run.progress import Reporter
 from hal.deadline import Cancelled
@@ -41,8 +42,6 @@ PROJECTED: Final = (Path("prj"), Path("prj_share"), Path())
 ABOVE: Final = 4
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 FEWEST: Final = 8
-SRGB_TO_XYZ: Final = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""IEC 61966-2-1."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,7 +134,7 @@ def _crossings(shown: Float64, places: Float64, mask: Mask) -> Iterator[float]:
         beside = np.abs(other[window] - np.round(other[window]))
         if not ((steps > 1 / STEEPEST) & (steps < STEEPEST)).all() or not (beside > CLEAR).all():
             continue
-        level = max(at[row, column : column + 2].round().tolist(), key=lambda one: -abs(one - at[row, column]))
+        level = np.floor(at[row, column : column + 2].max())
         belongs = column + (level - at[row, column]) / (at[row, column + 1] - at[row, column])
         x = np.arange(column - half, column + half + 2, dtype=np.float64)
         values = shown[window]

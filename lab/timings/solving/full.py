@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from controller.config.models import SolveTable
-from controller.core.arrays import FloatImage
+from controller.core.colour import linear_to_srgb
 from controller.core.storage import runtime_folder
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings
@@ -102,7 +102,8 @@ def _uploaded(size: str) -> list[Row]:
             made = [sys.executable, "-m", "lab.timings.tools.synthetic", str(run), size]
             names = subprocess.run(made, check=True, capture_output=True, text=True).stdout.split()
         target = run / "uploaded.png"
-        cv2.imwrite(str(target), _eight_bits(synthetic_target(CAMERA[size])))
+        shown = np.rint(255 * linear_to_srgb(synthetic_target(CAMERA[size]))).astype(np.uint8)
+        cv2.imwrite(str(target), shown[..., ::-1])
         stage = held.enter_context(prepared_stage("small", FIRST_SEED))
         install_grey(stage)
         held.enter_context(BenchProcess(stage, cancel=threading.Event()))
@@ -136,9 +137,3 @@ def _answers(run: Path, names: list[str], target: Path) -> Iterator[float]:
             assert "error" not in answer, answer
             yield time.perf_counter() - began_s
         process.stdin.close()
-
-
-def _eight_bits(image: FloatImage) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """A picture (rows, columns, 3) of reflectances as 8-bit sRGB, blue first."""
-    shown = np.clip(image[..., ::-1], 0, 1) ** np.float32(1 / 2.2)
-    return np.asarray(255 * shown + 0.5).astype(np.uint8)
