@@ -234,7 +234,7 @@ def demo(stage: Path, *, reporter: Reporter, cancel: threading.Event) -> Mapping
     bench = BenchProcess(stage, cancel=cancel, tell=reporter.say)
     session = OwnSession(stage, around=bench)
     solve = checked.stage.tables.solve
-    engine = choose_engine(solve.device, reporter.say, solve.method)
+    engine = choose_engine(solve.device, reporter.say)
     steps = partial(demo_steps, checked=checked, engine=engine)
     run = session.run(checked, StageWork("demo", steps, views=True), reporter=reporter, cancel=cancel)
     reporter.say("Writing the report.")

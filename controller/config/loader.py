@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from controller.config.models import AlertsTable, CameraTable, ConfigTable, OpenConfigTable, SolveTable, StageTables
+from controller.config.models import AlertsTable, CameraTable, ConfigTable, OpenConfigTable, StageTables
 from controller.config.problems import Place
 from controller.core.errors import UsageError
 from controller.core.files import UnfitFile, read_bytes
@@ -228,7 +228,6 @@ def _check_agreement(tables: StageTables) -> None:
     _check_cameras(tables)
     _check_mains(tables)
     _check_alerts(tables.alerts)
-    _check_solve(tables.solve)
     outputs = [output.name for output in tables.display.outputs]
     if not outputs:
         return  # real windows: only the display itself knows its outputs
@@ -266,13 +265,6 @@ def _check_alerts(alerts: AlertsTable) -> None:
     if alerts.mail_user is not None and alerts.mail_security == "none":
         problem = "would send the password without encryption"
         raise alerts.place.wrong_value("mail_security", "none", problem, '"starttls" or "tls", or no mail_user')
-
-
-def _check_solve(solve: SolveTable) -> None:
-    """Only the processor solves by regions."""
-    if solve.method == "regions" and solve.device == "gpu":
-        problem = 'can\'t be combined with device = "gpu"'
-        raise solve.place.wrong_value("method", "regions", problem, '"global", or "regions" with another device')
 
 
 def _check_mains(tables: StageTables) -> None:

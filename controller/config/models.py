@@ -307,11 +307,6 @@ class SolveTable(ConfigTable):
         description="how far a target is bent where it is darker or more saturated than can be shown, so that the "
         "object's own pattern does not show, from 0 (such parts are cut off) to 1",
     )
-    method: Literal["global", "regions"] = Field(
-        default="global",
-        description='the solver: "global" (all pixels together), or "regions" (the paper\'s: regions of 16 x 16 camera '
-        "pixels, one after the other; much slower, nearly as good, on the processor alone)",
-    )
     unseen: Literal["smooth", "black"] = Field(
         default="smooth",
         description='what projector pixels show that light the object where no camera sees it: "smooth" (the light of '

@@ -115,7 +115,7 @@ def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions)
             _kept[key] = base, DriveLevels.of_transport(stage.transport)
         base, drive = _kept[key]
         light = StageLight(stage.transport, stage.black, stage.indirect, drive)
-        engine = choose_engine("cpu", lambda note: None, options.method)
+        engine = choose_engine("cpu", lambda note: None)
         return solve_appearance(light, base, asked, options, SolveContext(engine))
 
     return _outcome_of(work)

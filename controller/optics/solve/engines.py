@@ -20,8 +20,6 @@ MODULE: Final = "wgpu"
 """The module of the extra `gpu`."""
 
 Choice = Literal["auto", "cpu", "gpu"]
-Method = Literal["global", "regions"]
-"""The global solver, or the paper's by regions (``bounded.regions``)."""
 
 
 def graphics_processors() -> list[str] | None:
@@ -47,14 +45,14 @@ def graphics_sentence() -> str:
     return f"Graphics processors for solves: {', '.join(names)}."
 
 
-def choose_engine(device: str, note: Callable[[str], None], method: Method = "global") -> Engine:
+def choose_engine(device: str, note: Callable[[str], None]) -> Engine:
     """The engine for solves.
 
     ``device``: "cpu" the processor; "gpu" a graphics processor, also one in software; "auto" a real graphics processor
     where there is one, else the processor. ``note`` gets a sentence on what a graphics processor takes, and on what it
-    had to leave to the processor. ``method``: regions are solved by the processor alone.
+    had to leave to the processor.
 
-    Raises UsageError("solve-device-unknown", "solve-device-unsuitable", "extra-missing", "no-graphics-processor").
+    Raises UsageError("solve-device-unknown", "extra-missing", "no-graphics-processor").
     """
     from controller.optics.solve.bounded.engine import Processor
 
@@ -64,16 +62,6 @@ def choose_engine(device: str, note: Callable[[str], None], method: Method = "gl
             what=f"The device {device} to solve on is unknown.",
             remedy=f"Choose one of {', '.join(get_args(Choice))}.",
         )
-    if method == "regions":
-        if device == "gpu":
-            raise UsageError(
-                "solve-device-unsuitable",
-                what="A graphics processor can't solve by regions.",
-                remedy='Take the device "cpu" or "auto", or set method = "global" under [solve] in stage.toml.',
-            )
-        from controller.optics.solve.bounded.regions import RegionsEngine
-
-        return RegionsEngine()
     if device == "cpu":
         return Processor()
     if importlib.util.find_spec(MODULE) is None:

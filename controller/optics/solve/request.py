@@ -32,7 +32,6 @@ from controller.optics.solve.appearance import (
 )
 from controller.optics.solve.bounded.engine import ALONE, SolveContext
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings, appearance_weights
-from controller.optics.solve.engines import Method
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import (
@@ -70,7 +69,6 @@ class SolveOptions:
 
     ``base``: the base image; with "high-pass" each appearance solves one of its own
     ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
-    ``method``: which solver, so that a run knows; the engine of the context is the one that solves
     ``exposure``: instead of that by ``share``, where a target asks for one
     ``unseen``: what projector pixels show that no camera sees, see ``continued``
     """
@@ -80,7 +78,6 @@ class SolveOptions:
     mode: Mode = "full"
     base: BaseChoice = "white"
     adapt: float = 0.0
-    method: Method = "global"
     exposure: float | None = None
     unseen: Unseen = "black"
 
@@ -91,16 +88,12 @@ class SolveOptions:
             inputs["adapt"] = repr(self.adapt)
         if self.unseen != "black":
             inputs["unseen"] = self.unseen
-        return inputs | self._method()
+        return inputs
 
     def base_inputs(self) -> dict[str, str]:
         """The inputs of the base image; the mode and brightness of appearances are not among them."""
         shared = "white" if self.base == "high-pass" else self.base
-        return {"smoothness": repr(self.smoothness), "base": shared} | self._method()
-
-    def _method(self) -> dict[str, str]:
-        # not the usual one, which runs of earlier versions do not name
-        return {} if self.method == "global" else {"method": self.method}
+        return {"smoothness": repr(self.smoothness), "base": shared}
 
 
 @dataclass(frozen=True, slots=True)

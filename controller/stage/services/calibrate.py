@@ -227,7 +227,7 @@ def make_appearances(
     checked = check_stage(session.stage)
     folder = checked.stage.folder
     solve = checked.stage.tables.solve
-    engine = choose_engine(solve.device if order.device is None else order.device, reporter.say, solve.method)
+    engine = choose_engine(solve.device if order.device is None else order.device, reporter.say)
     with session.locked():
         run = usable_calibration(checked, reporter, accept_grade=order.accept_grade)
         calibrated = all_views(run, checked.names, engine)

@@ -11,9 +11,9 @@ import numpy as np
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
-from controller.optics.solve.bounded.regions import RegionCut, solve_regions
 from controller.optics.solve.bounded.solver import solve_bounded
 from lab.study.output.drawing import LabelledPicture, detail, maps, screen, strip
+from lab.study.regions import RegionCut, solve_regions
 from lab.study.subject.measuring import predicted
 from lab.study.subject.subject import ReachableTarget, Subject
 from lab.study.subject.trial import photograph_target

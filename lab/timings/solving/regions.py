@@ -18,7 +18,12 @@ import numpy as np
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.equations import SolveSettings, build_problem, initial_point
-from controller.optics.solve.bounded.regions import (
+from controller.optics.solve.bounded.solver import solve_bounded
+from controller.optics.solve.reach.drive_levels import DriveLevels
+from controller.optics.solve.reach.feasibility import exposures, target_radiance
+from controller.optics.transport import LightTransport, build_transport
+from hal.runtime.compute import usable_cpus
+from lab.study.regions import (
     PHASES,
     SIZE_PX,
     BoxProblem,
@@ -27,11 +32,6 @@ from controller.optics.solve.bounded.regions import (
     solve_box,
     solve_regions,
 )
-from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.solve.reach.drive_levels import DriveLevels
-from controller.optics.solve.reach.feasibility import exposures, target_radiance
-from controller.optics.transport import LightTransport, build_transport
-from hal.runtime.compute import usable_cpus
 from lab.timings import Row, Timing, at_least, at_most
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration, synthetic_target
 from lab.timings.tools.traced import traced

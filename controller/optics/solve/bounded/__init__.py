@@ -1,3 +1,1 @@
-"""Bounded least-squares solvers. Entries: `solver.solve_bounded`, the global one (paper eqs 2 and 3), and
-`regions.solve_regions`, the paper's own by regions (eq. 7).
-"""
+"""The bounded least-squares solver (paper eqs 2 and 3). Entry: `solver.solve_bounded`."""

@@ -43,8 +43,9 @@ MOSTLY: Final = 0.5
 
 def options_of(table: SolveTable) -> SolveOptions:
     """How appearances are solved by [solve] of stage.toml, wherever they are."""
-    return SolveOptions(table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, table.method,
-                        unseen=table.unseen)  # fmt: skip
+    return SolveOptions(
+        table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, unseen=table.unseen
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ import pytest
 
 from controller.core.errors import UsageError
 from controller.optics.solve.bounded.engine import Processor
-from controller.optics.solve.bounded.regions import RegionsEngine
 from controller.optics.solve.engines import choose_engine, graphics_sentence
 from controller.optics.solve.gpu.device import adapters
 from controller.optics.solve.gpu.engine import GpuEngine
@@ -21,13 +20,6 @@ def silent(text: str) -> None:
 
 def test_the_processor_is_taken_when_asked_for() -> None:
     assert isinstance(choose_engine("cpu", silent), Processor)
-
-
-def test_regions_are_solved_by_the_processor_alone() -> None:
-    assert isinstance(choose_engine("auto", silent, "regions"), RegionsEngine)
-    with pytest.raises(UsageError, match="by regions") as refused:
-        choose_engine("gpu", silent, "regions")
-    assert refused.value.code == "solve-device-unsuitable"
 
 
 def test_a_device_in_software_is_taken_only_when_asked_for() -> None:

@@ -11,7 +11,6 @@ from controller.config.models import SolveTable
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.solve.bounded.engine import IterationControl, Processor
 from controller.optics.solve.bounded.equations import Solution, SolveInput
-from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.request import AppearanceResult, SolveOptions
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
@@ -20,7 +19,6 @@ from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.outline import keep_outline
-from controller.stage.artefacts.solved import read_solved
 from controller.stage.steps.appearance.solving import AppearanceRequest, options_of, solve_steps
 from hal.deadline import in_seconds
 from hal.notices import Level
@@ -60,24 +58,6 @@ def test_the_base_and_every_appearance_are_made_by_it(tmp_path: Path) -> None:
             )
         # the base is kept: it is the same for both
         assert engine.did == expected
-
-
-def test_a_stage_can_be_solved_by_the_paper_s_regions(tmp_path: Path) -> None:
-    """As `[solve] method = "regions"` says; the base's run knows that it is another."""
-    names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
-    options = options_of(SolveTable(method="regions", mode="full", adapt=0.0))
-    assert options.inputs()["method"] == options.base_inputs()["method"] == "regions"
-    assert "method" not in options_of(SolveTable()).inputs()
-    calibrated = Calibrated(tmp_path, names, choose_engine("auto", lambda note: None, options.method))
-    request = AppearanceRequest(
-        "grey", "Grey", lambda: Target(0.5 * synthetic_target(CAMERA), np.ones(CAMERA, np.bool_)), {}
-    )
-    with Journal(tmp_path) as journal:
-        runner = Runner(solve_steps(calibrated, [request], options, ()), journal, reporter=Silent())
-        runner.run("appearance", deadline=in_seconds(120))
-    kkt = float(str(read_solved(tmp_path, "grey", names).figures["kkt"]))
-    assert 0 < kkt < 0.05
-    assert calibrated.base.solution.converged
 
 
 def test_an_outline_that_was_drawn_says_what_the_object_is_and_what_was_solved_for_another_is_solved_again(

@@ -16,18 +16,17 @@ from controller.core.errors import UsageError, WorkError
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings, build_problem
-from controller.optics.solve.bounded.regions import (
+from controller.optics.solve.bounded.solver import solve_bounded
+from controller.optics.transport import LightTransport, build_transport
+from controller.optics.transport.planes import CameraBox
+from lab.study.regions import (
     SOLVERS,
     BoxProblem,
     RegionCut,
     Regions,
-    RegionsEngine,
     solve_box,
     solve_regions,
 )
-from controller.optics.solve.bounded.solver import solve_bounded
-from controller.optics.transport import LightTransport, build_transport
-from controller.optics.transport.planes import CameraBox
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
 
 pytestmark = pytest.mark.slow
@@ -240,28 +239,10 @@ def test_a_solver_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
     def absent(name: str) -> object:
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr("controller.optics.solve.bounded.regions.importlib.import_module", absent)
+    monkeypatch.setattr("lab.study.regions.importlib.import_module", absent)
     problem = BoxProblem(sp.csr_matrix(np.eye(2)), np.ones(2), np.zeros(2))
     for name in set(SOLVERS) - {"lsq_linear"}:
         with pytest.raises(UsageError) as refused:
             solve_box(name, problem)
         assert refused.value.code == "solver-missing"
         assert name in refused.value.remedy
-
-
-def test_as_an_engine_it_solves_what_any_engine_does(stage: Stage) -> None:
-    calibration = crop(stage)
-    transport = build_transport(calibration)
-    target = picture(transport)
-    told: list[float] = []
-    context = SolveContext(RegionsEngine(), lambda done, left: told.append(left))
-    found = solve_bounded(transport, target, calibration.black, context=context)
-    regions = solve_regions(transport, target, calibration.black)
-    for one, other in zip(found.frames, regions.frames, strict=True):
-        np.testing.assert_array_equal(one, other)
-    best = solve_bounded(transport, target, calibration.black, SolveSettings(tolerance=1e-6, most_iterations=6000))
-    assert found.converged
-    assert found.iterations == regions.regions == len(told)
-    assert told[-1] == 0
-    assert best.objective < found.objective < 1.06 * best.objective
-    assert best.kkt < found.kkt < 0.02

@@ -4,8 +4,7 @@ The camera image is cut into regions of 16x16, each solved together with a margi
 phases take alternate rows and columns of regions; what an earlier phase has settled is held fixed in later ones. A
 region determines its own pixels; those of its margin are provisional, and its neighbours solve them again. The
 regions of a phase don't touch each other, so their order does not matter. Earlier values being fixed, the result is
-near the optimum, not at it: the global solver (``solver``) is the default, this one is for comparison
-(docs/decisions/0007).
+near the optimum, not at it: this solver is for comparison with the product's (docs/decisions/0007).
 
 The equations of a region are cut out of the whole solve: the same T, camera blur and colour mixing included, and the
 same smoothness; what the pixels that are held fixed contribute stands on the right-hand side.
@@ -32,16 +31,12 @@ from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import UsageError, WorkError
 from controller.optics.solve.bounded.engine import (
     ALONE,
-    IterationControl,
-    Processor,
     SolveContext,
-    corrected,
     kkt_residual,
 )
 from controller.optics.solve.bounded.equations import (
     DEFAULT_SETTINGS,
     Problem,
-    Solution,
     SolveInput,
     SolveSettings,
     build_problem,
@@ -398,27 +393,3 @@ def _centres(transport: LightTransport, pixels: Pixels) -> Pixels:
     at = np.floor(transport.gaussian_mean_planes(place)[:2, pixels].T + 0.5).astype(np.int64)
     inside: Pixels = np.clip(at, 0, np.array([rows - 1, columns - 1]))
     return inside
-
-
-class RegionsEngine(Processor):
-    """The paper's solver in place of the global one, ``method = "regions"`` in stage.toml; on the processor alone.
-
-    A solve starts again, whatever ``start`` it has, and takes its own time: ``tolerance`` and ``most_iterations`` don't
-    matter. A solution's ``iterations`` are its regions; it has converged when all of them are solved. It reports
-    progress after each region.
-    """
-
-    name = "processor, by regions"
-    worked = name
-
-    def solve(self, given: SolveInput, control: IterationControl) -> Solution:
-        """As ``Engine.solve``."""
-        given = corrected(self, given, control)
-        result = solve_regions(
-            given.transport,
-            given.target,
-            given.black,
-            SolveSettings(given.smoothness, given.weights),
-            SolveContext(progress=control.progress, cancelled=control.cancelled),
-        )
-        return Solution(result.frames, result.objective, result.kkt, result.regions, result.seconds, converged=True)
