@@ -228,6 +228,11 @@ def _check_agreement(tables: StageTables) -> None:
     _check_cameras(tables)
     _check_mains(tables)
     _check_alerts(tables.alerts)
+    hosts = sorted({output.host for output in tables.display.outputs if output.host})
+    for table in tables.movable:
+        if table.host and table.host not in hosts:
+            allowed = f"one of {', '.join(hosts)}" if hosts else "omitted: every output is on this computer"
+            raise table.place.wrong_value("host", table.host, "has no output of the display", allowed)
     outputs = [output.name for output in tables.display.outputs]
     if not outputs:
         return  # real windows: only the display itself knows its outputs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from controller.config.defaults import SMOOTHNESS
 from controller.config.table import (
@@ -20,6 +20,11 @@ from controller.config.table import (
 )
 from hal.values import LampRules
 
+_Host = Annotated[
+    str,
+    Field(pattern=r"^([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.local)?)?$"),
+    AfterValidator(lambda name: name.removesuffix(".local")),
+]
 _Address = Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$", max_length=254)]
 
 
@@ -116,6 +121,10 @@ class ProjectorTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
     output: Name = Field(description="the name of the display output that feeds this projector")
     driver: Name = Field(description='the name of a projector driver, e.g. "serial"')
+    host: _Host = Field(
+        default="",
+        description="the computer that its control line hangs on, one of those that have outputs; if omitted: this one",
+    )
     ask_lit_s: float = Field(
         default=15.0, ge=1, le=60, description="seconds between two questions to a lit projector, 1 to 60"
     )
@@ -173,9 +182,8 @@ class OutputTable(ConfigTable):
         description="[x, y] of its upper left corner in the picture of its connector, where a splitter divides that "
         "among several projectors; if omitted: the output is the whole connector",
     )
-    host: str = Field(
+    host: _Host = Field(
         default="",
-        pattern=r"^([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?(\.local)?)?$",
         description='the computer that it is on, by the name with which that joined ("left" or "left.local"); if '
         "omitted: this one",
     )
@@ -188,8 +196,7 @@ class OutputTable(ConfigTable):
     @property
     def elsewhere(self) -> str:
         """Its computer and X screen as a player's option names them, "" for this computer's first screen."""
-        host = self.host.removesuffix(".local")
-        return f"{host}/{self.screen}" if self.screen else host
+        return f"{self.host}/{self.screen}" if self.screen else self.host
 
 
 class DisplayTable(OpenConfigTable):
@@ -338,6 +345,9 @@ class MainsTable(ConfigTable):
 class RelaysTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every relay board, 1 to 64 printable characters")
     driver: Name = Field(description='the name of a power_switch driver, e.g. "usb-relay"')
+    host: _Host = Field(
+        default="", description="the computer that it hangs on, one of those that have outputs; if omitted: this one"
+    )
     boot_s: Annotated[float, Field(ge=0, le=600)] = Field(
         default=10.0, description="seconds from mains on until a projector accepts commands, 0 to 600"
     )
@@ -473,6 +483,11 @@ class StageTables(ConfigTable):
     disk: DiskTable = Field(default_factory=DiskTable, description="the table [disk]")
     backup: BackupTable = Field(default_factory=BackupTable, description="the table [backup]")
     alerts: AlertsTable = Field(default_factory=AlertsTable, description="the table [alerts]")
+
+    @property
+    def movable(self) -> tuple[ProjectorTable | RelaysTable, ...]:
+        """The devices that may be on other computers."""
+        return (*self.projectors, *self.relays)
 
     @property
     def views(self) -> tuple[tuple[str, CameraTable], ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -351,6 +351,10 @@ class Player:
         }
 
     # --- presenting ---------------------------------------------------------------------------------------------
+
+    def device(self, host: str, call: Mapping[str, Any], on_result: ResultCallback) -> bool:
+        """Whether it reaches that computer's devices: a player alone reaches none."""
+        return False
 
     def reports(self, after: int) -> list[list[Any]]:
         """What was presented by schedules: [count, due_s, at_s, appearance] each, of the common clock, the first of

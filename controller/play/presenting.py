@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -99,7 +99,8 @@ class PresentedSet:
     at_s: float
 
 
-ResultCallback: TypeAlias = Callable[[PresentedSet | VelaturaError], None]
+Outcome: TypeAlias = PresentedSet | VelaturaError | Mapping[str, Any]
+ResultCallback: TypeAlias = Callable[[Outcome], None]
 """Called once with the result of a request: presented, or the reason why not."""
 
 

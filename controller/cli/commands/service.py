@@ -132,12 +132,13 @@ def agent(
         from controller.kiosk.install.system import System
         from controller.kiosk.install.update import Packages
         from controller.stage.hosts.agent import admitted, keep
+        from controller.stage.rig.elsewhere import DevicesHere
 
         if admit:
             return admitted(stage, admit, code)
         system = System(reporter.say)
         updates = partial(Packages, system) if only_plays(system) else None
-        return keep(keys, name, partial(_on_screen, reporter.say), cancel, updates)
+        return keep(keys, name, partial(_on_screen, reporter.say), cancel, DevicesHere, updates)
 
     work(do)
 

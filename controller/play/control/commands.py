@@ -13,7 +13,6 @@ import select
 import signal
 import socket
 import stat
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
@@ -36,7 +35,7 @@ from controller.play.display.identification import identification
 from controller.play.frames import FrameFile, FrameSet
 from controller.play.loop import Player
 from controller.play.playlist import Playlist
-from controller.play.presenting import PresentedSet
+from controller.play.presenting import Outcome, PresentedSet, ResultCallback
 from hal.codecs import player as player_codec
 from hal.codecs.player import error_line
 
@@ -210,7 +209,9 @@ class Server:
 
 SUFFIX: Final = ".playing"
 _BLACK: Final = b'{"op": "stop"}\n'
-_SHOWS_NOTHING: Final = protocol.Hello | protocol.Status | protocol.LoadBundle | protocol.Clock | protocol.Reports
+_SHOWS_NOTHING: Final = (
+    protocol.Hello | protocol.Status | protocol.LoadBundle | protocol.Clock | protocol.Reports | protocol.Device
+)
 
 
 class SavedRequest:
@@ -300,17 +301,18 @@ class Commands:
             if values is not None:
                 self._server.send(client, player_codec.answer_line(ticket, values))
 
-    def _answer(self, client: Client, ticket: Any, outcome: PresentedSet | VelaturaError) -> None:
+    def _answer(self, client: Client, ticket: Any, outcome: Outcome) -> None:
         if isinstance(outcome, VelaturaError):
             self._server.send(client, player_codec.error_line(ticket, outcome))
-        else:
-            values = {"sequence": outcome.sequence, "presented_at": outcome.at_s}
-            self._server.send(client, player_codec.answer_line(ticket, values))
+            return
+        if isinstance(outcome, PresentedSet):
+            outcome = {"sequence": outcome.sequence, "presented_at": outcome.at_s}
+        self._server.send(client, player_codec.answer_line(ticket, outcome))
 
     def _do(
         self,
         request: protocol.Request,
-        on_result: Callable[[PresentedSet | VelaturaError], None],
+        on_result: ResultCallback,
         at_s: float | None = None,
         bundle: Path | None = None,
     ) -> dict[str, Any] | None:
@@ -332,6 +334,12 @@ class Commands:
                 player.play(player.suggested(repeat), on_result)
             case protocol.Stop(fade_s):
                 player.stop(on_result, fade_s=fade_s, at_s=at_s)
+            case protocol.Device(host, call):
+                if not player.device(host, call, on_result):
+                    raise UsageError(
+                        "host-unknown", what=f"The display has no output on the computer {host}.",
+                        remedy="Start the stage again, so that its player has the outputs of stage.toml.",
+                    )  # fmt: skip
             case protocol.Identify():
                 player.show(identification(player.sizes), on_result, showing="identification")
             case _:

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeAlias
 
 from controller.core.errors import UsageError
 
-MINOR: Final = 5
+MINOR: Final = 6
 """Raised when the protocol gets an addition that older clients can ignore."""
 MAX_LINE_BYTES: Final = 256 * 1024
 MAX_ITEMS: Final = 4096
@@ -133,6 +133,14 @@ class Reports:
 
 
 @dataclass(frozen=True, slots=True)
+class Device:
+    """Of a display of several computers: bring ``call`` to the devices of the computer ``host``."""
+
+    host: str
+    call: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Timed:
     """A request that takes effect at a moment of the common clock. ``bundle``: the file it is of from then on."""
 
@@ -143,7 +151,7 @@ class Timed:
 
 Request: TypeAlias = (
     Hello | Show | Play | Sequence | Suggested | Live | Stop | Identify | Status | LoadBundle | Clock | Reports | Timed
-    | Quit
+    | Quit | Device
 )  # fmt: skip
 
 
@@ -234,6 +242,12 @@ def _reports(*, after: Any = 0) -> Reports:
     return Reports(_integer(after, "after", 2**63 - 1))
 
 
+def _device(*, host: Any, call: Any) -> Device:
+    if not isinstance(call, dict):
+        raise ValueError("call is not an object")
+    return Device(_text(host, "host"), call)
+
+
 def _share(value: Any) -> float:
     return 0.0 if value == 0 and not isinstance(value, bool) else _number(value, "brightness", 1.0)
 
@@ -292,5 +306,6 @@ _READERS: Final[dict[str, Any]] = {
     "clock": _clock,
     "reports": _reports,
     "quit": Quit,
+    "device": _device,
 }
 _TIMED: Final = ("show", "play", "sequence", "stop")

@@ -36,13 +36,21 @@ class Updates(Protocol):
     def plays(self, state: str) -> tuple[str, str, str]: ...
 
 
+class Devices(Protocol):
+    """The stage's, on this computer; ``controller.stage.rig.elsewhere`` has it."""
+
+    def step(self, silent_s: float) -> None: ...
+
+    def end(self) -> None: ...
+
+
 def keep(
     keys: Path, name: str | None, show: Callable[[str], AbstractContextManager[None]], cancel: threading.Event,
-    updates: Callable[[Link, str], Updates] | None,
+    devices: Callable[[Path, Link, str], Devices], updates: Callable[[Link, str], Updates] | None,
 ) -> dict[str, Any]:  # fmt: skip
     """An agent on this computer until ``cancel``; without a membership in ``keys`` it first joins by a code, which
-    ``show`` shows meanwhile. ``updates``: takes those of the program that the link brings; None where
-    the program is not an installed one.
+    ``show`` shows meanwhile. ``devices``: makes those of this computer, from a folder for what lasts; ``updates``:
+    takes those of the program that the link brings; None where the program is not an installed one.
 
     Raises as ``Joining`` and ``member_link``.
     """
@@ -61,6 +69,7 @@ def keep(
 
     with member_link(own) as link:
         agent = Agent(link, own.name, keys.with_name("bundles"), clock, screen)
+        agent.devices = devices(keys.resolve().parent, link, key(own.name, "device"))
         if updates is not None:
             agent.updates = updates(link, key(own.name, "program"))
         agent.run(cancel)
@@ -92,8 +101,9 @@ class Agent:
         self._screens: dict[str, Screen] = {}
         self._bundles = Arrivals(folder, self._check)
         self._pictures: dict[tuple[str, str], Any] = {}
-        self._heard_s = _NEVER_S
+        self._heard_s, self._began_s = _NEVER_S, time.monotonic()
         self.updates: Updates | None = None
+        self.devices: Devices | None = None
         self._lock = threading.Lock()
         link.answer(key(name, "prepare"), dict[str, Setup], self._prepare)
         link.answer(key(name, "ask"), Asked, self._ask)
@@ -103,16 +113,20 @@ class Agent:
         link.appear(key(name, "there"))
 
     def run(self, ended: threading.Event) -> None:
-        """Until ``ended``; then the players show black and end."""
+        """Until ``ended``; then the players show black and end, and lamps are switched off."""
         while not ended.wait(BEAT_S):
             self.step()
         for screen in self._screens.values():
             screen.end()
+        if self.devices is not None:
+            self.devices.end()
 
     def step(self) -> None:
         """Look at the clock and at each player once, and report."""
         self._clock.look()
         silent_s = time.monotonic() - self._heard_s
+        if self.devices is not None:
+            self.devices.step(min(silent_s, time.monotonic() - self._began_s))
         with self._lock:
             states = {name: one.step(one.setup.keep_s - silent_s) for name, one in self._screens.items()}
         plays = "playing" if all(state.status is not None for state in states.values()) else "fault"

@@ -30,9 +30,9 @@ from controller.play.control.protocol import Suggested
 from controller.play.frames import FrameFile, FrameSet, OutputSize, parse_outputs, parse_where
 from controller.play.loop import Player
 from controller.play.playlist import Playlist
-from controller.play.presenting import Intervals, PresentedSet, ResultCallback
+from controller.play.presenting import Intervals, Outcome, PresentedSet, ResultCallback
 from controller.stage.hosts.clock import HostClock
-from controller.stage.hosts.remote import Remote, opened_link
+from controller.stage.hosts.remote import Remote, lost_host, opened_link
 from controller.stage.hosts.screen import Screen, Setup
 from hal.errors import CodedError
 
@@ -43,6 +43,8 @@ LEAD_S: Final = 1.0
 LEAD_SHOW_S: Final = 0.2
 _ASKED_S: Final = 5.0
 _LOST: Final = ("link-no-answer", "player-gone", "player-silent", "player-not-running", "superseded")
+_MOST_CALLS: Final = 16
+"""Of devices at once: one that hangs must not keep the others waiting."""
 _WAITED: Final = 8192
 """So many moments are remembered while some player has not reported them."""
 
@@ -107,6 +109,7 @@ class Conductor:
         self._last = PresentedSet(0, 0.0)
         self._pool = ThreadPoolExecutor(8 * len(players), thread_name_prefix="players")
         self._jobs = ThreadPoolExecutor(4, thread_name_prefix="requests")
+        self._calls = ThreadPoolExecutor(_MOST_CALLS, thread_name_prefix="devices")
         self._results: deque[Callable[[], None]] = deque()
         self._agreeing, self._ended = threading.Lock(), threading.Event()
         self._leaving = False
@@ -191,6 +194,13 @@ class Conductor:
         """Each player has its own."""
         return []
 
+    def device(self, host: str, call: Mapping[str, Any], on_result: ResultCallback) -> bool:
+        """As ``Player.device``; the agent of that computer answers."""
+        there = next((player for player in self._players if isinstance(player, Remote) and player.host == host), None)
+        if there is not None:
+            self._calls.submit(self._work, on_result, partial(there.call, call))
+        return there is not None
+
     def _later(
         self,
         on_result: ResultCallback,
@@ -198,24 +208,24 @@ class Conductor:
         lead_s: float,
         pictures: Mapping[str, Any] | None = None,
     ) -> None:
-        def work() -> None:
-            try:
-                if pictures is not None:
-                    self._put(pictures)
-                outcome: PresentedSet | VelaturaError = self._agree(request, lead_s)
-            except CodedError as error:
-                outcome = WorkError(error.code, what=error.what, remedy=error.remedy)
-            self._results.append(partial(on_result, outcome))
-            self._wake()
+        def agreed() -> PresentedSet:
+            if pictures is not None:
+                self._put(pictures)
+            return self._agree(request, lead_s)
 
-        self._jobs.submit(work)
+        self._jobs.submit(self._work, on_result, agreed)
+
+    def _work(self, on_result: ResultCallback, work: Callable[[], Outcome]) -> None:
+        try:
+            outcome = work()
+        except CodedError as error:
+            outcome = WorkError(error.code, what=error.what, remedy=error.remedy)
+        self._results.append(partial(on_result, outcome))
+        self._wake()
 
     def _put(self, pictures: Mapping[str, Any]) -> None:
         if lost := self._lost():
-            raise WorkError(
-                "host-lost", what=f"No answer from the computer {', '.join(lost)}.",
-                remedy="Check that it is on and its network; the others keep their picture.",
-            )  # fmt: skip
+            raise lost_host(", ".join(lost))
         own = [{name: pictures[name] for name in player.setup.names} for player in self._players]
         list(self._pool.map(lambda player, its: player.put(its), self._players, own))
 

@@ -81,6 +81,8 @@ def placed_rows(message: bytes, pictures: dict[tuple[str, str], npt.NDArray[np.u
 SILENT_S: Final = 3.0
 _START_S: Final = 25.0
 _PART_S: Final = 10.0
+_DRIVERS_S: Final = 10.0
+"""A driver that hangs is left behind so long after its deadline at most."""
 _AGAIN_S: Final = 1.0
 _UPDATE_AGAIN_S: Final = 30.0
 _LATER: Final = ("link-no-answer", "update-on-trial")
@@ -96,6 +98,14 @@ def opened_link(keys: Path | None, port: int) -> Link:
     return house_link(Authority(keys, "players"), port=port)
 
 
+def lost_host(name: str) -> WorkError:
+    """The error where a computer does not answer that is needed now."""
+    return WorkError(
+        "host-lost", what=f"No answer from the computer {name}.",
+        remedy="Check that it is on and its network; the others keep their picture.",
+    )  # fmt: skip
+
+
 class Remote:
     """As ``screen.Player``. It counts as there once it has its setup, until nothing is heard of it for ``SILENT_S``."""
 
@@ -108,7 +118,7 @@ class Remote:
         self._link, self.host, self._screen, self._setups = link, host, screen, setups
         self._state, self.trouble = State(), ""
         self._reports: list[tuple[float, float, str | None]] = []
-        self._heard_s = 0.0
+        self._heard_s, self._first = 0.0, threading.Event()
         self._prepared = False
         self._asked_at: float | None = None
         self._busy = threading.Lock()
@@ -123,6 +133,7 @@ class Remote:
     def _heard(self, report: Report) -> None:
         fresh = time.monotonic() - self._heard_s > SILENT_S
         self._heard_s = time.monotonic()
+        self._first.set()
         there, update, why = report.update
         self.trouble = report.trouble or (f"Its update was taken back: {why}" if update == "failed" else "")
         self._look_for_update(there)
@@ -204,6 +215,14 @@ class Remote:
             if error.code != "superseded":
                 self._asked_at = None
             raise
+
+    def call(self, call: Mapping[str, Any]) -> dict[str, Any]:
+        """What the agent answers to a call of a device. It is waited for where nothing was ever heard of it."""
+        within_s = float(call["within_s"])
+        self._first.wait(within_s)
+        if time.monotonic() - self._heard_s > SILENT_S:
+            raise lost_host(self.host)
+        return self._link.ask(key(self.host, "device"), call, dict, within_s=within_s + _DRIVERS_S)
 
     def end(self) -> None:
         """Its agent and its player stay, and show black."""

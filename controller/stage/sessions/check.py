@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from controller.config import Stage, check_driver_settings, load_stage
-from controller.config.models import OpenConfigTable
+from controller.config.models import OpenConfigTable, ProjectorTable, RelaysTable
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
 from controller.core.files import read_text
+from controller.stage.rig.elsewhere import DeviceElsewhere
 from hal.errors import DeviceError, DriverFault, PluginError
 from hal.registry import Driver, Drivers, OpenContext, check_device, load_drivers
 
@@ -27,7 +28,7 @@ class Checked:
     """A completely checked stage; no device is opened yet.
 
     ``faults``: drivers that failed to check their settings. Their devices may still open. ``dousers``: of each
-    projector.
+    projector. ``elsewhere``: the devices of other computers.
     """
 
     stage: Stage
@@ -40,6 +41,7 @@ class Checked:
     key_panel: tuple[Driver, dict[str, Any]] | None = None
     faults: tuple[DriverFault, ...] = ()
     dousers: tuple[tuple[Driver, dict[str, Any]] | None, ...] = ()
+    elsewhere: tuple[DeviceElsewhere, ...] = ()
 
     def prior(self, view: str | None = None) -> CameraPrior:
         """The values of a view's camera from stage.toml and from measurements on the stage; None: of the first view.
@@ -88,6 +90,7 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path |
     tables = stage.tables
 
     faults: list[DriverFault] = []
+    elsewhere: list[DeviceElsewhere] = []
 
     def checked(kind: str, table: OpenConfigTable, name: str) -> tuple[Driver, dict[str, Any]]:
         try:
@@ -106,6 +109,11 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path |
             faults.append(error)
         except DeviceError as error:
             raise mistake_in(table, settings, error) from error
+        if isinstance(table, ProjectorTable | RelaysTable) and table.host:
+            alone_s = tables.display.alone_s if tables.display.alone == "black" else None
+            rules = tables.safety.at_least()
+            elsewhere.append(DeviceElsewhere(table.host, kind, name, driver.name, settings, rules, alone_s))
+            driver = elsewhere[-1].opened_by(driver)
         return driver, settings
 
     return Checked(
@@ -127,6 +135,7 @@ def check_stage(folder: Path, *, drivers: Drivers | None = None, instead: Path |
             for table in tables.projectors
         ),
         faults=tuple(faults),
+        elsewhere=tuple(elsewhere),
     )  # fmt: skip
 
 

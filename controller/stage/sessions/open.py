@@ -44,11 +44,17 @@ def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False, onl
     ``plays``: the player starts with the installed bundle; the start fails if it shows no picture of it.
     ``only``: the view of the only camera that is opened. A camera that is not the first may be missing.
 
-    Mains relays are closed first. This function switches no relay or lamp off: ``lit`` does that.
+    Mains relays are closed first, once other computers have said that they have the drivers of their devices. This
+    function switches no relay or lamp off: ``lit`` does that.
     """
     stage = checked.stage
     with contextlib.ExitStack() as stack:
         context = open_context(stage.folder, runtime=stack.enter_context(used_runtime_folder(stage.folder)))
+        # The player of an installed kiosk is systemd's.
+        if checked.stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder):
+            stack.enter_context(_player(stage, context, plays=plays))
+        for device in checked.elsewhere:
+            device.ask(context, "check", deadline=deadline.within(OPEN_S))
         ambient_limit = light_sensor(checked, context, stack, deadline)
         circuits = mains_circuits(checked, context, stack, deadline)
         close_circuits(circuits, deadline=deadline)
@@ -71,9 +77,6 @@ def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False, onl
                 absent[name] = error
             else:
                 _closed_by(stack, cameras[name])
-        # The player of an installed kiosk is systemd's.
-        if checked.stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder):
-            stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
         _closed_by(stack, display)

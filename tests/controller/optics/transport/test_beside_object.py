@@ -14,7 +14,7 @@ from controller.optics.calibrate.values import Calibration, Metapixels, PhaseMap
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.transport import build_transport
-from controller.optics.transport.indirect.beside_object import beside_object
+from controller.optics.transport.factory import beside_object
 
 CAMERA, PIXELS = (90, 120), (30, 40)
 TIMES = 3

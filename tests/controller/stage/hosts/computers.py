@@ -20,10 +20,12 @@ from typing import Any
 from controller.play.control.launch import end_serving
 from controller.stage.hosts.agent import Agent
 from controller.stage.hosts.clock import HostClock, Tracking
+from controller.stage.hosts.remote import key
 from controller.stage.hosts.screen import Screen
 from controller.stage.link.joining import Joining, admit
 from controller.stage.link.membership import Authority, membership
 from controller.stage.link.session import member_link
+from controller.stage.rig.elsewhere import DevicesHere
 from tests.controller.play.wire import Wire
 
 
@@ -50,6 +52,7 @@ def agent(keys: Path, folder: Path) -> None:
     clock = HostClock(wall, time.monotonic, track)
     with member_link(belongs) as link:
         one = Agent(link, belongs.name, folder / "bundles", clock, lambda name: Screen(folder / "screen", clock))
+        one.devices = DevicesHere(folder, link, key(belongs.name, "device"))
         ended = threading.Event()
         signal.signal(signal.SIGTERM, lambda *_: ended.set())
         one.run(ended)
