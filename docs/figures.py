@@ -70,13 +70,11 @@ def _own_exposure(root: Path) -> str:
     return span([row[place] for row in table.rows if row[way] == "one projector, dimmed"], ".2f")
 
 
-def _errors(root: Path, place: int) -> str:
-    """Least to most of the medians that criteria of the appearances tell, in reach (0) or of all that is lit (1)."""
-    found: list[float] = []
-    for one in study(root, "appearances").criteria:
-        if "where it is in reach" in one.asked:
-            found += [float(re.findall(NUMBER, text)[2 * place]) for text in one.reached.values()]
-    return span(list(found), ".2f")
+def _errors(root: Path, compared: str) -> str:
+    """Least to most of the appearances' medians over that set of pixels."""
+    table = study(root, "appearances").table("errors")
+    way, over, median = (table.columns.index(name) for name in ("way", "compared", "CIEDE2000 median"))
+    return span([row[median] for row in table.rows if (row[way], row[over]) == ("ours", compared)], ".2f")
 
 
 def _photographs(root: Path) -> str:
@@ -101,8 +99,8 @@ FIGURES: Final[Mapping[str, Figure]] = {
     "nearer-at-our-exposure": Figure(lambda root: _times(root, "nearer than one projector at the same exposure")),
     "nearer-at-its-exposure": Figure(lambda root: _times(root, "at the exposure that this one can reach")),
     "its-exposure": Figure(_own_exposure),
-    "error-in-reach": Figure(lambda root: _errors(root, 0)),
-    "error-of-all-lit": Figure(lambda root: _errors(root, 1)),
+    "error-in-reach": Figure(lambda root: _errors(root, "in reach")),
+    "error-of-all-lit": Figure(lambda root: _errors(root, "all lit pixels")),
     **{f"residual-{n}": Figure(lambda root, n=n: _residual(root, n)) for n in (1, 2, 3)},  # type: ignore[misc]
 }
 

@@ -140,10 +140,10 @@ class MeteredStage:
             transport = build_transport(calibration)
         return ComparisonCalibration(calibration, transport, subject.indirect, subject.geometry)
 
-    def dots(self, n: int) -> Dots:
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
         """Projector ``n`` as dots show it; their photographs are counted, once."""
         self._count(("dots", n), self.effort.dots[n])
-        return self.subject.light.dots(n)
+        return self.subject.light.dots(n, plain=plain)
 
     def _count(self, what: object, photographs: int) -> None:
         if what not in self._counted:

@@ -54,7 +54,7 @@ class BenchLight:
         light = unit * self.truth.picture([shown[name] for name in self.calibrated.projectors])
         return developed(light, float(light.max()))
 
-    def dots(self, n: int) -> Dots:
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
         raise AssertionError("experiments that need dots are done by `make nightly`")
 
 

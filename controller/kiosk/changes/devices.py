@@ -65,7 +65,7 @@ def lens_facts(stage: Path) -> Iterator[Fact]:
             tags = _exif(picture)
             if tags.get(_LENS) or tags.get(_FOCAL_MM):
                 yield Fact("lens", "", printable(str(tags.get(_LENS) or "unnamed")).strip("\0 "))
-                yield Fact("lens", "focal length", f"{float(tags.get(_FOCAL_MM) or 0):g} mm")
+                yield Fact("lens", "focal length", f"{mm:g} mm" if (mm := float(tags.get(_FOCAL_MM) or 0)) else None)
                 return
             # All of one run come from the same camera.
             break

@@ -59,8 +59,8 @@ def _ways(subject: Subject, wanted: ReachableTarget, best: int) -> list[tuple[st
         ).frames
 
     return [
-        ("one projector, division at each pixel", lambda: traditional_compensation(calibration, wanted.radiance, best)),
-        ("feathered projectors", lambda: feathered(calibration, wanted.radiance)),
+        ("one projector, division at each pixel", lambda: traditional_compensation(calibration, wanted.direct, best)),
+        ("feathered projectors", lambda: feathered(calibration, wanted.direct)),
         ("unconstrained inverse, clipped", lambda: unbounded_inverse(raw, wanted.direct, black)),
         ("bounded, no pixel model", lambda: bounded(raw, 0.0)),
         (OURS, lambda: bounded(subject.transport, SMOOTHNESS)),

@@ -18,24 +18,28 @@ from controller.optics.calibrate.metapixels.from_dots import (
     where_missing,
 )
 from controller.optics.calibrate.values import Metapixels, PhaseMap
-from controller.optics.capture.patterns import DotPattern, dot_patterns
+from controller.optics.capture.patterns import DotPattern, dot_frame, dot_patterns
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import read_correspondence, read_phase_map
+from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.geometry import read_geometry
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.names import npz_path
-from controller.stage.artefacts.photographs import Developed, PhotographSet
+from controller.stage.artefacts.photographs import Developed, PhotographSet, TakenPhotograph
 from controller.stage.artefacts.projectors import DotNotes, Light
 from controller.stage.rig.rig import Rig, RigProjector
 from controller.stage.steps import costs
 from controller.stage.steps.calibrate.dots import capture_step, read_dots
+from controller.stage.steps.capture.dots import check_disk, planned, read_batches, take_in_batches
 from controller.stage.steps.modes import DotOptions
 from lab.study.subject.subject import Dots, Shares
 
 FAINTEST_SHARE = 0.01
 """A dot's light below this share of white is left out as noise of the photograph."""
 DOTS: Final = DotOptions("paper", None)
+PLAIN: Final = "study-plain-dots"
+"""Kind of the photographs of dots at the exposure of white."""
 
 
 def dot_steps(rig: Rig, *, longest_exposure_s: float) -> list[Step]:
@@ -59,11 +63,18 @@ def _evaluation(projector: RigProjector) -> Step:
 
 
 def _evaluate(name: str, size: tuple[int, int], context: Context) -> Sequence[Path]:
+    spacing = DotNotes.read(context.folder, StepKind.STUDY_DOTS, name).spacing_px
+    taken = read_dots(context.folder, PhotographSet(StepKind.STUDY_DOTS, name), dot_patterns(size[::-1], spacing))
+    return [write_study_dots(context.folder, name, _dots(context, name, size, spacing, taken))]
+
+
+def _dots(
+    context: Context, name: str, size: tuple[int, int], spacing: int, taken: Mapping[str, TakenPhotograph]
+) -> Dots:
+    """A projector's dots from their photographs, by the pattern's name; ``size`` (rows, columns)."""
     folder, (rows, columns) = context.folder, size
-    spacing = DotNotes.read(folder, StepKind.STUDY_DOTS, name).spacing_px
     patterns = dot_patterns((columns, rows), spacing)
     light = Light.read(folder, name)
-    taken = read_dots(folder, PhotographSet(StepKind.STUDY_DOTS, name), patterns)
     captures = Developed(taken, {"black": light.black})
     phase_map, _ = read_phase_map(folder, name)
     assert phase_map is not None
@@ -72,7 +83,25 @@ def _evaluate(name: str, size: tuple[int, int], context: Context) -> Sequence[Pa
     model = initial_metapixels(modelled_correspondence(read_geometry(folder, [name]), 0), (columns, rows))
     start = where_missing(initial_metapixels(read_correspondence(folder, name), (columns, rows)), model)
     fitted, _ = fit_dots(captures, light.white, start, spacing, fallback=model)
-    return [write_study_dots(folder, name, Dots(shares, fitted))]
+    return Dots(shares, fitted)
+
+
+def plain_dots(rig: Rig, context: Context, name: str) -> Dots:
+    """A projector's dots, photographed now, each once, at the exposure of white: as far apart as those of the steps."""
+    folder, into = context.folder, PhotographSet(PLAIN, name)
+    (projector,) = (one for one in rig.projectors if one.name == name)
+    columns, rows = projector.size_px
+    spacing = DotNotes.read(folder, StepKind.STUDY_DOTS, name).spacing_px
+    patterns = dot_patterns((columns, rows), spacing)
+    check_disk(folder, into, len(patterns))
+    exposure_s = Exposures.read(folder)[name].base_s
+    plan = [
+        planned(projector, pattern.name, partial(dot_frame, pattern, projector.size_px), exposure_s)
+        for pattern in patterns
+    ]
+    take_in_batches(rig, context, plan, into=into)
+    taken = {one.name: one for one in read_batches(folder, into, len(patterns))}
+    return _dots(context, name, (rows, columns), spacing, taken)
 
 
 def write_study_dots(folder: Path, name: str, dots: Dots) -> Path:

@@ -15,7 +15,7 @@ from controller.stage.rig.rig import Rig
 from controller.stage.rig.shared_display import frames_digest
 from controller.stage.steps.appearance.photographing import ShownPicture, take_hdr
 from controller.stage.steps.appearance.solving import device_frames
-from lab.study.subject.dots import read_study_dots
+from lab.study.subject.dots import plain_dots, read_study_dots
 from lab.study.subject.subject import Dots
 
 
@@ -43,5 +43,6 @@ class RigPhotographer:
         # Too bright for the shortest exposure is at least its full scale; black would be the one wrong answer.
         return np.asarray(np.nan_to_num(merged, nan=1 / min(one.exposure_s for one in taken)), np.float32)
 
-    def dots(self, n: int) -> Dots:
-        return read_study_dots(self.context.folder, self.calibrated.projectors[n])
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
+        name = self.calibrated.projectors[n]
+        return plain_dots(self.rig, self.context, name) if plain else read_study_dots(self.context.folder, name)

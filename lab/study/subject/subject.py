@@ -46,8 +46,8 @@ class Photographer(Protocol):
         ``name``: unique in its experiment; ``white``: the radiance of the target's white, by which it is exposed.
         """
 
-    def dots(self, n: int) -> Dots:
-        """Projector ``n`` as dots show it."""
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
+        """Projector ``n`` as dots show it; ``plain``: photographed once, no longer than white."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.core.errors import WorkError
 from controller.play.control import launch
 from controller.play.control.launch import PlayerProcess, PlayerSettings, end_leftover, replace_player
 
@@ -42,3 +43,21 @@ def test_one_that_was_still_loading_when_it_was_looked_for_is_replaced_all_the_s
     with replace_player(tmp_path, PlayerSettings([("P1", 64, 48)], tmp_path / "other.frame")) as player:
         assert player.alive
         assert not left.alive
+
+
+def test_a_socket_that_stays_taken_is_not_waited_for_longer_than_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks = iter(range(100))
+
+    def taken(runtime: Path, settings: PlayerSettings, *, timeout_s: float) -> PlayerProcess:
+        raise WorkError("player-not-started", what=f"It says: {launch._TAKEN}", remedy="End the other one.")
+
+    def none_left(runtime: Path) -> bool:
+        assert next(looks, None) is not None, "it looks for ever"
+        return False
+
+    monkeypatch.setattr(launch, "start_player", taken)
+    monkeypatch.setattr(launch, "end_leftover", none_left)
+    with pytest.raises(WorkError):
+        replace_player(tmp_path, PlayerSettings([("P1", 64, 48)], tmp_path / "frame"), timeout_s=0.05)

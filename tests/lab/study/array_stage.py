@@ -42,10 +42,10 @@ class ArrayLight:
         noisy = light + self.rng.normal(0, NOISE, light.shape)
         return np.asarray(noisy, np.float32)
 
-    def dots(self, n: int) -> Dots:
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
         metapixels = self.calibration.projectors[n].metapixels
         shares = normalised(gaussian_weights(metapixels, CAMERA))
-        shares.data = np.clip(shares.data + self.rng.normal(0, 0.01, shares.data.size), 0, 1)
+        shares.data = np.clip(shares.data + self.rng.normal(0, 0.05 if plain else 0.01, shares.data.size), 0, 1)
         return Dots(shares, metapixels)
 
 

@@ -93,8 +93,8 @@ class Disturbed:
             shown = [np.asarray(frame ** np.float32(float(change.get("gamma", 1.0)))) for frame in shown]
         return self.light.photograph(name, shown, white=white)
 
-    def dots(self, n: int) -> Dots:
-        return self.light.dots(n)
+    def dots(self, n: int, *, plain: bool = False) -> Dots:
+        return self.light.dots(n, plain=plain)
 
 
 def stage() -> tuple[Subject, Clumsy]:

@@ -104,8 +104,8 @@ def _shown(subject: Subject, alone: Subject, best: int, look: Look, target: Targ
         light.photograph(f"{look.name}-{way}", shown, white=asked.white)
         for way, shown, asked in (
             ("ours", frames, wanted),
-            ("one", traditional_compensation(subject.calibration, wanted.radiance, best), wanted),
-            ("one-dimmed", traditional_compensation(subject.calibration, dimmed.radiance, best), dimmed),
+            ("one", traditional_compensation(subject.calibration, wanted.direct, best), wanted),
+            ("one-dimmed", traditional_compensation(subject.calibration, dimmed.direct, best), dimmed),
         )
     ]
     both = wanted.mask & dimmed.mask
@@ -138,31 +138,24 @@ def _criteria(shown: Sequence[PhotographedLook], left_out: Sequence[LeftOut]) ->
             " ".join(f"{one.look.title}: {one.reason}" for one in left_out),
         )
     ]
-    for one in shown:
-        ours, other = one.ours.delta_e, one.alone.delta_e
-        near = _near(one.ours)
-        found.append(
+    if shown:
+        far = [one for one in shown if not _near(one.ours)]
+        close = [one for one in shown if one.alone.delta_e < TIMES_BETTER * one.ours.delta_e]
+        found += [
             Criterion(
-                f"{one.look.title}: CIEDE2000 at most {MOST_DELTA_E:g} in the median and {MOST_DELTA_E_P95:g} in 95 %"
+                f"every appearance: CIEDE2000 at most {MOST_DELTA_E:g} in the median and {MOST_DELTA_E_P95:g} in 95 %"
                 " where it is in reach",
-                f"{ours:.2f} on {one.share:.0%} of the object, {one.whole.delta_e:.2f} on all of it;"
-                f" 95 % {one.ours.delta_e_p95:.1f} and {one.whole.delta_e_p95:.1f}",
-                near,
-                "" if near else _shortfall(one),
-            )
-        )
-        better = other >= TIMES_BETTER * ours
-        found.append(
+                f"{len(shown) - len(far)} of {len(shown)}: " + "; ".join(map(_distance, shown)),
+                not far,
+                " ".join(map(_shortfall, far)),
+            ),
             Criterion(
-                f"{one.look.title}: at least {TIMES_BETTER:g} times nearer than one projector at the same exposure",
-                f"{other:.2f} to {ours:.2f}: {other / ours:.1f} times",
-                better,
-                "" if better else
-                f"Half of it is within {other:.2f} with one projector, and calibration and noise keep ours, by the"
-                f" model {one.model.delta_e:.2f}, at {ours:.2f}; 95 % is within {one.alone.delta_e_p95:.1f} with one"
-                f" and {one.ours.delta_e_p95:.1f} with ours.",
-            )
-        )  # fmt: skip
+                f"every appearance: at least {TIMES_BETTER:g} times nearer than one projector at the same exposure",
+                f"{len(shown) - len(close)} of {len(shown)}: " + "; ".join(map(_gain, shown)),
+                not close,
+                " ".join(map(_close, close)),
+            ),
+        ]
     return (*found, *_against_dimmed(shown))
 
 
@@ -193,11 +186,31 @@ def _near(found: Quality) -> bool:
     return found.delta_e <= MOST_DELTA_E and found.delta_e_p95 <= MOST_DELTA_E_P95
 
 
+def _distance(one: PhotographedLook) -> str:
+    return (
+        f"{one.look.title} {one.ours.delta_e:.2f} and {one.ours.delta_e_p95:.1f} on {one.share:.0%} of the object"
+        f" ({one.whole.delta_e:.2f} and {one.whole.delta_e_p95:.1f} on all of it)"
+    )
+
+
 def _shortfall(one: PhotographedLook) -> str:
     model = f"{one.model.delta_e:.2f} in the median and {one.model.delta_e_p95:.1f} in 95 %"
     if not _near(one.model):
-        return f"By the model, too, these frames come no nearer than {model}: the projectors cannot make its detail."
-    return f"By the model these frames come to {model}; the rest is the calibration's error and noise."
+        return f"{one.look.title}: by the model, too, these frames come no nearer than {model}."
+    return f"{one.look.title}: by the model {model}; the rest is the calibration's error and noise."
+
+
+def _gain(one: PhotographedLook) -> str:
+    ours, other = one.ours.delta_e, one.alone.delta_e
+    return f"{one.look.title} {other:.2f} to {ours:.2f}, {other / ours:.1f} times"
+
+
+def _close(one: PhotographedLook) -> str:
+    return (
+        f"{one.look.title}: half of it is within {one.alone.delta_e:.2f} with one projector, and calibration and noise"
+        f" keep ours, by the model {one.model.delta_e:.2f}, at {one.ours.delta_e:.2f}; 95 % is within"
+        f" {one.alone.delta_e_p95:.1f} with one and {one.ours.delta_e_p95:.1f} with ours."
+    )
 
 
 def _rounded(value: float | None) -> float | None:
@@ -285,8 +298,9 @@ One painted object gets all the appearances of the paper's figures. Blender rend
 shape, in the calibrated view; the others are made from its normals, its own coordinates and its photograph under white
 light. Each is solved in full at the largest exposure that 95 % of the object can reach, and compared where it is in
 reach. *One projector* is the method before superposition, a division at each pixel (Nayar 2003, Grossberg 2004), with
-the projector that lights most of the object. It is shown at our exposure, where it lacks light, and at the exposure
-that it can reach itself, where both are compared on the pixels that it reaches.
+the projector that lights most of the object, and with our correction for the light that comes back from the room. It is
+shown at our exposure, where it lacks light, and at the exposure that it can reach itself, where both are compared on
+the pixels that it reaches.
 Paint absorbs colours that no light can restore. Large parts of a blue glaze on yellow and red paint, and of bright
 highlights, are out of reach: the figures *in reach* are without them, those of the *whole object* include them.
 The lowered head bends everything at the same height, here the vase's neck. All is seen from the calibrating camera:

@@ -155,9 +155,10 @@ def test_another_body_and_new_firmware_of_the_camera(tmp_path: Path) -> None:
     ]
 
 
-def photograph(stage: Path, run: str, lens: str, focal_mm: float) -> None:
+def photograph(stage: Path, run: str, lens: str | None, focal_mm: float | None) -> None:
     tags = Image.Exif()
-    tags.get_ifd(0x8769).update({0xA434: lens, 0x920A: focal_mm})
+    told = {0xA434: lens, 0x920A: focal_mm}
+    tags.get_ifd(0x8769).update({tag: value for tag, value in told.items() if value is not None})
     folder = stage / "runs" / run / "captures" / "left"
     folder.mkdir(parents=True)
     Image.new("RGB", (8, 8)).save(folder / "0001.jpg", exif=tags)
@@ -174,6 +175,12 @@ def test_another_lens_and_a_turned_zoom(tmp_path: Path) -> None:
     assert compared(before, tuple(lens_facts(tmp_path))) == [
         "The camera's lens was EF 24-70mm f/2.8L, and is now EF 50mm f/1.8."
     ]
+    photograph(tmp_path, "20260503-110000-drift", None, None)
+    assert [fact.value for fact in lens_facts(tmp_path)] == ["EF 50mm f/1.8", "50 mm"], "of the newest that tells one"
+    photograph(tmp_path, "20260503-120000-drift", "Old 50mm", None)
+    assert [fact.value for fact in lens_facts(tmp_path)] == ["Old 50mm", None]
+    photograph(tmp_path, "20260503-130000-drift", None, 35.0)
+    assert [fact.value for fact in lens_facts(tmp_path)] == ["unnamed", "35 mm"]
     broken = tmp_path / "runs/20260504-100000-drift/captures"
     broken.mkdir(parents=True)
     (broken / "0001.jpg").write_bytes(b"no photograph")

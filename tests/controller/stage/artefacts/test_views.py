@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from controller.stage.artefacts.grade import FIGURES, worst_of, worst_view
+from controller.stage.artefacts.names import write_json
 from controller.stage.artefacts.views import (
     first_view,
     is_whole,
@@ -38,6 +40,21 @@ def test_a_view_that_is_not_whole_is_not_listed(tmp_path: Path) -> None:
     assert list(view_folders(tmp_path)) == ["camera", "back"]
     reopen_view(folder)
     assert list(view_folders(tmp_path)) == ["camera"]
+
+
+def test_the_worst_view_and_projector_are_of_all_views(tmp_path: Path) -> None:
+    write_view(tmp_path, "front", 0)
+    folder = view_folder(tmp_path, "back")
+    folder.mkdir(parents=True)
+    write_view(folder, "back", 1)
+    assert worst_of(tmp_path) is None
+    assert worst_view(tmp_path) == ("front", tmp_path)
+    write_json(tmp_path / FIGURES, {"left": {"relative_rms": 0.02}, "right": {"relative_rms": 0.03}})
+    write_json(folder / FIGURES, {"left": {"relative_rms": 0.05}, "right": {"relative_rms": 0.01}})
+    assert worst_of(tmp_path) == ("left", 5.0)
+    assert worst_view(tmp_path) == ("back", folder)
+    write_json(tmp_path / FIGURES, {"left": {"relative_rms": 0.06}, "right": {"relative_rms": 0.0}})
+    assert worst_view(tmp_path) == ("front", tmp_path)
 
 
 def test_any_name_has_a_folder_of_its_own(tmp_path: Path) -> None:

@@ -195,14 +195,24 @@ def test_a_stop_reaches_every_view(tmp_path: Path) -> None:
     assert "back" not in view_folders(stage.run_folder)
 
 
-def test_a_view_whose_light_can_not_be_calibrated_is_not_whole_and_the_others_are(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (CalibrationError("projector-reaches-nothing", what="No pixel.", remedy="Look."), "No pixel."),
+        (ZeroDivisionError("by zero"), "ZeroDivisionError: by zero."),
+    ],
+    ids=["refused", "fault"],
+)
+def test_a_view_whose_light_can_not_be_calibrated_is_not_whole_and_the_others_are(
+    tmp_path: Path, error: Exception, told: str
+) -> None:
     stage = Stage(tmp_path)
     steps = stage.steps
 
     def make(rig: Rig, folder: Path) -> Sequence[Step]:
         def refuse(context: Context) -> Sequence[Path]:
             if rig.view == "back":
-                raise CalibrationError("projector-reaches-nothing", what="No pixel was found.", remedy="Look.")
+                raise error
             return ()
 
         return [*steps(rig, folder), Step(StepId("pixels"), refuse, calculates=True)]
@@ -210,4 +220,4 @@ def test_a_view_whose_light_can_not_be_calibrated_is_not_whole_and_the_others_ar
     stage.steps = make  # type: ignore[method-assign]
     stage.run()
     assert list(view_folders(stage.run_folder)) == ["front"]
-    assert "View back is not whole: No pixel was found." in stage.said.warnings
+    assert f"View back is not whole: {told}" in stage.said.warnings
