@@ -7,6 +7,8 @@ in ``controller.core.errors``. Only the standard library is imported here: the p
 
 from __future__ import annotations
 
+import functools
+
 
 class CodedError(Exception):
     """An error that a person can act on: the base of ``DeviceError`` and of the controller's ``VelaturaError``.
@@ -23,6 +25,11 @@ class CodedError(Exception):
         self.code = code
         self.what = what
         self.remedy = remedy
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # By itself an error is sent to another process by its positional arguments alone.
+        made = functools.partial(type(self), self.code, what=self.what, remedy=self.remedy)
+        return made, (), self.__dict__
 
 
 class DeviceError(CodedError):

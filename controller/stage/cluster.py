@@ -1,12 +1,11 @@
 """Solves on many machines with Dask: the workers' tasks, and the connection to the scheduler.
 
 Tasks are plain functions of plain values, sent by name. A worker is a process with this release installed. It runs one
-task at a time, because the compiled kernels use all of its cores. Errors are returned as values, because Dask can't
-transfer our exceptions. A task whose worker fails is started again.
+task at a time, because the compiled kernels use all of its cores. A task whose worker fails is started again.
 
 Dask's protocol unpickles the data of its peers: a scheduler and its workers can run any code here, and the other way
-round. So they need their own network, or TLS with certificates on both sides (address ``tls://``; the files as in
-Dask's configuration, ``distributed.comm.tls``).
+round. So they need their own network, or TLS with certificates on both sides (address ``tls://``): those of a house
+(``controller.stage.link.peers``), or the files in Dask's configuration, ``distributed.comm.tls``.
 """
 
 from __future__ import annotations
@@ -16,16 +15,17 @@ import hashlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
-import xxhash
 
 from controller.core.arrays import FloatImage
-from controller.core.errors import UsageError, VelaturaError, WorkError
+from controller.core.errors import UsageError, WorkError
 from controller.core.extras import extra_missing
 from controller.optics.solve.appearance import Base, StageLight, prepare_base
 from controller.optics.solve.bounded.engine import SolveContext
@@ -47,7 +47,7 @@ _CODE: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class StageData:
     """Data for all appearances of a stage; a worker gets it once.
 
@@ -60,73 +60,26 @@ class StageData:
     black: FloatImage
     indirect: ReflectedLight | None = None
 
-    def digest(self) -> str:
-        """A hash of the contents, so that equal stages are sent only once."""
-        hashed = xxhash.xxh3_128()
-        for name, array in sorted(self.transport.arrays().items()):
-            _update(hashed, name, array)
-        for number, array in enumerate((self.image, *self.solution.frames, self.black)):
-            _update(hashed, str(number), array)
-        for name, array in sorted(({} if self.indirect is None else self.indirect.arrays()).items()):
-            _update(hashed, f"indirect {name}", array)
-        return hashed.hexdigest()
+
+_kept: Final[WeakKeyDictionary[StageData, tuple[Base, DriveLevels]]] = WeakKeyDictionary()
 
 
-def _update(hashed: xxhash.xxh3_128, name: str, array: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> None:
-    hashed.update(f"{name} {array.dtype} {array.shape}".encode())
-    if array.size:
-        hashed.update(np.ascontiguousarray(array).data.cast("B"))
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome(Generic[Value]):
-    """The result of a task: a value, or the code and the sentences of its error."""
-
-    value: Value | None
-    error: tuple[type[VelaturaError], str, str, str] | None
-
-    def unwrapped(self) -> Value:
-        """The value. Raises the error of the worker."""
-        if self.error is not None:
-            kind, code, what, remedy = self.error
-            raise kind(code, what=what, remedy=remedy)
-        assert self.value is not None
-        return self.value
-
-
-def _outcome_of(work: Callable[[], Value]) -> Outcome[Value]:
-    try:
-        with _RUNNING:
-            return Outcome(work(), None)
-    except VelaturaError as error:
-        return Outcome(None, (type(error), error.code, error.what, error.remedy))
-
-
-_kept: dict[str, tuple[Base, DriveLevels]] = {}
-
-
-def make_there(stage: StageData, key: str, asked: Target, options: SolveOptions) -> Outcome[AppearanceResult]:
-    """An appearance from ``solve.request.solve_appearance``; ``key`` identifies the stage's contents."""
-
-    def work() -> AppearanceResult:
-        if key not in _kept:
+def make_there(stage: StageData, asked: Target, options: SolveOptions) -> AppearanceResult:
+    """An appearance from ``solve.request.solve_appearance``."""
+    with _RUNNING:
+        if stage not in _kept:
             _kept.clear()  # keep one stage only: it fills a worker's memory
             base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
-            _kept[key] = base, DriveLevels.of_transport(stage.transport)
-        base, drive = _kept[key]
+            _kept[stage] = base, DriveLevels.of_transport(stage.transport)
+        base, drive = _kept[stage]
         light = StageLight(stage.transport, stage.black, stage.indirect, drive)
         engine = choose_engine("cpu", lambda note: None)
         return solve_appearance(light, base, asked, options, SolveContext(engine))
 
-    return _outcome_of(work)
 
-
+@cache
 def code_digest() -> str:
     """A hash of this process's code that affects results; it must be the same on all machines."""
-    return _CODE_DIGEST
-
-
-def _digest_of_code() -> str:
     hashed = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).resolve().parents[2]
     for name in _CODE:
@@ -136,9 +89,7 @@ def _digest_of_code() -> str:
     return hashed.hexdigest()
 
 
-# read at import: the files may be replaced later
-_CODE_DIGEST: Final = _digest_of_code()
-
+code_digest()  # the files may be replaced later
 
 CONNECT_S: Final = 10.0
 WORKERS_S: Final = 60.0
@@ -154,61 +105,55 @@ class Cluster:
     """Workers of a scheduler. For calls from one thread."""
 
     def __init__(self, client: Any, address: str) -> None:
-        self._client = client
+        self.client = client
         self._address = address
-        self._shared: dict[str, Any] = {}
 
     @property
     def workers(self) -> int:
         """Number of workers now."""
-        info: dict[str, Any] = self._client.scheduler_info(n_workers=-1)
+        info: dict[str, Any] = self.client.scheduler_info(n_workers=-1)
         return len(info["workers"])
 
-    def submit(self, function: Callable[..., Outcome[Value]], *arguments: Any) -> Task[Value]:
+    def submit(self, function: Callable[..., Value], *arguments: Any) -> Task[Value]:
         """Start ``function(*arguments)`` on a worker; ``Shared`` arguments arrive there as their values."""
-        return Task(self, lambda: self._begin(function, arguments))
+        return Task(self, lambda: self.client.submit(function, *map(self._placed, arguments), pure=False, retries=0))
 
-    def share(self, key: str, value: Any) -> Shared:
-        """Data for many tasks. ``key`` identifies the content; each worker gets it once, at its first use."""
-        return Shared(key, value)
-
-    def _begin(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        given = [self._placed(part) if isinstance(part, Shared) else part for part in arguments]
-        return self._client.submit(function, *given, pure=False, retries=0)
-
-    def _placed(self, shared: Shared) -> Any:
+    def _placed(self, shared: Any) -> Any:
         """The data in the cluster; sent again if its worker is gone."""
-        future = self._shared.get(shared.key)
-        if future is None or future.status != "finished":
+        if not isinstance(shared, Shared):
+            return shared
+        if shared.future is None or shared.future.status != "finished":
             self.wait_for_workers(lambda: None)
             # Never twice under one name: a worker that still asks a lost worker for the data would drop the new copy,
             # the scheduler would believe that the worker has it, and its tasks would wait for ever.
-            name = f"{shared.key}-{secrets.token_hex(8)}"
-            (future,) = self._client.scatter({name: shared.value}, hash=False).values()
-            self._shared[shared.key] = future
-        return future
+            name = f"velatura-stage-{secrets.token_hex(8)}"
+            (shared.future,) = self.client.scatter({name: shared.value}, hash=False).values()
+        return shared.future
 
-    def wait_for_workers(self, check: Callable[[], None]) -> None:
+    def wait_for_workers(self, check: Callable[[], None], within_s: float | None = None) -> None:
         """Return once there is a worker.
 
-        Raises WorkError("no-workers") after ``WORKERS_S`` without one, and what ``check`` raises.
+        Raises WorkError("no-workers") after ``WORKERS_S``, or ``within_s``, without one, and what ``check`` raises.
         """
+        most_s = WORKERS_S if within_s is None else within_s
         began_s = time.monotonic()
         while self.workers == 0:
             check()
-            if time.monotonic() - began_s > WORKERS_S:
+            if time.monotonic() - began_s >= most_s:
                 raise WorkError(
                     "no-workers",
-                    what=f"The scheduler at {self._address} has had no worker for {WORKERS_S:g} seconds.",
+                    what=f"The scheduler at {self._address} has had no worker for {most_s:g} seconds.",
                     remedy="Start workers (docs/how-to/cluster.md), or solve without --scheduler.",
                 )
             time.sleep(POLL_S)
 
-    def check_code(self) -> None:
-        """Raise UsageError("workers-differ") unless every worker has the same code as this process."""
+    def check_code(self, within_s: float | None = None) -> None:
+        """Raise UsageError("workers-differ") unless every worker has the same code as this process, and WorkError
+        as ``wait_for_workers``.
+        """
         ours = code_digest()
-        self.wait_for_workers(lambda: None)
-        theirs = self._client.run(code_digest, on_error="return")
+        self.wait_for_workers(lambda: None, within_s)
+        theirs = self.client.run(code_digest, on_error="return")
         other = [address for address, digest in theirs.items() if digest != ours]
         if other:
             raise UsageError(
@@ -219,11 +164,11 @@ class Cluster:
 
 
 class Shared:
-    """Data named by its content; see ``Cluster.share``."""
+    """Data for many tasks of one ``Cluster``; each worker gets it once, at its first use."""
 
-    def __init__(self, key: str, value: Any) -> None:
-        self.key = key
+    def __init__(self, value: Any) -> None:
         self.value = value
+        self.future: Any = None
 
 
 class Task(Generic[Value]):
@@ -252,10 +197,10 @@ class Task(Generic[Value]):
                 self.cancel()
                 raise
             if self._future.status == "finished":
-                with contextlib.suppress(*_lost()):
-                    outcome: Outcome[Value] = self._future.result(timeout=WORKERS_S)
-                    return outcome.unwrapped()
-            elif self._future.status == "error" and not isinstance(self._future.exception(), _lost()):
+                with contextlib.suppress(*lost()):
+                    value: Value = self._future.result(timeout=WORKERS_S)
+                    return value
+            elif self._future.status == "error" and not isinstance(self._future.exception(), lost()):
                 raise self._future.exception()
             self._cluster.wait_for_workers(check)
             self._future = self._begin()
@@ -270,7 +215,7 @@ class Task(Generic[Value]):
         self._future.cancel()
 
 
-def _lost() -> tuple[type[BaseException], ...]:
+def lost() -> tuple[type[BaseException], ...]:
     """Dask's errors for a lost worker or its lost data."""
     from concurrent.futures import CancelledError
 
@@ -281,14 +226,19 @@ def _lost() -> tuple[type[BaseException], ...]:
 
 
 @contextlib.contextmanager
-def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster]:
+def connected(
+    address: str, *, timeout_s: float = CONNECT_S, workers_s: float | None = None, tls: Sequence[Path] = ()
+) -> Iterator[Cluster]:
     """A connection to the scheduler at ``address``, such as tcp://host:8786 or tls://host:8786.
+
+    ``workers_s``: how long to wait for a first worker; ``tls``: authority, certificate and key; none: as Dask is set
 
     Raises UsageError "extra-missing" (the package distributed is not installed), "scheduler-address" or
     "workers-differ"; WorkError "scheduler-unreachable" or "no-workers".
     """
     try:
         from distributed import Client
+        from distributed.security import Security
     except ModuleNotFoundError as error:
         raise extra_missing(error.name or "") or error from error
     if not address.startswith(("tcp://", "tls://")):
@@ -297,8 +247,10 @@ def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster
             what=f"{address!r} is not a scheduler's address.",
             remedy="Write it as tcp://host:8786 or tls://host:8786.",
         )
+    files = dict(zip(("tls_ca_file", "tls_client_cert", "tls_client_key"), map(str, tls), strict=False))
+    given = {"security": Security(require_encryption=True, **files)} if files else {}  # type: ignore[no-untyped-call]
     try:
-        client: Any = Client(address, timeout=timeout_s, set_as_default=False, name="velatura")  # type: ignore[no-untyped-call]
+        client: Any = Client(address, timeout=timeout_s, set_as_default=False, name="velatura", **given)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise WorkError(
             "scheduler-unreachable",
@@ -307,7 +259,7 @@ def connected(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Cluster
         ) from error
     try:
         cluster = Cluster(client, address)
-        cluster.check_code()
+        cluster.check_code(workers_s)
         yield cluster
     finally:
         client.close()

@@ -11,6 +11,38 @@ import pytest
 from tests.booted.kiosk import PICTURE_S, SERVICES, Kiosk
 from tests.booted.machine import ADDRESS, STAGE
 
+_HOUSE = """
+import sys
+from pathlib import Path
+from controller.stage.link.membership import Authority, Membership
+from controller.stage.link.peers import keep_peer
+house = Authority(Path("/tmp/authority"), "City").peers()
+own = "/run/velatura/cluster"
+for name, place, endpoints in (("house", "/tmp/house", ()), ("knight", own, ("tls/127.0.0.1:7447",))):
+    member = Membership(Path(place), name, "City", endpoints)
+    keep_peer(member.folder, member, lambda asked: house.certify(asked, name))
+"""
+_LISTENS = """
+import sys
+from pathlib import Path
+from controller.stage.link.peers import peer, scheduler_at
+sys.exit(scheduler_at(peer(Path("/run/velatura/cluster"))) is None)
+"""
+_SOLVED = """
+from pathlib import Path
+from controller.stage.cluster import connected
+from controller.stage.link.peers import peer, scheduler_at, tls_files
+def tried(*places):
+    import os
+    seen = [os.access(place, os.R_OK) for place in places]
+    return [os.nice(0), os.sched_getscheduler(0) == os.SCHED_IDLE, os.getuid() > 60000, seen]
+import sys, cloudpickle
+cloudpickle.register_pickle_by_value(sys.modules["__main__"])
+there = peer(Path("/run/velatura/cluster"))
+with connected(scheduler_at(there), workers_s=240, tls=tls_files(there)) as cluster:
+    private = "/var/lib/velatura/stage", "/run/velatura/player.sock", "/etc/velatura/panel.key"
+    print(cluster.submit(tried, *private).result())
+"""
 EXPOSED_TENTHS = 30
 """Of systemd's measure of what a service could do; 100 is everything."""
 
@@ -59,10 +91,29 @@ def test_the_first_password_is_told_once_and_not_in_the_journal(bare: Kiosk) -> 
     assert bare.machine.called("test", "-e", "/run/velatura/first-login").returncode == 1
 
 
-@pytest.mark.parametrize("service", ["velatura-player", "velatura-controller"])
+@pytest.mark.parametrize("service", ["velatura-player", "velatura-controller", "velatura-worker"])
 def test_a_service_that_is_broken_into_can_do_little_on_this_debian(bare: Kiosk, service: str) -> None:
     most = f"--threshold={EXPOSED_TENTHS}"
     print(bare.machine.call("systemd-analyze", "security", "--no-pager", most, service).splitlines()[-1])
+
+
+def test_a_closed_stage_solves_for_its_house_and_what_it_is_sent_sees_nothing_of_it(bare: Kiosk) -> None:
+    machine, python = bare.machine, "/opt/velatura/bin/python"
+    machine.call("velatura", "kiosk", "install", "--worker")
+    machine.call(python, "-c", _HOUSE, user="velatura")
+    machine.call("systemd-run", "--unit=house", "--uid=velatura", "--setenv=HOME=/tmp", "--",
+                 "velatura", "kiosk", "worker", "/tmp/house")  # fmt: skip
+    said_again = "while sleep 5; do touch /run/velatura/cluster/closed; done"
+    machine.call("systemd-run", "--unit=closed", "--uid=velatura", "--", "sh", "-c", said_again)
+    machine.wait_for(lambda: machine.called(python, "-c", _LISTENS, user="velatura").returncode == 0)
+    solved = machine.called(python, "-c", _SOLVED, user="velatura")
+    told = machine.call("journalctl", "--no-pager", "--output=cat", "--unit=velatura-worker", "--unit=house")
+    assert solved.stdout.strip() == "[19, True, True, [False, False, False]]", solved.stderr + told
+    machine.call("systemctl", "stop", "closed")
+    machine.call("rm", "/run/velatura/cluster/closed")
+    commands = "cat /proc/[0-9]*/cmdline | tr '\\0' ' '"
+    machine.wait_for(lambda: "dask worker" not in machine.call("sh", "-c", commands))
+    machine.call("systemctl", "disable", "--quiet", "--now", "house", "velatura-worker")
 
 
 def test_a_graphics_processor_could_solve_on_this_debian(bare: Kiosk) -> None:

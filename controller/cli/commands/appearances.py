@@ -25,7 +25,8 @@ class SolveChoice:
         Literal["minimum", "white", "high-pass"] | None, typer.Option(help="Base image (default: from stage.toml).")
     ] = None
     scheduler: Annotated[
-        str | None, typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786.")
+        str | None,
+        typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786 (default: that of its house)."),
     ] = None
     refine: Annotated[
         int | None, typer.Option(help="Photographs that correct each result (default: from stage.toml).", min=0, max=9)

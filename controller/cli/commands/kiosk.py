@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from controller.cli import console
-from controller.cli.commands.service import agent, install, serve, uninstall, update
+from controller.cli.commands.service import agent, install, serve, uninstall, update, worker
 from controller.cli.derived import call, commands, job
 from controller.cli.groups import Members, StageFolder, group
 from controller.core.errors import UsageError
@@ -174,7 +174,7 @@ def _members() -> Members:
     derived = commands("kiosk")
     shown, work = ([derived.pop(name) for name in names] for names in (_SHOWN, _WORK))
     return {
-        "Run it": (serve, agent, install, update, uninstall, status, events),
+        "Run it": (serve, agent, worker, install, update, uninstall, status, events),
         "What it shows": shown,
         "Calibration and appearances": (*work, results, aim),
         "Look after it": (schedule, settings, ACCOUNT, HOUSE, *derived.values()),

@@ -143,6 +143,20 @@ def agent(
     work(do)
 
 
+def worker(
+    folder: Annotated[Path, typer.Argument(help="What the kiosk tells its workers in; the service has it.")],
+) -> None:
+    """Solve for the stages of the house while this one is closed; on the house, share the work out."""
+
+    def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
+        from controller.kiosk.house.workers import work as run
+
+        run(folder, cancel)
+        return {}
+
+    work(do)
+
+
 @contextlib.contextmanager
 def _on_screen(say: Callable[[str], object], code: str) -> Iterator[None]:
     """The code of a computer that joins, on its first projector; here in any case."""
@@ -183,6 +197,9 @@ def install(
     player: Annotated[
         bool, typer.Option("--player", help="Only outputs of a stage that another computer runs.")
     ] = False,
+    worker: Annotated[
+        bool, typer.Option("--worker", help="Solve for the stages of the house while this one is closed.")
+    ] = False,
     trust: Annotated[
         list[Path] | None, typer.Option(help="Take updates signed by this public key (.pub); can be repeated.")
     ] = None,
@@ -201,6 +218,8 @@ def install(
         steps.install_player(system, say=console.say, restart=restart)
     else:
         steps.install(system, outputs_again=outputs, restart=restart, say=console.say)
+        if worker:
+            steps.install_worker(system)
     text = "The kiosk runs, and starts with this computer."
     if backup is not None:
         text = "The backup is in place. `velatura kiosk changes` and `velatura doctor` tell what is different here."

@@ -41,7 +41,8 @@ from controller.kiosk.operations.house import (
 from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventLevel
 from controller.stage.link.joining import admit
-from controller.stage.link.membership import Authority
+from controller.stage.link.membership import Authority, Certified, Membership
+from controller.stage.link.peers import keep_peer, peer_folder
 from controller.stage.link.session import EVERYWHERE, PORT, house_link
 from controller.stage.link.transfer import Arrivals, Offer, send
 from hal.errors import CodedError
@@ -151,6 +152,13 @@ class House:
             stage.linked = False
             link.subscribe(f"member/{name}/state", Report, partial(self._hear, name))
             link.watch(f"member/{name}/here", partial(self._appear, name, self._openings))
+            link.answer(f"member/{name}/peer", bytes, partial(self._certify, name))
+        with contextlib.suppress(OSError):  # solves then stay where they are
+            keep_peer(peer_folder(self._stage), Membership(self._stage, "house", self._settings.name, ()),
+                      partial(self._certify, "house"))  # fmt: skip
+
+    def _certify(self, name: str, request: bytes) -> Certified:
+        return self._authority.peers().certify(request, name)
 
     def _appear(self, name: str, opening: int, here: bool) -> None:
         if opening != self._openings or self._ended.is_set():

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from controller.core.errors import UsageError, WorkError
 from controller.core.kiosk_places import is_installed
+from controller.kiosk.house.workers import may_solve, say_closed
 from controller.kiosk.install.system import System
 from controller.kiosk.install.update import Outcome, Packages, outcome
 from controller.kiosk.interface import Kiosk
@@ -24,7 +25,8 @@ from controller.kiosk.operations.table import OPERATIONS
 from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
-from controller.stage.link.membership import Membership, leave, membership
+from controller.stage.link.membership import Certified, Membership, leave, membership
+from controller.stage.link.peers import keep_peer, peer_folder
 from controller.stage.link.session import EVERYWHERE, Link, member_link
 from controller.stage.link.transfer import Offer
 from hal.errors import CodedError
@@ -32,6 +34,7 @@ from hal.errors import CodedError
 PAUSE_S: Final = 2.0
 """Between two states, at least."""
 AGAIN_S: Final = 30.0
+CERTIFIED_S: Final = 600.0
 MOST_EVENTS: Final = 200
 PICTURE_PX: Final = 160
 _VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb}
@@ -70,7 +73,7 @@ class Member:
         if computer is None and is_installed(stage):
             computer = System(lambda line: None)
         self._computer = computer
-        self._kiosk, self._folder = kiosk, stage / MEMBERSHIP
+        self._kiosk, self._stage, self._folder = kiosk, stage, stage / MEMBERSHIP
         self._host, self._joining = host, joining
         self._lock = threading.Lock()
         self._running: _Reports | None = None
@@ -123,7 +126,7 @@ class Member:
             try:
                 there = membership(self._folder)
                 if there is not None and self._running is None:
-                    self._running = _Reports(self._kiosk, there, self._computer)
+                    self._running = _Reports(self._kiosk, there, self._computer, peer_folder(self._stage))
             except CodedError as error:
                 self._kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
 
@@ -141,8 +144,9 @@ class Member:
 class _Reports:
     """The link of one membership, and the thread that publishes."""
 
-    def __init__(self, kiosk: Kiosk, member: Membership, computer: System | None) -> None:
-        self._kiosk, self._member, self._computer = kiosk, member, computer
+    def __init__(self, kiosk: Kiosk, member: Membership, computer: System | None, peers: Path) -> None:
+        self._kiosk, self._member, self._computer, self._peers = kiosk, member, computer, peers
+        self._certify_s = 0.0
         self._key = f"member/{member.name}"
         self._link: Link = member_link(member)
         self._changed, self._ended = threading.Event(), threading.Event()
@@ -165,12 +169,15 @@ class _Reports:
         self._changed.set()
         self._link.close()
         self._forget_backup()
+        say_closed(self._peers, False)
 
     def _publish(self) -> None:
         last, sent_s, number = None, 0.0, 0
         while not self._ended.is_set():
             self._changed.wait(AGAIN_S)
             self._changed.clear()
+            with contextlib.suppress(CodedError, OSError):  # without a house or a disk it solves nothing for others
+                self._offer_solves()
             events = tuple(self._kiosk.events(number))
             report = self._report(events[-MOST_EVENTS:])
             if report != last or time.monotonic() - sent_s >= AGAIN_S:
@@ -178,6 +185,16 @@ class _Reports:
                 last, sent_s = replace(report, events=()), time.monotonic()
                 number = events[-1].number if events else number
             self._ended.wait(PAUSE_S)
+
+    def _offer_solves(self) -> None:
+        """Let the house's solves use this computer while the stage is closed."""
+        closed = may_solve(self._kiosk.snapshot(), time.time())
+        if closed and time.monotonic() >= self._certify_s:
+            keep_peer(
+                self._peers, self._member, lambda request: self._link.ask(f"{self._key}/peer", request, Certified)
+            )
+            self._certify_s = time.monotonic() + CERTIFIED_S
+        say_closed(self._peers, closed)
 
     def _report(self, events: Sequence[EventRow]) -> Report:
         now = self._kiosk.snapshot()

@@ -42,7 +42,9 @@ _FOLDERS: Final = {
 def shipped(prefix: Path) -> dict[Path, str]:
     """Files that are the same on every kiosk, whose program is installed in ``prefix``."""
     found = {
-        Path("/etc/tmpfiles.d/velatura.conf"): f"d {RUNTIME} 0700 {USER} {USER} -\n",
+        Path("/etc/tmpfiles.d/velatura.conf"): (
+            f"d {RUNTIME} 0700 {USER} {USER} -\nd {RUNTIME}/cluster 0750 {USER} {USER} -\n"
+        ),
         Path("/etc/systemd/journald.conf.d/velatura.conf"): "[Journal]\nSystemMaxUse=200M\n",
     }
     for name, folder in _FOLDERS.items():
@@ -67,6 +69,7 @@ AMD: Final = "xserver-xorg-video-amdgpu"
 GROUPS: Final = ("dialout", "plugdev", "video", "render")
 SERVICES: Final = ("velatura-x11", "velatura-player", "velatura-controller")
 AGENT: Final = "velatura-agent"
+WORKER: Final = "velatura-worker"
 NETWORK: Final = Path("/etc/systemd/system/velatura-player.service.d/network.conf")
 TARGET: Final = "velatura.target"
 UPDATES: Final = "velatura-update.path"
@@ -103,6 +106,11 @@ def install_player(
     system.run("systemctl", "start", "velatura-x11", UPDATES)
     _outputs(system, again=not restart, say=say)
     system.run("systemctl", "restart", AGENT)
+
+
+def install_worker(system: System) -> None:
+    """Let an installed kiosk solve for its house. Raises WorkError("kiosk-step-failed")."""
+    system.run("systemctl", "enable", "--quiet", "--now", WORKER)
 
 
 def _conducts(system: System) -> bool:
@@ -147,6 +155,7 @@ def install(
         # other order there is no player for as long as the controller takes to stop.
         # A service that does not start tells why; the package must not stay half installed for it.
         system.run("systemctl", "restart", *reversed(SERVICES[1:]), may_fail=restart)
+        system.run("systemctl", "try-restart", WORKER, may_fail=True)
     system.run("systemctl", "start", TARGET, may_fail=restart)
     if not system.dry:
         _first_login(system, say)
@@ -162,7 +171,7 @@ def trust(system: System, key: Path) -> None:
 
 def uninstall(system: System, *, purge: bool, prefix: Path = Path(sys.prefix)) -> None:
     """Take everything back but the stage and the packages. ``purge``: the stage, the settings and the user, too."""
-    for unit in (TARGET, AGENT, UPDATES, *SERVICES):
+    for unit in (TARGET, AGENT, UPDATES, WORKER, *SERVICES):
         system.run("systemctl", "disable", "--now", "--quiet", unit, may_fail=True)
     for path in (*shipped(prefix), NETWORK, X_OUTPUTS, PLAYER_OPTIONS):
         system.remove(path)
@@ -234,7 +243,7 @@ def _folders(system: System) -> None:
     system.folder(STAGE, mode=0o750, owner=owner)
     # The example of docs/how-to/run-a-kiosk.md.
     system.folder(STATE / "backups", mode=0o750, owner=owner)
-    if not system.at(RUNTIME).is_dir():
+    if not system.at(RUNTIME / "cluster").is_dir():
         system.run("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/velatura.conf")
 
 

@@ -2,6 +2,9 @@
 
 A house, or the controller of several players, has an ``Authority`` in a folder below ``keys/`` of its stage. A member
 has a ``Membership`` in such a folder. A private key never leaves the computer that made it.
+
+Who solves for the others has a second certificate, by which it also serves (``Authority.peers``). Those have an
+authority of their own: by a certificate that may serve, a member could pass for the house.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from controller.core.storage import sync_folder, write_atomically
 
 AUTHORITY, CERTIFICATE, KEY = "authority.pem", "certificate.pem", "key.pem"
 """The files of TLS in either folder; only ``KEY``, and the authority's own key, are secret."""
-_AUTHORITY_KEY, _MEMBERS, _HOUSE = "authority-key.pem", "members.json", "house.json"
+_AUTHORITY_KEY, _MEMBERS, _HOUSE, _PEERS = "authority-key.pem", "members.json", "house.json", "peers"
 _NAME: Final = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 _BEGIN: Final = datetime(2020, 1, 1, tzinfo=UTC)
 """A computer whose clock lost its battery must not be shut out."""
@@ -66,11 +69,22 @@ def checked_name(name: str) -> str:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Certified:
+    """What ``Authority.certify`` answers, PEM."""
+
+    certificate: str
+    authority: str
+
+
 class Authority:
     """The certificate authority of a house; made at its first use. ``name``: of the house.
 
     Two processes must not change one at the same time.
     """
+
+    _uses: tuple[x509.ObjectIdentifier, ...] = (ExtendedKeyUsageOID.CLIENT_AUTH,)
+    """Of the certificates of members."""
 
     def __init__(self, folder: Path, name: str) -> None:
         """Raises UsageError("house-keys-damaged")."""
@@ -101,6 +115,13 @@ class Authority:
                 what=f"The house has a member with the name {name}.",
                 remedy="Choose another name, or remove that member first.",
             )
+        certified = f"{name}.{secrets.token_hex(8)}"
+        certificate = self.certify(request, certified).certificate
+        self._list({**self._members, name: Member(name, certified, address, time.time())})
+        return certificate.encode()
+
+    def certify(self, request: bytes, name: str) -> Certified:
+        """A certificate for a request of ``requested``. Raises UsageError("house-request-wrong")."""
         try:
             asked = x509.load_pem_x509_csr(request)
             valid = asked.is_signature_valid and isinstance(asked.public_key(), ec.EllipticCurvePublicKey)
@@ -112,12 +133,12 @@ class Authority:
                 what=f"{name} sent no valid request for a certificate.",
                 remedy="Install the same version of Velatura on both computers, and join again.",
             )
-        certified = f"{name}.{secrets.token_hex(8)}"
-        certificate = _signed(
-            certified, asked.public_key(), self._certificate.subject, self._key, ExtendedKeyUsageOID.CLIENT_AUTH
-        )
-        self._list({**self._members, name: Member(name, certified, address, time.time())})
-        return certificate
+        certificate = _signed(name, asked.public_key(), self._certificate.subject, self._key, *self._uses)
+        return Certified(certificate.decode(), (self.folder / AUTHORITY).read_text())
+
+    def peers(self) -> Authority:
+        """Of those who solve for each other; another one after a member was removed."""
+        return _Peers(self.folder / _PEERS, self.name)
 
     def remove(self, name: str) -> None:
         """Its certificate counts no more, also not when it joins again. Raises UsageError("house-member-unknown")."""
@@ -126,6 +147,7 @@ class Authority:
                 "house-member-unknown", what=f"The house has no member {name}.", remedy="Choose one of its page."
             )
         self._list({key: one for key, one in self._members.items() if key != name})
+        shutil.rmtree(self.folder / _PEERS, ignore_errors=True)
 
     def _list(self, members: dict[str, Member]) -> None:
         listed = [{slot: getattr(one, slot) for slot in Member.__slots__} for one in members.values()]
@@ -137,7 +159,7 @@ class Authority:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"house {secrets.token_hex(8)}")])
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = _signed(subject, key.public_key(), subject, key, None)
+        certificate = _signed(subject, key.public_key(), subject, key)
         server = ec.generate_private_key(ec.SECP256R1())
         for file, data in (
             (_AUTHORITY_KEY, _pem(key)),
@@ -147,6 +169,10 @@ class Authority:
             (_MEMBERS, b"[]"),
         ):
             write_atomically(self.folder / file, data, mode=0o600)
+
+
+class _Peers(Authority):
+    _uses = (ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH)
 
 
 def requested() -> tuple[bytes, bytes]:
@@ -217,9 +243,9 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _signed(
     subject: str | x509.Name, public: object, issuer: x509.Name, key: ec.EllipticCurvePrivateKey,
-    use: x509.ObjectIdentifier | None,
+    *uses: x509.ObjectIdentifier,
 ) -> bytes:  # fmt: skip
-    """A certificate (PEM) for one ``use``; None: of the authority itself. A member's can't serve: no member can pass
+    """A certificate (PEM) for these ``uses``; none: of the authority itself. A member's can't serve: no member can pass
     for the house.
     """
     assert isinstance(public, ec.EllipticCurvePublicKey)
@@ -232,10 +258,10 @@ def _signed(
         .serial_number(x509.random_serial_number())
         .not_valid_before(_BEGIN)
         .not_valid_after(datetime.now(UTC) + _VALID)
-        .add_extension(x509.BasicConstraints(use is None, 0 if use is None else None), critical=True)
+        .add_extension(x509.BasicConstraints(not uses, None if uses else 0), critical=True)
     )
-    if use is not None:
-        builder = builder.add_extension(x509.ExtendedKeyUsage([use]), critical=True)
+    if uses:
+        builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=True)
         # The TLS library of Zenoh refuses a certificate without one; addresses change, so it is not compared.
         builder = builder.add_extension(x509.SubjectAlternativeName([x509.DNSName("velatura")]), critical=False)
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)

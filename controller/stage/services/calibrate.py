@@ -202,7 +202,7 @@ class AppearanceOrder:
     base : the base image instead of stage.toml's
     refinement : how photographs then correct them; None keeps refined frames
     device : what solves, instead of stage.toml's
-    scheduler : a Dask cluster that solves the appearances
+    scheduler : a Dask cluster that solves the appearances; None: that of the stage's house, if it has workers now
     accept_grade : publish with any calibration grade
     """
 
@@ -237,7 +237,7 @@ def make_appearances(
         scale = costs.scale(size for _, size in output_sizes(checked).values())
         with (
             kernels_compiled(reporter) as compiled,
-            answering_on(order.scheduler, calibrated, requests) as answering,
+            answering_on(order.scheduler, calibrated, requests, folder) as answering,
             Journal(run) as journal,
         ):
             steps = [

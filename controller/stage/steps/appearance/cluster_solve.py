@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
 
+from controller.core.errors import VelaturaError, WorkError
+from controller.optics.solve.bounded.engine import Processor
 from controller.optics.solve.request import AppearanceResult, SolveOptions
 from controller.optics.solve.targets.values import Target
 from controller.run.runner import Context
 from controller.stage.artefacts.calibrated import Calibrated
-from controller.stage.cluster import Cluster, StageData, Task, connected, make_there
-from controller.stage.steps.appearance.solving import Answering, AppearanceRequest
+from controller.stage.cluster import Cluster, Shared, StageData, Task, connected, make_there
+from controller.stage.steps.appearance.solving import Answering, AppearanceRequest, answer_here
 
 
 class SpreadAppearances:
-    """Starts appearances elsewhere, and gives their results by name."""
+    """Starts appearances elsewhere, and gives their results by name. ``stage`` is asked for at the first one."""
 
-    def __init__(self, cluster: Cluster, stage: StageData) -> None:
-        key = f"velatura-stage-{stage.digest()}"
-        self._key, self._cluster = key, cluster
-        self._stage = cluster.share(key, stage)
+    def __init__(self, cluster: Cluster, stage: Callable[[], StageData]) -> None:
+        self.cluster, self._data = cluster, stage
+        self._stage: Shared | None = None
         self._begun: dict[str, Task[AppearanceResult]] = {}
 
     def begin(self, name: str, asked: Target, options: SolveOptions) -> None:
         """Start an appearance, unless it was started already."""
         if name not in self._begun:
-            self._begun[name] = self._cluster.submit(make_there, self._stage, self._key, asked, options)
+            stage = self._stage = self._stage or Shared(self._data())
+            self._begun[name] = self.cluster.submit(make_there, stage, asked, options)
 
     def answer(self, name: str, check: Callable[[], None]) -> AppearanceResult:
         """The result of a started one; errors as ``solve.request.solve_appearance`` and ``Task.result``."""
@@ -38,54 +43,80 @@ class SpreadAppearances:
         self._begun.clear()
 
 
-class ClusterSolve:
-    """Solves like ``steps.appearance.solving``; the first request also submits those that follow.
-
-    Requests with a step before their solving (Blender's) are submitted when it is their turn.
+def _answer_spread(
+    spread: SpreadAppearances,
+    requests: Sequence[AppearanceRequest],
+    request: AppearanceRequest,
+    options: SolveOptions,
+    context: Context,
+) -> AppearanceResult:
+    """An ``Answering``; the first request also submits those that follow, but for those with a step before their
+    solving (Blender's).
     """
+    context.advance(0.0, f"{spread.cluster.workers} workers")
+    names = [other.name for other in requests]
+    for other in requests[names.index(request.name) :]:
+        if other.name == request.name or other.prepare is None:
+            context.check()
+            spread.begin(other.name, other.target(), options)
+    return spread.answer(request.name, context.check)
 
-    def __init__(self, cluster: Cluster, calibrated: Calibrated, requests: Sequence[AppearanceRequest]) -> None:
-        self._cluster, self._calibrated, self._requests = cluster, calibrated, tuple(requests)
-        self._spread: SpreadAppearances | None = None
 
-    def __call__(self, request: AppearanceRequest, options: SolveOptions, context: Context) -> AppearanceResult:
-        """The result of one request."""
-        context.advance(0.0, f"{self._cluster.workers} workers")
-        spread = self._spread or self._opened()
-        names = [other.name for other in self._requests]
-        for other in self._requests[names.index(request.name) :]:
-            if other.name == request.name or other.prepare is None:
-                context.check()
-                spread.begin(other.name, other.target(), options)
-        return spread.answer(request.name, context.check)
+def _stage_data(calibrated: Calibrated) -> StageData:
+    base, black = calibrated.base, calibrated.calibration.black
+    return StageData(calibrated.transport, base.image, base.solution, black, calibrated.reflected)
 
-    def _opened(self) -> SpreadAppearances:
-        base, calibration = self._calibrated.base, self._calibrated.calibration
-        indirect = self._calibrated.reflected
-        stage = StageData(self._calibrated.transport, base.image, base.solution, calibration.black, indirect)
-        self._spread = SpreadAppearances(self._cluster, stage)
-        return self._spread
 
-    def cancel(self) -> None:
-        """Cancel the requests that are still running."""
-        if self._spread is not None:
-            self._spread.cancel()
+_LOST: Final = ("no-workers", "workers-lost")
+"""In the morning, when the stages open."""
 
 
 @contextlib.contextmanager
 def answering_on(
-    scheduler: str | None, calibrated: Calibrated, requests: Sequence[AppearanceRequest]
-) -> Iterator[Answering | None]:
-    """Solves appearances on the cluster of ``scheduler``; None without a scheduler.
+    scheduler: str | None, calibrated: Calibrated, requests: Sequence[AppearanceRequest], stage: Path
+) -> Iterator[Answering]:
+    """Solves appearances on the cluster of ``scheduler``; without one on that of the house of ``stage``, if it has
+    workers now; else here.
 
-    Raises what ``cluster.connect.connected`` raises.
+    Raises what ``cluster.connected`` raises, of ``scheduler`` alone.
     """
-    if scheduler is None:
-        yield None
-        return
-    with connected(scheduler) as cluster:
-        spreading = ClusterSolve(cluster, calibrated, requests)
-        try:
-            yield spreading
-        finally:
-            spreading.cancel()
+    here = partial(answer_here, calibrated)
+    with contextlib.ExitStack() as stack:
+        if scheduler is not None:
+            cluster = stack.enter_context(connected(scheduler))
+        else:
+            # A graphics processor is faster than they are.
+            of_house = _cluster_of_house(stage, stack) if isinstance(calibrated.engine, Processor) else None
+            if of_house is None:
+                yield here
+                return
+            cluster = of_house
+        spread = SpreadAppearances(cluster, partial(_stage_data, calibrated))
+        stack.callback(spread.cancel)
+        there = partial(_answer_spread, spread, requests)
+        yield there if scheduler is not None else partial(_answer_there, there, here)
+
+
+def _cluster_of_house(stage: Path, stack: contextlib.ExitStack) -> Cluster | None:
+    """None where there is none, or none that can solve for this stage now."""
+    try:
+        from controller.stage.link.peers import peer, peer_folder, scheduler_at, tls_files
+    except ModuleNotFoundError:  # an extra
+        return None
+    with contextlib.suppress(OSError, VelaturaError):
+        member = peer(peer_folder(stage))
+        if member is not None and (address := scheduler_at(member)) is not None:
+            return stack.enter_context(connected(address, workers_s=0, tls=tls_files(member)))
+    return None
+
+
+def _answer_there(
+    there: Answering, here: Answering, request: AppearanceRequest, options: SolveOptions, context: Context
+) -> AppearanceResult:
+    try:
+        return there(request, options, context)
+    except WorkError as error:
+        if error.code not in _LOST:
+            raise
+        context.reporter.say(f"{error.what} {request.title} is solved here.")
+        return here(request, options, context)

@@ -174,9 +174,10 @@ Answering = Callable[[AppearanceRequest, SolveOptions, Context], AppearanceResul
 """Solves an appearance, here or elsewhere."""
 
 
-def _answer_here(
+def answer_here(
     calibrated: Calibrated, request: AppearanceRequest, options: SolveOptions, context: Context
 ) -> AppearanceResult:
+    """An ``Answering`` by this computer."""
     solving = SolveContext(calibrated.engine, _watched(context), folder=calibrated.folder)
     base = calibrated.base if options.mode == "scale" else None
     return solve_appearance(calibrated.light, base, request.target(), options, solving)
@@ -190,7 +191,7 @@ def _solve_appearance(
     context: Context,
 ) -> Sequence[Path]:
     began_s = time.perf_counter()
-    made = (answering or partial(_answer_here, calibrated))(request, options, context)
+    made = (answering or partial(answer_here, calibrated))(request, options, context)
     if made.figures["advice"] is not None:
         context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
     for line in _limits(request.title, made.figures, options.share):

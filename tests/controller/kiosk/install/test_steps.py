@@ -39,6 +39,7 @@ class Recorded(System):
             self.write(Path(words[words.index("-keyout") + 1]), "a key")
         if words[0] == "systemd-tmpfiles":
             self.folder(RUNTIME)
+            self.folder(RUNTIME / "cluster")
 
 
 @pytest.fixture
@@ -91,7 +92,10 @@ def test_once_more_it_changes_nothing(debian: Path) -> None:
 def test_another_version_starts_controller_and_player_again_and_not_the_x_server(debian: Path) -> None:
     installed(debian, FRESH)
     ran = installed(debian, THERE, restart=True).ran
-    assert [line for line in ran if "restart" in line] == ["systemctl restart velatura-controller velatura-player"]
+    assert [line for line in ran if "restart" in line] == [
+        "systemctl restart velatura-controller velatura-player",
+        "systemctl try-restart velatura-worker",
+    ]
 
 
 def test_a_dry_run_writes_nothing_and_tells_all_of_it(debian: Path) -> None:
@@ -147,6 +151,19 @@ def test_a_computer_on_which_it_would_not_work_is_refused(
         steps.install(system, outputs_again=False, restart=False, say=system.told.append, prefix=prefix)
     assert isinstance(caught.value, UsageError)
     assert (caught.value.code, system.ran) == (code, [])
+
+
+def test_a_kiosk_that_solves_for_its_house_has_one_service_more_until_it_is_taken_back(debian: Path) -> None:
+    system = installed(debian, FRESH)
+    steps.install_worker(system)
+    assert system.ran[-1] == "systemctl enable --quiet --now velatura-worker"
+    restarted = installed(debian, THERE, restart=True).ran
+    assert restarted.index("systemctl try-restart velatura-worker") > restarted.index(
+        "systemctl restart velatura-controller velatura-player"
+    )
+    again = Recorded(debian, THERE)
+    steps.uninstall(again, purge=False, prefix=PREFIX)
+    assert "systemctl disable --now --quiet velatura-worker" in again.ran
 
 
 def test_uninstalling_takes_everything_back_but_the_stage(debian: Path) -> None:
