@@ -16,6 +16,7 @@ from lab.study.experiments.live import LIVE
 from lab.study.experiments.placement.experiment import PLACEMENT, planned_object
 from lab.study.experiments.regions import REGIONS
 from lab.study.experiments.residual import RESIDUAL, RESIDUAL_SIX
+from lab.study.experiments.residual_sweep import RESIDUAL_SWEEP
 from lab.study.experiments.robustness import ROBUSTNESS
 from lab.study.experiments.sharpness import SHARPNESS
 from lab.study.experiments.times.experiment import TIMES
@@ -27,6 +28,7 @@ EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     REGIONS,
     RESIDUAL,
     RESIDUAL_SIX,
+    RESIDUAL_SWEEP,
     SHARPNESS,
     FREQUENCY,
     FREQUENCY_SHARP,

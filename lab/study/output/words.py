@@ -32,6 +32,12 @@ of 16x16 camera pixels, over the target's white; the mean is over regions. The p
 by nor whether its figures are from the solve or from photographs; both are given here. Its shape and angles are not
 known to the degree either: places and squares were chosen before anything was measured, and not changed after. With
 smaller squares, more regions contain an edge, and every figure is larger.""",
+    "residual-sweep": """\
+The checkerboard of the page [Residual with one, two and three projectors](residual.md), with squares of three sizes, at
+four exposures, its residual normalised in five ways. The paper tells none of the three, and none is chosen here: the
+table shows which of them bring which of its figures. *Fall* is the residual with one projector over that with three; a
+square of a residual falls as the square of it, so the paper's fall of about seven times is not the same statement for
+both. All figures are means over regions of 16x16 camera pixels, over all that any of the three lights.""",
     "sharpness": """\
 lambda counts the edge pixels that photograph and target have in common over the larger number of edge pixels
 (eq. 9), in the neighbourhood of each pixel; edges are Canny's, at the target's own threshold. Two targets: a
@@ -101,6 +107,10 @@ than is missing here; why the rest is missing was not found.""",
     ("residual", "mean, median region"): """\
 Each projector adds the errors of its own calibration and its own noise; where one already reaches a region well, the
 next cannot make it better. That is what the median region shows, and the mean hides.""",
+    ("residual-sweep", "somewhere in the sweep"): """\
+Where squares are normalised, at exposures that one or two can make, one and two projectors come to the paper's figures,
+and three far below them, which counts as off, too. Without squares, the paper's fall is met where the target is
+brightest, at several times its figures: there light is lacking, as the page of three projectors says.""",
     ("residual-six", "mean, median region"): """\
 Where two projectors light a region well, further ones can hardly make it better: by the model they reduce the residual
 a little more, but the errors of their own calibration add as much. What is left of the mean and of the 95 % lies at
