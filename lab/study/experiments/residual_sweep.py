@@ -130,7 +130,7 @@ def _table(made: Sequence[Combination]) -> ResultTable:
         "squares across", "as bright as", "normalised", *counts, *(f"{count}, by the model" for count in counts),
         "fall from one to three", "times off the paper's, at most",
     )  # fmt: skip
-    rows: list[tuple[Cell, ...]] = [(None, "the paper, not told", "not told", *PAPER.values(), None, None, None,
+    rows: list[tuple[Cell, ...]] = [(None, "the paper, not reported", "not reported", *PAPER.values(), None, None, None,
                                      PAPER[1] / PAPER[3], 1.0)]  # fmt: skip
     rows += [
         (one.squares, one.exposure, one.normalised, *one.shown, *one.by_model, one.shown[0] / one.shown[-1], one.off)
