@@ -260,6 +260,7 @@ def update(
     elif dry_run:
         console.show_result(update.changes(system, package))
     else:
+        update.needs(system, package)
         with package.open("rb") as content:
             stream_atomically(update.OFFERED, lambda file: shutil.copyfileobj(content, file))
         console.show_result({"offered": package}, "`journalctl -fu velatura-update` tells what becomes of it.")

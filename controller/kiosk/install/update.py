@@ -11,16 +11,17 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import hashlib
+import itertools
 import json
 import os
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 from nacl.signing import SigningKey
 
@@ -86,26 +87,29 @@ def outcome(system: System) -> Outcome:
 
 def sign_package(package: Path, key: SigningKey, to: Path) -> None:
     """Write a Debian package with a signature behind it, which `dpkg` skips. Raises WorkError, OSError."""
-    content = package.read_bytes().partition(_TAIL)[0]
-    content += b"\n" * (len(content) % 2)
-    block = sign(_SIGNED, hashlib.sha256(content).digest(), key)
-    write_atomically(to, content + _TAIL + block)
+    digest = hashlib.sha256()
+
+    def write(copy: BinaryIO) -> None:
+        with package.open("rb") as file:
+            size, _ = _end_of_content(file)
+            for part in itertools.chain(_content(file, size), [b"\n" * (size % 2)]):
+                digest.update(part)
+                copy.write(part)
+        copy.write(_TAIL + sign(_SIGNED, digest.digest(), key))
+
+    stream_atomically(to, write)
 
 
 def check_package(package: Path, trusted: Path) -> None:
     """Raises UsageError("update-not-trusted") unless a key in the folder ``trusted`` has signed it."""
     try:
         with package.open("rb") as file:
-            file.seek(-len(_TAIL) - BLOCK_BYTES, os.SEEK_END)
-            size = file.tell()
-            tail, block = file.read(len(_TAIL)), file.read()
-            file.seek(0)
+            size, block = _end_of_content(file)
             digest = hashlib.sha256()
-            while size and (part := file.read(min(size, 1 << 20))):
+            for part in _content(file, size):
                 digest.update(part)
-                size -= len(part)
         keys = [load_public_key(path) for path in sorted(trusted.glob("*.pub"))]
-        if tail == _TAIL and keys:
+        if block and keys:
             check_signature(_SIGNED, digest.digest(), block, trusted=keys, allow_unsigned=False)
             return
     except (OSError, BundleError):
@@ -117,19 +121,46 @@ def check_package(package: Path, trusted: Path) -> None:
     )  # fmt: skip
 
 
+def _end_of_content(file: BinaryIO) -> tuple[int, bytes]:
+    """The bytes of a package without a signature behind it, and that signature; empty where it has none."""
+    size = file.seek(0, os.SEEK_END)
+    end = file.seek(max(0, size - len(_TAIL) - BLOCK_BYTES))
+    tail, block = file.read(len(_TAIL)), file.read()
+    return (end, block) if tail == _TAIL else (size, b"")
+
+
+def _content(file: BinaryIO, size: int) -> Iterator[bytes]:
+    file.seek(0)
+    while size and (part := file.read(min(size, 1 << 20))):
+        size -= len(part)
+        yield part
+
+
+def needs(system: System, package: Path) -> list[str]:
+    """The Debian packages that are to be installed for it, as apt says.
+
+    Raises UsageError("update-needs-packages") where this computer can't have them.
+    """
+    depends = (system.look("dpkg-deb", "--field", str(package), "Depends") or "").strip()
+    said = system.look("apt-get", "--simulate", "satisfy", depends) if depends else ""
+    if said is None:
+        raise UsageError(
+            "update-needs-packages", what=f"The update needs what this computer can't have: {depends[:300]}.",
+            remedy="Take the package for this release of Debian, or let apt-get reach its servers.",
+        )  # fmt: skip
+    return sorted(re.findall(r"^Inst (\S+)", said, re.MULTILINE))
+
+
 def changes(system: System, package: Path) -> dict[str, Any]:
-    """What an update would change here: ``version``, ``needs`` (Debian packages that are missing), and the files of
-    the program that are ``new``, ``changed`` and ``gone``. Raises WorkError("kiosk-step-failed").
+    """What an update would change here: ``version``, what it ``needs``, and the files of the program that are ``new``,
+    ``changed`` and ``gone``. Raises WorkError("kiosk-step-failed"), and as ``needs``.
     """
     with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:  # /tmp may be memory
         system.run("dpkg-deb", "--extract", str(package), folder)
         theirs, ours = (_files(root) for root in (Path(folder, *PROGRAM.parts[1:]), system.at(PROGRAM)))
-    fields = system.look("dpkg-deb", "--field", str(package), "Version", "Depends") or ""
-    listed = system.look("dpkg-query", "--show", "--showformat", "${Package} ") or ""
-    depends = re.findall(r"(?:, |: )([a-z0-9.+-]+)", fields.partition("Depends")[2])
     return {
-        "version": (re.findall(r"^Version: (\S+)", fields) or [""])[0],
-        "needs": sorted(set(depends) - {name.removesuffix("t64") for name in listed.split()} - set(listed.split())),
+        "version": (system.look("dpkg-deb", "--field", str(package), "Version") or "").strip(),
+        "needs": needs(system, package),
         "new": sorted(theirs.keys() - ours.keys()),
         "changed": sorted(name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]),
         "gone": sorted(ours.keys() - theirs.keys() - {MARK}),
@@ -235,6 +266,7 @@ class Updates:
             with os.fdopen(os.open(offered, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as source:
                 stream_atomically(copy, lambda file: shutil.copyfileobj(source, file, 1 << 20), mode=0o600)
             check_package(copy, self._system.at(TRUSTED))
+            needs(self._system, copy)
             copy.rename(self._package)
             sync_folder(self._package.parent)
         except (VelaturaError, OSError) as error:

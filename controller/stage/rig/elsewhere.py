@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_json, to_jsonable_python
 
-from controller.core.storage import write_atomically
+from controller.core.storage import runtime_path, write_atomically
 from controller.play.control.launch import SOCKET_NAME
 from controller.play.control.notify import log
 from controller.stage.rig.lamp_guard import LampGuard
@@ -97,7 +97,7 @@ class DeviceElsewhere:
         client = PlayerClient()
         try:
             until = replace(deadline, at_s=deadline.at_s + _LATER_S)
-            answer = client.request((context.runtime or context.stage) / SOCKET_NAME, request, until)
+            answer = client.request((context.runtime or runtime_path(context.stage)) / SOCKET_NAME, request, until)
         except DeviceRefused as error:
             raise DeviceGone(error.code, what=error.what, remedy=error.remedy) from error
         finally:

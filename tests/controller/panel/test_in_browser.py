@@ -7,12 +7,14 @@ import io
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
+from controller.kiosk.operations.house import House, HouseNow, Rollout, Stagehouse, StageUpdate
 from controller.kiosk.state import BundleIdentity, Grade
 from controller.kiosk.store.accounts import Accounts
 from controller.panel import live
@@ -384,6 +386,35 @@ def test_a_stage_that_can_show_nothing_leads_step_by_step(fresh: Served, browser
         expect(page.locator(".todo .now a")).to_have_attribute("href", "/appearances/new")
         kiosk.change(bundle=BundleIdentity(1, "ab" * 32, 1.0))
         expect(page.locator(".todo")).to_have_count(0)
+
+
+class UpdatingHouse:
+    """A house, as far as its page for updates asks it."""
+
+    begun = True
+
+    def rollout(self) -> Rollout:
+        states = ("trial", "failed", "waits", "comes", "done", "")
+        stages = (StageUpdate(f"stage {one}", "0.8", one, "It is dark." * (one == "failed")) for one in states)
+        return Rollout("0.9", self.begun, tuple(stages))
+
+    def now(self) -> HouseNow:
+        return HouseNow("museum", (), ("all floors",))
+
+
+def test_the_page_of_a_houses_update_has_no_barrier(tmp_path: Path, browser: Browser) -> None:
+    house = UpdatingHouse()
+    kiosk = MemoryKiosk(tmp_path / "pictures")
+    opened = House(open=lambda: cast("Stagehouse", house))
+    with served(kiosk, tmp_path / "private", house=opened) as running, tab(browser, running.address) as page:
+        page.set_viewport_size({"width": 360, "height": 740})
+        enter(page, "tina")
+        for house.begun, button in ((True, "Stop"), (False, "Begin the update")):
+            page.goto("/house/update")
+            expect(page.get_by_role("button", name=button, exact=True)).to_be_visible()
+            assert not (found := violations(page)), found
+            wider = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert wider <= 0
 
 
 @pytest.mark.parametrize(("phone", "light"), [(True, False), (False, True), (False, False)])

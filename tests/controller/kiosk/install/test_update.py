@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import subprocess
+import tracemalloc
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ class Computer(System):
         self.told: list[str] = []
         super().__init__(self.told.append, root=root)
         self.reports, self._copies = {version: list(rows) for version, rows in reports.items()}, copies
-        self.waited_s = 0.0
+        self.waited_s, self.asks_apt = 0.0, False
 
     def run(self, *words: str, may_fail: bool = False) -> None:
         if words[0] == "dpkg-deb" and self._copies is not None:
@@ -67,6 +68,9 @@ class Computer(System):
             super().run(*words)
         else:
             self.told.append(f"{self.version}: {' '.join(words)}")
+
+    def look(self, *words: str, more: Mapping[str, str] | None = None) -> str | None:
+        return "" if words[0] == "apt-get" and not self.asks_apt else super().look(*words, more=more)
 
     @property
     def version(self) -> str:
@@ -115,6 +119,37 @@ def test_a_signed_package_is_one_that_dpkg_still_reads(package: Path) -> None:
     before = package.read_bytes()
     sign_package(package, KEY, package)
     assert package.read_bytes() == before, "a signature takes the place of an old one"
+
+
+def test_a_large_package_is_signed_and_checked_in_parts(tmp_path: Path) -> None:
+    file, trusted = tmp_path / "large.deb", tmp_path / "trusted"
+    trusted.mkdir()
+    write_public_key(trusted / "house.pub", bytes(KEY.verify_key))
+    with file.open("wb") as made:
+        made.truncate((48 << 20) + 1)
+    tracemalloc.start()
+    try:
+        for _ in range(2):
+            sign_package(file, KEY, file)
+            check_package(file, trusted)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_package_for_another_debian_is_refused_before_anything_changes(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    offered(tmp_path, debian_package(tmp_path / "made", "2", depends="python3 (>= 3.99), python3 (<< 3.99.99)"))
+    computer = Computer(tmp_path, {"1": [BEFORE]})
+    computer.asks_apt = True
+    computer.boot()
+    assert computer.version == "1"
+    told = outcome(computer)
+    assert (told.name, told.state) == ("", "failed")
+    assert "python3 (>= 3.99)" in told.why
+    assert [line for line in computer.told if "dpkg-deb" in line] == []
+    package = debian_package(tmp_path / "made", "3", depends="libc6 (>= 2.2) | no-such-package")
+    assert update.needs(computer, package) == []
 
 
 def test_an_update_starts_proves_itself_and_stays(tmp_path: Path, package: Path) -> None:
