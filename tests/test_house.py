@@ -15,7 +15,7 @@ from controller.cli import groups
 from tests import house
 
 LIMITS: Final[Mapping[str, int]] = {
-    "lines": 111_700,
+    "lines": 111_950,
     "files": 655,
     "folders at the root of controller": 11,
     "files with one importer": 145,
