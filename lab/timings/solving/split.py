@@ -71,12 +71,13 @@ def solve_split(
     began_s, sheet, parts = time.perf_counter(), transport.sheet, parts_of(transport)
     whole = build_problem(transport, target, black, SolveSettings().smoothness, None)
     addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
-    at = [addresses[g % len(addresses)] for g in range(len(parts))]
+    order = turns(parts)
+    # Those of one turn on all workers.
+    at = {g: addresses[i % len(addresses)] for together in order for i, g in enumerate(together)}
     borders = [
         [(h, *part.border(other)) for h, other in enumerate(parts) if h != g and part.border(other)[0].size]
         for g, part in enumerate(parts)
     ]
-    order = turns(parts)
 
     def there(g: int, function: Callable[..., Any], *arguments: Any) -> Any:
         return client.submit(function, *arguments, workers=[at[g]], pure=False)
