@@ -14,6 +14,7 @@ from lab.study.experiments.effort import EFFORT
 from lab.study.experiments.frequency.experiment import FREQUENCY, FREQUENCY_SHARP, sharp_object
 from lab.study.experiments.live import LIVE
 from lab.study.experiments.placement.experiment import PLACEMENT, planned_object
+from lab.study.experiments.plain_dots import PLAIN_ABLATION
 from lab.study.experiments.regions import REGIONS
 from lab.study.experiments.residual import RESIDUAL, RESIDUAL_SIX
 from lab.study.experiments.residual_sweep import RESIDUAL_SWEEP
@@ -25,6 +26,7 @@ from lab.study.values import Experiment
 
 EXPERIMENTS: Final[tuple[Experiment, ...]] = (
     ABLATION,
+    PLAIN_ABLATION,
     REGIONS,
     RESIDUAL,
     RESIDUAL_SIX,

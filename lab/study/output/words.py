@@ -18,6 +18,13 @@ to the same dots, without any correction of their centres. *Regularisation*: cen
 gaps filled. *Smoothness*: eq. 3 at its default strength. *Quadrilaterals* replace the Gaussians; everything else is
 as in the step before. Rows of each light transport are scaled so that all pixels at white give the white image
 (decision 5). The paper does not scale them, so the early steps are better here than in the paper.""",
+    "ablation-plain": """\
+The ablation's target and steps, from dots as the paper's camera saw them: each pattern photographed once, no longer
+than white, where a dot is much fainter than white. No row of a light transport is scaled: each projector pixel lights
+what its dot showed, or its Gaussian, as bright as it was fitted to the dot (eq. 8), and neighbours' light adds up to
+more or less than the white image. The page [What each part is worth](ablation.md) has the same steps from dots
+photographed longer, with scaled rows; its stages may stand in another room. White, black and the pictures that are
+judged are HDR in both. The regularised centres keep their fitted brightness; gaps get the median one.""",
     "regions": """\
 A piece of the camera's picture of one target, solved in four phases of regions (paper 3.2; they overlap by 25
 %), and globally. Differences are over the piece without a border of half of the largest region. Times are wall
@@ -100,6 +107,12 @@ changes.""",
     ("ablation", "+ smoothness"): """\
 Smoothness removes noise from the frames, so that CIEDE2000 and RMSE fall, and a little detail, too: SSIM falls, and so
 does lambda.""",
+    ("ablation-plain", "+ Gaussian metapixels"): """\
+A Gaussian has less of a faint dot's noise, so colours come nearer; the dot itself has the sharper pixel, so that lambda
+and SSIM are higher without it.""",
+    ("ablation-plain", "+ regularisation"): """\
+It changes little here: the table has about the same errors before and after. Its moved centres keep the brightness that
+was fitted where they were.""",
     ("earlier", "ours is better than: bounded, no pixel model"): """\
 Dots photographed as well as here are as good a light transport as our shares, at the price of 49 and more
 photographs a projector (see the ablation). Ours is smoothed. In the ablation, smoothness costs SSIM, too, but less
