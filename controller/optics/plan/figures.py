@@ -305,12 +305,16 @@ def _in_style(draw: Callable[Arguments, ByteImage]) -> Callable[Arguments, ByteI
 
 
 @_in_style
-def layout(placements: Sequence[Placement], surface: Surface, audience_m: Float64) -> ByteImage:
-    """The room from above and from the right: object, projectors with their cones of light, and the audience."""
+def layout(
+    placements: Sequence[Placement], cameras: Sequence[Placement], surface: Surface, audience_m: Float64
+) -> ByteImage:
+    """The room from above and from the right: object, projectors with their light, what cameras see, the audience."""
+    devices = [(one, str(n + 1), COLOURS[n % len(COLOURS)], "-") for n, one in enumerate(placements)]
+    devices += [(one, f"C{n + 1}", DIM, ":") for n, one in enumerate(cameras)]
     figure = figure_of((10.0, 4.6), dpi=DPI, constrained=True)
     above, side = figure.subplots(1, 2)
-    _room(above, placements, surface, audience_m, across=0, up=2, sign=1.0)
-    _room(side, placements, surface, audience_m, across=2, up=1, sign=-1.0)
+    _room(above, devices, surface, audience_m, across=0, up=2, sign=1.0)
+    _room(side, devices, surface, audience_m, across=2, up=1, sign=-1.0)
     above.set(title="from above", xlabel="to the right (m)", ylabel="away from the audience (m)")
     side.set(title="from the right", xlabel="away from the audience (m)", ylabel="up (m)")
     return picture_of(figure)
@@ -332,19 +336,20 @@ def value_map(values: Float64, title: str, unit: str, *, lowest: float, highest:
 
 
 def _room(
-    axes: Any, placements: Sequence[Placement], surface: Surface, audience_m: Float64, *, across: int, up: int,
-    sign: float,
+    axes: Any, devices: Sequence[tuple[Placement, str, str, str]], surface: Surface, audience_m: Float64, *,
+    across: int, up: int, sign: float,
 ) -> None:  # fmt: skip
-    """One projection of the room; ``sign`` turns what points down."""
+    """One projection of the room; ``sign`` turns what points down. ``devices``: with number, colour and line."""
     seen = surface.points_m[surface.area_m2 > 0]
     axes.plot(seen[:, across], sign * seen[:, up], ".", color=DIM, markersize=1.2)
     axes.plot(audience_m[:, across], sign * audience_m[:, up], "^", color=INK, markersize=7, label="audience")
-    for number, placement in enumerate(placements):
-        at, colour = placement.position_m, COLOURS[number % len(COLOURS)]
+    for placement, number, colour, line in devices:
+        at = placement.position_m
         for corner in _cone(placement, seen):
-            axes.plot([at[across], corner[across]], sign * np.array([at[up], corner[up]]), color=colour, linewidth=0.8)
-        axes.plot(at[across], sign * at[up], "o", color=colour, markersize=9)
-        axes.annotate(str(number + 1), (at[across], sign * at[up]), color=BACK, ha="center", va="center", fontsize=8)
+            ends = [at[across], corner[across]], sign * np.array([at[up], corner[up]])
+            axes.plot(*ends, line, color=colour, linewidth=0.8)
+        axes.plot(at[across], sign * at[up], "o" if line == "-" else "s", color=colour, markersize=9)
+        axes.annotate(number, (at[across], sign * at[up]), color=BACK, ha="center", va="center", fontsize=8)
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color=LINE, linewidth=0.5)
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.core.arrays import Float64
+from controller.core.arrays import ByteImage, Float64
 from controller.core.errors import UsageError
 from controller.core.storage import write_atomically
 from controller.optics.plan.figures import camera_figures, combined_light, figures_of, layout, value_map
@@ -18,7 +18,7 @@ from controller.optics.plan.optics import lit_by
 from controller.optics.plan.plan_file import EXAMPLE, PlanTables, read_plan
 from controller.optics.plan.search import PlacementPlan, PlanScene, candidates_of, choose_cameras, choose_placements
 from controller.optics.plan.target_object import AudienceView, TargetObject, read_target_object, sampled, seen_from
-from controller.optics.plan.values import Placement, PlanGoal, Surface
+from controller.optics.plan.values import Placement, PlanGoal
 from controller.run.progress import Reporter, Tracker
 from controller.stage.report.page import Goal, Page, ReportPicture, render
 from controller.stage.report.words import SUPERPOSITION
@@ -66,10 +66,14 @@ def plan(*, file: Path, out: Path, reporter: Reporter, cancel: threading.Event) 
     tracker.end()
     tracker.begin(3)
     figures = figures_of(best, surface, goal)
-    if models := tables.camera_models():
-        figures |= camera_figures(choose_cameras(models, places, scene, goal, best.candidates), best, surface)
+    models = tables.camera_models()
+    cameras = choose_cameras(models, places, scene, goal, best.candidates) if models else ()
+    if cameras:
+        figures |= camera_figures(cameras, best, surface)
+    projecting, seeing = ([one.placement for one in devices] for devices in (best.candidates, cameras))
+    drawn = layout(projecting, seeing, surface, audience)
     out.mkdir(parents=True, exist_ok=True)
-    page = _page(tables, len(places), target_object, best, surface, audience, figures)
+    page = _page(tables, len(places), target_object, best, drawn, audience, figures)
     write_atomically(out / MACHINE, (json.dumps(figures, indent=2, allow_nan=False) + "\n").encode())
     write_atomically(out / HTML, render(page).encode())
     tracker.end()
@@ -81,14 +85,14 @@ def _page(
     places: int,
     target_object: TargetObject,
     best: PlacementPlan,
-    surface: Surface,
+    drawn: ByteImage,
     audience: Float64,
     figures: Mapping[str, Any],
 ) -> Page:
     goal = tables.goal
     placements = [candidate.placement for candidate in best.candidates]
-    room = ReportPicture("The room", layout(placements, surface, audience), "metres from the centre of the object")
-    galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Projector places", "", (room,))]
+    room = ReportPicture("The room", drawn, "metres from the centre of the object")
+    galleries: list[tuple[str, str, tuple[ReportPicture, ...]]] = [("Places", "", (room,))]
     for number, eye in enumerate(audience):
         name = "from the audience" if len(audience) == 1 else f"from the audience's place {number + 1}"
         view = seen_from(target_object, eye, rows=VIEW_ROWS)

@@ -41,7 +41,8 @@ def arranged(truth: BenchTruth, room: str, thing: StageObject, *, hung: bool = F
         return truth
     truth = dataclasses.replace(
         truth,
-        surfaces=truth.surfaces or table_and_wall(thing),
+        # A wall would hide the object from those that stand behind it.
+        surfaces=truth.surfaces or table_and_wall(thing)[: 1 if len(truth.cameras) >= AROUND else None],
         engine="radiosity",
         camera=dataclasses.replace(truth.camera, glare=0.02),
         more_cameras=tuple(dataclasses.replace(one, glare=0.02) for one in truth.more_cameras),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.core.errors import UsageError
-from controller.optics.plan.figures import camera_figures
+from controller.optics.plan.figures import DIM, camera_figures, layout
 from controller.optics.plan.search import PlanScene, candidates_of, choose_cameras, choose_placements
 from controller.optics.plan.target_object import TargetObject, sampled
 from controller.optics.plan.values import MountingPoint, PlanGoal, ProjectorModel, Surface
@@ -46,6 +46,12 @@ def test_four_cameras_see_nearly_all_that_six_projectors_light_all_around(
     assert seen[0] < seen[1] < seen[2]
     assert seen[2] >= 0.95
     assert seen[0] < 0.6, "one camera sees half of a ball at most"
+    lights, cameras = ([one.placement for one in devices] for devices in (best.candidates, chosen))
+    grey = [
+        np.count_nonzero((layout(lights, those, surface, EYES) == [int(DIM[n : n + 2], 16) for n in (1, 3, 5)]).all(2))
+        for those in ((), cameras)
+    ]
+    assert grey[1] > grey[0] + 2 * 4 * 100, "each camera is drawn from above and from the side"
 
 
 def test_cameras_that_have_no_room_are_refused(
