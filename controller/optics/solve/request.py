@@ -7,7 +7,7 @@ machine, and gives the same.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
@@ -160,8 +160,17 @@ class _Gap:
 _gaps: Final[WeakKeyDictionary[LightTransport, Sequence[_Gap]]] = WeakKeyDictionary()
 
 
-def continued(transport: LightTransport, frames: Sequence[FloatImage]) -> tuple[FloatImage, ...]:
-    """Frames (rows, columns, 3) in which pixels that no camera sees have the mean light of those next to them.
+SheetOf: TypeAlias = Callable[[int, Mask], FloatImage]
+"""By a projector's number and a mask of its pixels: what is painted where they land, (rows, columns, 3), or NaN."""
+DARKEST: Final = 0.02
+"""Paint, by which light is divided."""
+
+
+def continued(
+    transport: LightTransport, frames: Sequence[FloatImage], sheet: SheetOf | None = None
+) -> tuple[FloatImage, ...]:
+    """Frames (rows, columns, 3) in which pixels that no camera sees have the mean light of those next to them, or what
+    that is on ``sheet``.
 
     They are gaps between what cameras see of the object, and what lies between it and the room beside it. Next to the
     room they fade. What is open to the picture's border stays dark: it may light anything.
@@ -169,10 +178,16 @@ def continued(transport: LightTransport, frames: Sequence[FloatImage]) -> tuple[
     if transport not in _gaps:
         _gaps[transport] = [_gap(transport, n) for n in range(len(transport.sizes))]
     whole = []
-    for frame, gap in zip(frames, _gaps[transport], strict=True):
+    for n, (frame, gap) in enumerate(zip(frames, _gaps[transport], strict=True)):
         filled = np.array(frame, np.float32)
         pixels = filled.reshape(-1, 3)
-        pixels[gap.at] = pixels[gap.beside].mean(axis=1)
+        light = pixels[gap.beside].mean(axis=1)
+        if sheet is not None:
+            asked = np.isin(np.arange(len(pixels)), np.union1d(gap.at, gap.beside)).reshape(frame.shape[:2])
+            paint = np.maximum(sheet(n, asked), DARKEST).reshape(-1, 3)
+            level = np.nan_to_num(pixels[gap.beside] / paint[gap.beside]).mean(axis=1)
+            light = np.where(np.isfinite(paint[gap.at]), np.minimum(level * paint[gap.at], 1), light)
+        pixels[gap.at] = light
         whole.append(filled)
     return tuple(whole)
 

@@ -80,7 +80,7 @@ def texture(sheet: FloatImage, places: Places | None, own: FloatImage, mask: Mas
     ``places``: None for a sheet that is the camera's picture; ``own`` (rows, columns, 3): the object as it is, where
     the sheet is transparent or ends
     """
-    light = np.dstack([sheet[..., :3] * sheet[..., 3:], sheet[..., 3]]).astype(np.float32)
+    light = _times_alpha(sheet)
     if places is None:
         way = cv2.INTER_AREA if sheet.shape[0] > mask.shape[0] else cv2.INTER_LINEAR
         image = np.asarray(cv2.resize(light, mask.shape[::-1], interpolation=way), np.float32)
@@ -89,6 +89,16 @@ def texture(sheet: FloatImage, places: Places | None, own: FloatImage, mask: Mas
     painted = through_camera(Target(image, mask))
     mixed = painted.image[..., :3] + (1 - painted.image[..., 3:]) * own
     return replace(painted, image=np.where(mask[..., None], mixed, 0).astype(np.float32))
+
+
+def paint_at(sheet: FloatImage, places: Places, mask: Mask) -> FloatImage:
+    """(rows, columns, 3): a sheet's colours in ``mask``, NaN where it is clear or does not cover the object."""
+    found = _painted(_times_alpha(sheet), places, mask)
+    return np.where(found[..., 3:] > 0.5, found[..., :3] / np.maximum(found[..., 3:], 0.5), np.float32(np.nan))
+
+
+def _times_alpha(sheet: FloatImage) -> FloatImage:
+    return np.dstack([sheet[..., :3] * sheet[..., 3:], sheet[..., 3]]).astype(np.float32)
 
 
 def _painted(sheet: FloatImage, places: Places, mask: Mask) -> FloatImage:

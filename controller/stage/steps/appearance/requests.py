@@ -17,9 +17,11 @@ import numpy as np
 from controller.config import Stage
 from controller.config.models import AppearanceTable
 from controller.config.table import allowed, checked_arguments
+from controller.core.arrays import FloatImage, Mask
 from controller.core.colour import ColourSpace
 from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
+from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.solve.targets.files import check_picture, load_target, read_picture
 from controller.optics.solve.targets.patterns import (
     CheckerboardLook,
@@ -30,7 +32,7 @@ from controller.optics.solve.targets.patterns import (
 )
 from controller.optics.solve.targets.relight import GlossLook, gloss, recolour
 from controller.optics.solve.targets.restoration import RestorationLook, restored
-from controller.optics.solve.targets.sheets import as_it_is, texture
+from controller.optics.solve.targets.sheets import as_it_is, mesh_places, paint_at, texture
 from controller.optics.solve.targets.values import Target, in_box, on_each, through_camera
 from controller.optics.solve.targets.wrap import PrintLook, wrap_photograph
 from controller.run.runner import Context
@@ -121,7 +123,20 @@ def _request(stage: Stage, table: AppearanceTable, calibrated: Calibrated) -> Ap
         arguments = {_ARGUMENTS.get(key, key): value for key, value in options.items()}
         return make_target(table.kind, file, arguments, calibrated)
 
-    return AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
+    request = AppearanceRequest(table.name, TITLES[table.kind], target, inputs)
+    if table.kind != "texture" or options.get("uv", "mesh") != "mesh" or file is None:
+        return request
+    return replace(request, sheet=partial(_unseen_paint, calibrated, lambda: _sheet(file, options.get("colour"))))
+
+
+def _unseen_paint(calibrated: Calibrated, sheet: Callable[[], FloatImage], n: int, lit: Mask) -> FloatImage:
+    """As of ``SheetOf``: what a camera in the place of projector ``n`` would see of the sheet on the mesh."""
+    geometry, mesh = calibrated.first.known_geometry, RegisteredMesh.read(calibrated.folder)
+    if geometry is None or mesh is None or mesh.uv is None:
+        return np.full((*lit.shape, 3), np.nan, np.float32)
+    own = geometry.projectors[n]
+    pose = mesh.pose.then(Pose(1.0, own.rotation, own.translation_m))
+    return paint_at(sheet(), mesh_places(mesh.solid, mesh.uv, pose, own), lit)
 
 
 def _pictures(table: AppearanceTable, file: Path, calibrated: Calibrated) -> list[Path]:
@@ -236,12 +251,9 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         return recolour(as_it_is(calibrated.transport, calibrated.matt), mask, **options)
     if kind == "texture":
         assert file is not None
-        sheet = np.maximum(read_picture(file, colour, soft=True), 0)
-        if sheet.shape[2] == 3:
-            sheet = np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
         mesh = RegisteredMesh.read(calibrated.folder) if options.get("uv", "mesh") == "mesh" else None
         places = None if mesh is None else calibrated.places(mesh)
-        return texture(sheet, places, as_it_is(calibrated.transport, calibrated.matt), mask)
+        return texture(_sheet(file, colour), places, as_it_is(calibrated.transport, calibrated.matt), mask)
     geometry = calibrated.geometry
     if kind == "photograph":
         assert file is not None
@@ -251,6 +263,12 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
         maker, look = _MAKERS[kind]
         make = partial(maker, look=look(**options))
     return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make), calibrated.objects(mask)))
+
+
+def _sheet(file: Path, colour: str | None) -> FloatImage:
+    """(rows, columns, 4): with alpha, also where the file has none."""
+    sheet = np.maximum(read_picture(file, colour, soft=True), 0)
+    return sheet if sheet.shape[2] == 4 else np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])
 
 
 PREFIX: Final = "builtin:"

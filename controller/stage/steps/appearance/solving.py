@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, get_args
@@ -20,7 +20,7 @@ from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
 from controller.optics.solve.reach.feasibility import HELD_BACK, SMALL_PART
-from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
+from controller.optics.solve.request import AppearanceResult, SheetOf, SolveOptions, continued, solve_appearance
 from controller.optics.solve.scaling.dither import to_device
 from controller.optics.solve.targets.values import Target
 from controller.run.runner import Context, Step
@@ -53,7 +53,8 @@ class AppearanceRequest:
     """An appearance to solve: ``target`` gives its picture, like reflectance, and a mask of its valid pixels.
 
     ``inputs`` are the hashes of the target's sources; ``prepare``, if given, is a step before
-    the solving, for slow targets; ``preparing`` is what it does, and ``prepare_s`` its cost.
+    the solving, for slow targets; ``preparing`` is what it does, and ``prepare_s`` its cost. ``sheet``: where no camera
+    sees, the light continues by it.
     """
 
     name: str
@@ -63,6 +64,7 @@ class AppearanceRequest:
     prepare: Callable[[Context], Sequence[Path]] | None = None
     prepare_s: float = 0.0
     preparing: str = "Rendering"
+    sheet: SheetOf | None = None
 
 
 def base_choice(name: str) -> BaseChoice:
@@ -192,6 +194,8 @@ def _solve_appearance(
 ) -> Sequence[Path]:
     began_s = time.perf_counter()
     made = (answering or partial(answer_here, calibrated))(request, options, context)
+    if request.sheet is not None and options.unseen == "smooth":
+        made = replace(made, frames=continued(calibrated.transport, made.frames, request.sheet))
     if made.figures["advice"] is not None:
         context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
     for line in _limits(request.title, made.figures, options.share):

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.core.arrays import FloatImage
+from controller.core.arrays import FloatImage, Mask
 from controller.optics.solve import request
 from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
 from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext, corrected
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, Solution, SolveInput, SolveSettings
-from controller.optics.solve.request import SolveOptions, solve_appearance
+from controller.optics.solve.request import SolveOptions, continued, solve_appearance
 from controller.optics.solve.result.metrics import colour_difference
 from controller.optics.solve.result.refinement import solve_again
 from controller.optics.solve.targets.values import Target
@@ -208,6 +208,18 @@ def test_what_no_camera_sees_continues_what_is_seen_beside_it() -> None:
         assert one[gap].max() <= around.max() + 1e-3
         steps = [np.abs(np.diff(part, axis=1)).mean() for part in (one[9:31, 19:27], other[9:31, 30:38])]
         assert steps[0] < 1.5 * steps[1] + 0.01, "no edge, and no noise"
+
+        def sheet(n: int, asked: Mask) -> FloatImage:
+            """Half as much in the right part, not known at the bottom. None but these pixels are looked up."""
+            paint = np.where(asked, np.float32(0.6), np.float32(np.nan))
+            paint[10:30, 23:26] /= 2
+            paint[27:30, 20:26] = np.nan
+            return np.repeat(paint[..., None], 3, axis=2)
+
+        painted = continued(light.transport, smooth, sheet)[n]
+        np.testing.assert_array_equal(painted[28:30, 20:26], one[28:30, 20:26])
+        np.testing.assert_allclose(painted[10:27, 20:23], one[10:27, 20:23], rtol=1e-4)
+        np.testing.assert_allclose(painted[10:27, 23:26], one[10:27, 23:26] / 2, rtol=1e-4)
         seen = (light.transport.per_weight[light.transport.span(n)] > 0).reshape(other.shape[:2])
         np.testing.assert_array_equal(one[seen], other[seen])
         assert not one[0, 0].any(), "what is open to the border may light anything"

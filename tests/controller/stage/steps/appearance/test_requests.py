@@ -133,6 +133,30 @@ def test_a_sheet_lies_on_the_mesh_and_leaves_the_object_where_it_is_clear(
     np.testing.assert_allclose(target.image[right], as_it_is[right], atol=1e-4)
 
 
+def test_where_no_camera_sees_a_projector_shows_what_lies_there_on_the_mesh(
+    tmp_path: Path, calibrated: Calibrated
+) -> None:
+    lay_wall(calibrated.folder)
+    sheet = np.zeros((600, 800, 4), np.uint8)
+    sheet[:, :400] = (255, 0, 0, 255)
+    painted(tmp_path, sheet)
+    found = requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0].sheet
+    assert found is not None
+    for n, own in enumerate(calibrated.geometry.projectors):
+        width, height = own.size_px
+        at = np.argwhere(np.ones((height, width)))[:, ::-1]
+        ways = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(own.matrix).T @ own.rotation
+        start = -own.rotation.T @ own.translation_m
+        x = (start[0] + (1 - start[2]) / ways[:, 2] * ways[:, 0]).reshape(height, width)
+        colours = found(n, np.ones((height, width), np.bool_))
+        red, clear = (x > -0.9) & (x < -0.05), x > 0.05
+        np.testing.assert_allclose(colours[red], np.broadcast_to((1, 0, 0), (red.sum(), 3)), atol=1e-4)
+        assert np.isnan(colours[clear]).all(), "the object's own paint is not on the sheet"
+        assert red.any()
+    camera = requests_of(load(tmp_path, STAGE + TEXTURE + 'uv = "camera"\n'), calibrated)[0]
+    assert camera.sheet is None, "the camera's picture has nothing of what it does not see"
+
+
 def recolour_white(folder: Path, calibrated: Calibrated) -> FloatImage:
     text = STAGE + '\n[[appearances]]\nname = "x"\nkind = "recolour"\ntint = [1.0, 1.0, 1.0]\n'
     return requests_of(load(folder, text), calibrated)[0].target().image
