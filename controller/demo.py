@@ -290,7 +290,7 @@ def demo_steps(rig: Rig, run: Path, *, checked: Checked, engine: Engine) -> Sequ
 
 def _join(checked: Checked, context: Context) -> Sequence[Path]:
     shape = checked.stage.tables.object.shape
-    join_geometry(context.folder, checked.names, checked.prior, shape, context.reporter)
+    join_geometry(context.folder, checked.poses, checked.prior, shape, context.reporter)
     return ()
 
 

@@ -117,6 +117,15 @@ class DouserTable(OpenConfigTable):
     driver: Name = Field(description='the name of a douser driver, e.g. "sacn"')
 
 
+class PoseTable(ConfigTable):
+    """Where a device stands, as it was measured, in a frame of the room that all devices share."""
+
+    position_m: Annotated[tuple[float, float, float], Field(strict=False)] = Field(
+        description="[x, y, z] of the middle of its lens, in metres"
+    )
+    sigma_m: Positive = Field(default=0.01, description="standard uncertainty of each of them in metres, above 0")
+
+
 class ProjectorTable(OpenConfigTable):
     name: Name = Field(description="a name for people, different for every projector, 1 to 64 printable characters")
     output: Name = Field(description="the name of the display output that feeds this projector")
@@ -132,6 +141,7 @@ class ProjectorTable(OpenConfigTable):
         default=18.0, ge=1, le=60, description="seconds between two questions to a dark projector, 1 to 60"
     )
     douser: DouserTable | None = Field(default=None, description="the table [projectors.douser]")
+    pose: PoseTable | None = Field(default=None, description="the table [projectors.pose]")
 
 
 class CameraTable(OpenConfigTable):
@@ -165,6 +175,7 @@ class CameraTable(OpenConfigTable):
     distance_rel_sigma: float = Field(
         default=0.01, gt=0, le=1, description="relative standard uncertainty of distance_m, above 0, at most 1"
     )
+    pose: PoseTable | None = Field(default=None, description="the table [cameras.pose], or [camera.pose]")
 
 
 class OutputTable(ConfigTable):

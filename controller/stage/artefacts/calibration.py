@@ -75,13 +75,15 @@ def _drawn(run: Path, shape: tuple[int, ...]) -> Mask | None:
 def read_calibration(folder: Path, projectors: Sequence[str]) -> Calibration:
     """The calibration of the finished run in ``folder``."""
     parts = []
+    mosaic: npt.NDArray[np.int64] | None = None
     found = read_indirect(folder, projectors)
     for number, name in enumerate(projectors):
         light = Light.read(folder, name)
         pixels = _phase_pixels(folder, name)
-        phase_map = mosaic = spread = None
+        phase_map = spread = None
         if pixels is not None:
-            phase_map, mosaic, spread = pixels.phase_map, pixels.known_mosaic, pixels.surface_spread
+            phase_map, spread = pixels.phase_map, pixels.surface_spread
+            mosaic = mosaic if pixels.known_mosaic is None else pixels.known_mosaic
         white, radiometry = _known(light.white), light.radiometry
         gain = read_white_gain(folder, name) if found is None else found[number].white_gain
         if gain is not None:

@@ -93,7 +93,7 @@ def calibrate(
     if place is not None:
         place.finish()
         run, last = place.run, None
-    join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
+    join_geometry(run, checked.poses, checked.prior, checked.stage.tables.object.shape, reporter)
     for sentence in (*swapped_views(view_folders(run), before), *changed_lamps(run, checked.names)):
         reporter.say(sentence, Level.WARNING)
     report_grade(checked, run, last, reporter, accept_grade=accept_grade)

@@ -118,7 +118,7 @@ def recalibrate(
     name = "recalibrate" if projector is None else "projector"
     run = session.run(checked, StageWork(name, steps, dark=True, views=True), reporter=reporter, cancel=cancel)
     _keep_views(run, last, reporter)
-    join_geometry(run, checked.names, checked.prior, checked.stage.tables.object.shape, reporter)
+    join_geometry(run, checked.poses, checked.prior, checked.stage.tables.object.shape, reporter)
     for sentence in changed_lamps(run, checked.names):
         reporter.say(sentence, Level.WARNING)
     compare_with_last(run, last, reporter)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import tomllib
 import zoneinfo
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from controller.config import Stage, check_driver_settings, load_stage
-from controller.config.models import OpenConfigTable, ProjectorTable, RelaysTable
+from controller.config.models import OpenConfigTable, PoseTable, ProjectorTable, RelaysTable
 from controller.core.errors import UsageError
 from controller.core.extras import extra_missing
 from controller.core.files import read_text
@@ -57,10 +57,12 @@ class Checked:
         measured = self.stage.tables.object.distances if name == views[0][0] else ()
         distance_m = table.distance_m if name in dict(views) else None
         distances = tuple(MeasuredDistance(d.from_px, d.to_px, d.distance_m, d.sigma_m) for d in measured)
+        pose = table.pose if name in dict(views) else None
         if table.intrinsics is not None:
-            return read_intrinsics(self.stage.path(table.intrinsics)).prior(
+            prior = read_intrinsics(self.stage.path(table.intrinsics)).prior(
                 distance_m=distance_m, distance_rel_sigma=table.distance_rel_sigma, distances=distances
             )
+            return replace(prior, pose=pose)
         if table.focal_length_px is None:
             allowed = "a number above 0, or intrinsics with a file from `velatura camera calibrate`"
             raise table.place.missing("focal_length_px", allowed, written=[])
@@ -70,7 +72,13 @@ class Checked:
             distance_m=distance_m,
             distance_rel_sigma=table.distance_rel_sigma,
             distances=distances,
+            pose=pose,
         )
+
+    @property
+    def poses(self) -> dict[str, PoseTable | None]:
+        """What was measured of where each projector stands, by its name, in stage order."""
+        return {table.name: table.pose for table in self.stage.tables.projectors}
 
     @property
     def names(self) -> tuple[str, ...]:

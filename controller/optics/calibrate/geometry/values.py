@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
+from controller.config.models import PoseTable
 from controller.core import channels
 from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError, UsageError
@@ -120,7 +121,7 @@ class CameraPrior:
     None. ``distortion_k1`` with its ``distortion_sigma``. ``other_terms``: k2, p1, p2 and log fy/fx, which stay as they
     are; ``focal_length_px`` is then fx. ``distance_m``: from the front of the lens to the nearest visible point of the
     object. ``distances``: between points of the picture; they tell the scale better.
-    ``size_px`` of the picture that the focal length belongs to, if that is known.
+    ``size_px`` of the picture that the focal length belongs to, if that is known. ``pose``: of the camera in the room.
     """
 
     focal_length_px: float
@@ -134,6 +135,7 @@ class CameraPrior:
     distances: tuple[MeasuredDistance, ...] = ()
     size_px: tuple[int, int] | None = None
     other_terms: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    pose: PoseTable | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Raises UsageError("camera-prior-invalid")."""

@@ -3,18 +3,21 @@
 Each view has its own points, on the rays of its camera; the projectors are the same for all of them. So a view's
 equations are those of ``bundle_adjustment``, for projectors in its camera's frame, and these follow from poses in the
 first camera's frame by the chain rule. Views need not overlap: two projectors that both see join them, also in size.
+Poses that were measured in the room are observations, too; how the room lies in the first camera's frame is adjusted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
+import cv2
 import numpy as np
 
+from controller.config.models import PoseTable
 from controller.core import channels
 from controller.core.arrays import Float64, Mask
 from controller.core.errors import CalibrationError
@@ -22,7 +25,7 @@ from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
 from controller.optics.calibrate.geometry.normal_equations import reduced, solve_positive
 from controller.optics.calibrate.geometry.self_calibration import noise_of, shape_sigma
-from controller.optics.calibrate.geometry.surface_points import AdjustedStage, ObjectPoints, object_points
+from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
 from controller.optics.calibrate.geometry.values import (
     MOST_SIGMAS,
     CameraPrior,
@@ -42,6 +45,10 @@ LINKS: Final = 2
 """Projectors that two views have to see together."""
 POSE: Final = 6
 """Parameters of a view's place: turn and centre."""
+ROOM: Final = 7
+"""Parameters of the room's frame: turn, shift, and the logarithm of the metres in a unit."""
+ANYWHERE: Final = 1e3
+"""Standard deviation of a step of them, for what no measured pose tells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +76,32 @@ class JoinedView:
 
 
 @dataclass(frozen=True, slots=True)
+class _Room:
+    """``measured``: poses in the room by a device's number; and how the first camera's frame lies in theirs."""
+
+    measured: Mapping[int, PoseTable]
+    turn: Float64
+    shift_m: Float64
+    log_metres: float
+
+    def moved(self, step: Float64) -> _Room:
+        turn = _turns(step[:3])[0] @ self.turn
+        return replace(self, turn=turn, shift_m=self.shift_m + step[3:6], log_metres=self.log_metres + float(step[6]))
+
+    def terms(self, places: _Places) -> Iterator[tuple[int, Float64, Float64]]:
+        """Of each measured position: whose it is, the residual in sigmas, and its derivatives."""
+        to_room = math.exp(self.log_metres) * self.turn
+        for number, own in self.measured.items():
+            centre, column = places.device(number)
+            x, y, z = there = to_room @ centre
+            row = np.zeros((3, places.columns))
+            row[:, -ROOM:] = np.column_stack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3), there])
+            if column is not None:
+                row[:, column : column + 3] = to_room
+            yield number, (there + self.shift_m - own.position_m) / own.sigma_m, row / own.sigma_m
+
+
+@dataclass(frozen=True, slots=True)
 class _Places:
     """``lenses`` of each view's camera, ``turns`` (views, 3, 3) from the first camera's frame to each, ``stands``
     (views, 3) their centres; ``intrinsics``, ``rotations``, ``centres``: of the projectors in the first one's frame;
@@ -81,6 +114,24 @@ class _Places:
     rotations: Float64
     centres: Float64
     depths: tuple[Float64, ...]
+    room: _Room
+
+    def device(self, number: int) -> tuple[Float64, int | None]:
+        """Centre of a camera, or after these of a projector, and its first column; the first camera has none."""
+        views = len(self.lenses)
+        if number < views:
+            return self.stands[number], ba.CAMERA_PARAMETERS * views + POSE * number - 3 if number else None
+        n = number - views
+        return self.centres[n], self.first + ba.PROJECTOR_PARAMETERS * n + ba.LENS_PARAMETERS + 3
+
+    @property
+    def first(self) -> int:
+        """The column with which those of the projectors begin."""
+        return ba.CAMERA_PARAMETERS * len(self.lenses) + POSE * (len(self.lenses) - 1)
+
+    @property
+    def columns(self) -> int:
+        return self.first + ba.PROJECTOR_PARAMETERS * len(self.intrinsics) + ROOM
 
     def seen_by(self, v: int) -> ba.AdjustmentState:
         """The stage in the frame of a view's camera."""
@@ -89,11 +140,11 @@ class _Places:
         return ba.AdjustmentState(self.lenses[v], self.intrinsics, rotations, centres, self.depths[v])
 
     def moved(self, step: Float64, depths: Sequence[Float64]) -> _Places:
-        """After a step of all parameters, in the order of ``_Columns``."""
+        """After a step of all parameters: lenses and places of the cameras, projectors, room."""
         views = len(self.lenses)
         lenses = step[: ba.CAMERA_PARAMETERS * views].reshape(views, -1)
-        places = step[lenses.size : lenses.size + POSE * (views - 1)].reshape(-1, POSE)
-        own = step[lenses.size + places.size :].reshape(-1, ba.PROJECTOR_PARAMETERS)
+        places = step[lenses.size : self.first].reshape(-1, POSE)
+        own = step[self.first : -ROOM].reshape(-1, ba.PROJECTOR_PARAMETERS)
         cameras = []
         for lens, change in zip(self.lenses, lenses, strict=True):
             camera = lens.copy()
@@ -108,6 +159,7 @@ class _Places:
             _turns(own[:, ba.LENS_PARAMETERS : ba.LENS_PARAMETERS + 3]) @ self.rotations,
             self.centres + own[:, ba.LENS_PARAMETERS + 3 :],
             tuple(before + change for before, change in zip(self.depths, depths, strict=True)),
+            self.room.moved(step[-ROOM:]),
         )
 
     def scaled(self, factor: float) -> _Places:
@@ -121,12 +173,15 @@ class _Places:
 
 
 def join_views(
-    views: Sequence[SeenStage], projector_names: Sequence[str], projector_sizes: Sequence[tuple[int, int]]
+    views: Sequence[SeenStage],
+    projector_names: Sequence[str],
+    projector_sizes: Sequence[tuple[int, int]],
+    poses: Sequence[PoseTable | None] = (),
 ) -> list[JoinedView]:
-    """Adjust all views together, the first one's camera being the origin.
+    """Adjust all views together, the first one's camera being the origin. ``poses``: what was measured of projectors.
 
-    Raises CalibrationError("views-not-linked", "distances-contradict", "geometry-uncertain"), and as
-    ``metres_per_unit``.
+    Raises CalibrationError("views-not-linked", "distances-contradict", "pose-contradicted", "geometry-uncertain"), and
+    as ``metres_per_unit``.
     """
     problems = [_problem(view, projector_sizes) for view in views]
     everything = [max(int(problem.seen.sum()), 1) for problem in problems]
@@ -134,7 +189,13 @@ def join_views(
     for _ in range(2):
         places, _, _ = _adjusted(problems, places)
         problems, places = _trimmed(problems, places)
+    measured = {number: own for number, own in enumerate((*(view.prior.pose for view in views), *poses)) if own}
+    if len(measured) > 1:  # one alone tells nothing
+        places = _in_room(measured, places)
+    free = places
     places, normals, covariance = _adjusted(problems, places)
+    if max((float(np.linalg.norm(off)) for _, off, _ in places.room.terms(places)), default=0.0) > MOST_SIGMAS:
+        raise _contradicted(free, [*(f"The camera of {view.name}" for view in views), *projector_names])
     stages, points = [], []
     for v, (view, problem, normal) in enumerate(zip(views, problems, normals, strict=True)):
         state, own = places.seen_by(v), _chain(places, v)
@@ -144,7 +205,10 @@ def join_views(
         )
         stages.append((stage, adjusted))
         points.append(object_points(stage, view.correspondences, view.prior))
-    unit_m, rel_sigma = _unit(views, points)
+    scales = {f"view {view.name}": (one.unit_m, one.unit_rel_sigma) for view, one in zip(views, points, strict=True)}
+    if places.room.measured:
+        scales["the poses in stage.toml"] = math.exp(places.room.log_metres), float(covariance[-1, -1] ** 0.5)
+    unit_m, rel_sigma = _unit(scales)
     found = []
     for v, (own_points, (stage, adjusted), problem) in enumerate(zip(points, stages, problems, strict=True)):
         scale = np.ones(len(adjusted.covariance))
@@ -186,7 +250,8 @@ def _started(
         shared = sorted(standing.keys() & views[v].poses.keys())
         if len(shared) < LINKS:
             raise _not_linked(views[v].name, [views[one].name for one in where], [names[n] for n in shared])
-        turn, stand, scales[v] = _placed([standing[n] for n in shared], [views[v].poses[n] for n in shared])
+        own_poses = [(own.rotation, _centre(own)) for own in (views[v].poses[n] for n in shared)]
+        turn, stand, scales[v] = _placed([standing[n] for n in shared], own_poses)
         where[v] = turn, stand
         for n, own in views[v].poses.items():
             if n not in standing:
@@ -210,24 +275,49 @@ def _started(
         np.stack([standing[n][0] for n in order]),
         np.stack([standing[n][1] for n in order]),
         tuple(np.ones(len(problem.seen)) for problem in problems),
+        _Room({}, np.eye(3), np.zeros(3), 0.0),
     )
     places = places.scaled(places.baseline() ** -0.5)
     depths = [pose_initialisation.triangulated(one, places.seen_by(v)) for v, one in enumerate(problems)]
     return replace(places, depths=tuple(np.nan_to_num(depth, nan=1.0) for depth in depths))
 
 
-def _placed(there: Sequence[tuple[Float64, Float64]], own: Sequence[Pinhole]) -> tuple[Float64, Float64, float]:
-    """Turn, centre and relative size of a view, from the projectors' poses in the first frame and its own."""
-    left, _, right = np.linalg.svd(
-        sum(pose.rotation.T @ rotation for (rotation, _), pose in zip(there, own, strict=True))
+def _in_room(measured: Mapping[int, PoseTable], places: _Places) -> _Places:
+    """The same in the room where the measured devices are nearest to them."""
+    no_turn = np.zeros((3, 3))
+    there = [(no_turn, np.array(own.position_m)) for own in measured.values()]
+    turn, stand, scale = _placed(there, [(no_turn, places.device(number)[0]) for number in measured])
+    return replace(places, room=_Room(measured, turn.T, stand, -math.log(scale)))
+
+
+def _contradicted(free: _Places, names: Sequence[str]) -> CalibrationError:
+    """Names the pose without which the others fit the ``free`` places, of the photographs alone, best."""
+    measured = free.room.measured
+
+    def rest(without: int) -> float:
+        others = _in_room({number: own for number, own in measured.items() if number != without}, free)
+        return sum(float(off @ off) for _, off, _ in others.room.terms(others))
+
+    return CalibrationError(
+        "pose-contradicted",
+        what=f"{names[min(measured, key=rest)]} does not stand as its pose in stage.toml says: photographs and the "
+        "other poses contradict it.",
+        remedy="Measure its position again, or give a larger sigma_m.",
     )
+
+
+def _placed(
+    there: Sequence[tuple[Float64, Float64]], own: Sequence[tuple[Float64, Float64]]
+) -> tuple[Float64, Float64, float]:
+    """Turn, centre and relative size of a frame, from turns and centres of devices in another one and its own."""
+    seen, centres = (np.stack([centre for _, centre in devices]) for devices in (own, there))
+    apart, apart_there = seen - seen.mean(axis=0), centres - centres.mean(axis=0)
+    size, size_there = (max(float(np.linalg.norm(one)), 1e-12) for one in (apart, apart_there))
+    turned = sum(turn.T @ rotation for (turn, _), (rotation, _) in zip(own, there, strict=True))
+    left, _, right = np.linalg.svd(apart.T @ apart_there / (size * size_there) + turned)
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    centres = np.stack([centre for _, centre in there]) @ turn.T
-    seen = np.stack([_centre(pose) for pose in own])
-    middle, apart = centres.mean(axis=0), seen - seen.mean(axis=0)
-    scale = float(np.linalg.norm(apart) / max(float(np.linalg.norm(centres - middle)), 1e-12))
-    stand = turn.T @ (middle - seen.mean(axis=0) / scale)
-    return np.asarray(turn), np.asarray(stand), scale
+    scale = size / size_there
+    return np.asarray(turn), np.asarray(centres.mean(axis=0) - turn.T @ seen.mean(axis=0) / scale), scale
 
 
 def _centre(pinhole: Pinhole) -> Float64:
@@ -235,25 +325,21 @@ def _centre(pinhole: Pinhole) -> Float64:
 
 
 def _turns(vectors: Float64) -> Float64:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix())
+    turns = [cv2.Rodrigues(vector)[0] for vector in vectors.reshape(-1, 3)]
+    return np.stack(turns) if turns else np.zeros((0, 3, 3))
 
 
 def _chain(places: _Places, v: int) -> Float64:
     """(4 + 10 N, P): change of the parameters in a view's frame by those of all."""
     views, projectors = len(places.lenses), len(places.intrinsics)
-    first = ba.CAMERA_PARAMETERS * views + POSE * (views - 1)
-    own = np.zeros(
-        (ba.CAMERA_PARAMETERS + ba.PROJECTOR_PARAMETERS * projectors, first + ba.PROJECTOR_PARAMETERS * projectors)
-    )
+    own = np.zeros((ba.CAMERA_PARAMETERS + ba.PROJECTOR_PARAMETERS * projectors, places.columns))
     lens = ba.CAMERA_PARAMETERS * v
     own[: ba.CAMERA_PARAMETERS, lens : lens + ba.CAMERA_PARAMETERS] = np.eye(ba.CAMERA_PARAMETERS)
     state, turn = places.seen_by(v), places.turns[v]
     place = ba.CAMERA_PARAMETERS * views + POSE * (v - 1)
     for n in range(projectors):
         row = ba.CAMERA_PARAMETERS + ba.PROJECTOR_PARAMETERS * n
-        column = first + ba.PROJECTOR_PARAMETERS * n
+        column = places.first + ba.PROJECTOR_PARAMETERS * n
         middle, last = ba.LENS_PARAMETERS, ba.LENS_PARAMETERS + 3
         own[row : row + last, column : column + last] = np.eye(last)
         own[row + last : row + last + 3, column + last : column + last + 3] = turn
@@ -266,18 +352,20 @@ def _chain(places: _Places, v: int) -> Float64:
 
 
 def _priors(problems: Sequence[ba.AdjustmentProblem], places: _Places) -> tuple[Float64, Float64]:
-    """Residuals in sigmas of lenses and gauge, and their derivatives by all parameters."""
-    views, projectors = len(places.lenses), len(places.intrinsics)
-    first = ba.CAMERA_PARAMETERS * views + POSE * (views - 1)
-    terms, rows = [], []
-    identity = np.eye(first + ba.PROJECTOR_PARAMETERS * projectors)
+    """Residuals in sigmas of room, lenses and gauge, and their derivatives by all parameters."""
+    projectors = len(places.intrinsics)
+    identity = np.eye(places.columns)
+    terms, rows = [np.zeros(ROOM)], [identity[-ROOM:] / ANYWHERE]
+    for _, term, row in places.room.terms(places):
+        terms.append(term)
+        rows.append(row)
     for v, (problem, lens) in enumerate(zip(problems, places.lenses, strict=True)):
         columns = slice(ba.CAMERA_PARAMETERS * v, ba.CAMERA_PARAMETERS * (v + 1))
         terms.append((lens - problem.camera_prior)[: ba.CAMERA_PARAMETERS] / problem.camera_sigma)
         rows.append(identity[columns] / problem.camera_sigma[:, None])
     gauge = np.zeros(len(identity))
     for n in range(projectors):
-        start = first + ba.PROJECTOR_PARAMETERS * n
+        start = places.first + ba.PROJECTOR_PARAMETERS * n
         sigma = problems[0].projector_sigma[n]
         terms.append((places.intrinsics[n] - problems[0].projector_prior[n]) / sigma)
         rows.append(identity[start : start + ba.LENS_PARAMETERS] / sigma[:, None])
@@ -349,26 +437,27 @@ def _trimmed(problems: Sequence[ba.AdjustmentProblem], places: _Places) -> tuple
     return kept_problems, replace(places, depths=tuple(depths))
 
 
-def _unit(views: Sequence[SeenStage], points: Sequence[ObjectPoints]) -> tuple[float, float]:
-    """Metres in one unit by all that was measured, and its relative deviation; of the first view where nothing was."""
-    known = [one for one in points if math.isfinite(one.unit_rel_sigma)]
-    if not known:
-        return points[0].unit_m, math.inf
-    logs, sigmas = (
-        np.array(values) for values in zip(*((math.log(one.unit_m), one.unit_rel_sigma) for one in known), strict=True)
-    )
+def _unit(scales: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Metres in one unit by all that was measured, and its relative deviation; of the first view where nothing was.
+
+    ``scales``: both, by what was measured
+    """
+    sure = {name: one for name, one in scales.items() if one[1] < 1}
+    if not sure:
+        return next(iter(scales.values()))[0], math.inf
+    logs = np.log([metres for metres, _ in sure.values()])
+    sigmas = np.array([sigma for _, sigma in sure.values()])
     weights = 1 / sigmas**2
     mean = float((weights * logs).sum() / weights.sum())
     off = np.abs(logs - mean) / np.hypot(sigmas, 0.002)
     if off.max() > MOST_SIGMAS:
-        worst = [view.name for view, one in zip(views, points, strict=True) if math.isfinite(one.unit_rel_sigma)][
-            int(off.argmax())
-        ]
+        worst = int(off.argmax())
         raise CalibrationError(
             "distances-contradict",
-            what=f"What was measured in view {worst} contradicts the other views: it is off by "
-            f"{100 * abs(math.expm1(logs[off.argmax()] - mean)):.1f} %.",
-            remedy="Measure again: distance_m from the front of each camera's lens to the nearest visible point.",
+            what=f"What was measured in {list(sure)[worst]} contradicts the other distances: it is off by "
+            f"{100 * abs(math.expm1(logs[worst] - mean)):.1f} %.",
+            remedy="Measure again: distance_m from the front of each camera's lens to the nearest visible point, and "
+            "the poses.",
         )
     return math.exp(mean), float(weights.sum() ** -0.5)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from controller.core.arrays import FloatImage
+from controller.config.models import PoseTable
+from controller.core.arrays import Float64, FloatImage
 from controller.core.errors import CalibrationError, TroubleCode
 from controller.optics.calibrate.correspondence.captures import completed
 from controller.optics.calibrate.correspondence.colour_alignment import (
@@ -40,10 +41,17 @@ from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.calibration import merge_photographs, read_black, read_captures, read_correspondence
-from controller.stage.artefacts.geometry import camera_px, has_geometry, read_geometry, write_geometry, write_view_pose
+from controller.stage.artefacts.geometry import (
+    camera_px,
+    has_geometry,
+    read_geometry,
+    read_shape,
+    write_geometry,
+    write_view_pose,
+)
 from controller.stage.artefacts.kinds import StepKind, of_projectors
 from controller.stage.artefacts.pattern_plans import PhotographOptions, PlanUsed
-from controller.stage.artefacts.photographs import Developed, light_of, noise_of, white_bracket
+from controller.stage.artefacts.photographs import Developed, TakenPhotograph, light_of, noise_of, white_bracket
 from controller.stage.artefacts.projectors import Light, PixelFigures, Pixels, read_metapixels, write_radiometry_figures
 from controller.stage.artefacts.views import view_folders
 from controller.stage.rig.rig import Rig, RigProjector
@@ -73,15 +81,16 @@ def calibration_steps(
     # The camera and all responses are measured beside photographs, so that no photograph waits for them.
     steps.append(camera_step(rig))
     names = [projector.name for projector in rig.projectors]
+    several = rig.seat is not None or not rig.is_first
     for projector in rig.projectors:
         steps.append(light_step(rig, projector, options))
-        steps.append(_radiometry_step(projector))
+        steps.append(_radiometry_step(projector, several=several))
     for number, projector in enumerate(rig.projectors):
         code = code_step(rig, projector, options)
         # What is asked for may be refused, so nothing more is photographed before that is known.
         waits = number > 1 and shape in ("surface", "plane")
         steps.append(replace(code, after=(*code.after, StepId(StepKind.SHAPE))) if waits else code)
-        steps.append(_pixels_step(projector))
+        steps.append(_pixels_step(projector, several=several))
         if number == 1 and len(rig.projectors) > 2 and shape != "unknown":
             steps.append(_first_shape_step(rig, prior, shape))
         steps.append(indirect_step(projector))
@@ -112,10 +121,32 @@ def _first_shape_step(rig: Rig, prior: CameraPrior, shape: AskedShape) -> Step:
     )
 
 
-def _radiometry_step(projector: RigProjector) -> Step:
+TOO_LITTLE: Final = frozenset({"projector-dark", "projector-reaches-nothing", "projector-size-wrong"})
+"""What a view finds that sees nothing, or next to nothing, of a projector: it stands behind the object."""
+
+
+def _unless_unseen(
+    found: Callable[[], Sequence[Path]], unseen: Callable[[], Sequence[Path]], *, several: bool, context: Context
+) -> Sequence[Path]:
+    """What a step leaves; where ``several`` views share the projectors, one may see too little of one of them."""
+    try:
+        return found()
+    except CalibrationError as error:
+        if not several or error.code not in TOO_LITTLE:
+            raise
+        context.reporter.say(f"Too little of this projector is seen from here: {error.what} Other cameras may see it.")
+        return unseen()
+
+
+def _radiometry_step(projector: RigProjector, *, several: bool) -> Step:
     return Step(
         StepId(StepKind.RADIOMETRY, projector.name),
-        lambda context: _radiometry(projector, context),
+        lambda context: _unless_unseen(
+            lambda: _radiometry(projector, context),
+            lambda: _no_light(projector, context),
+            several=several,
+            context=context,
+        ),
         after=(StepId(StepKind.BLACK), StepId(StepKind.LIGHT, projector.name), StepId(StepKind.CAMERA)),
         title=f"Measuring the response of {projector.name}",
         weight=costs.RADIOMETRY_S * costs.scale([projector.size_px]),
@@ -123,10 +154,15 @@ def _radiometry_step(projector: RigProjector) -> Step:
     )
 
 
-def _pixels_step(projector: RigProjector) -> Step:
+def _pixels_step(projector: RigProjector, *, several: bool) -> Step:
     return Step(
         StepId(StepKind.PIXELS, projector.name),
-        lambda context: _pixels(projector, context),
+        lambda context: _unless_unseen(
+            lambda: _pixels(projector, context),
+            lambda: _no_pixels(projector, context),
+            several=several,
+            context=context,
+        ),
         after=(StepId(StepKind.BLACK), *of_projectors([projector.name], StepKind.RADIOMETRY, StepKind.CODES)),
         title=f"Decoding {projector.name} and fitting its metapixels",
         weight=costs.PIXELS_S * costs.scale([projector.size_px]),
@@ -149,13 +185,12 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
         noise=noise_of(bracket[0]),
     )
     said = {TroubleCode.WHITE_SEGMENT: white_segment(projector.name, radiometry.segment)}
-    matrix = bracket[0].read().camera_to_xyz
     light = Light(
         response=radiometry.response,
         mixing=radiometry.mixing,
         white=np.maximum(white - black, 0).astype(np.float32),
         black=black,
-        camera_to_xyz=_SRGB_TO_XYZ if matrix is None else matrix,
+        camera_to_xyz=_to_xyz(taken),
         segment=np.array([radiometry.segment]) if radiometry.segment else None,
         paint=radiometry.paint,
     )
@@ -168,8 +203,31 @@ _SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.
 """IEC 61966-2-1; for a camera without its own colour matrix."""
 
 
+def _to_xyz(taken: Mapping[str, TakenPhotograph]) -> Float64:
+    matrix = next(iter(taken.values())).read().camera_to_xyz
+    return _SRGB_TO_XYZ if matrix is None else matrix
+
+
+def _no_light(projector: RigProjector, context: Context) -> Sequence[Path]:
+    """Of a projector that this view does not see, with a usual response, by which its patterns can be drawn."""
+    black, usual = read_black(context.folder), np.tile(np.linspace(0, 1, 256) ** 2.2, (3, 1))
+    taken = light_of(projector.name).by_name(context.folder)
+    light = Light(usual, np.eye(3), np.zeros_like(black), black, _to_xyz(taken))
+    return [light.write(context.folder, projector.name)]
+
+
+def _no_pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
+    camera, size_px = Light.read(context.folder, projector.name).white.shape[:2], projector.size_px[::-1]
+    nowhere, dark = np.full((*camera, 2), np.nan, np.float32), np.zeros(camera, np.float32)
+    centre_px, round_px = np.zeros((*size_px, 2), np.float32), np.tile(np.float32([1, 0, 1]), (*size_px, 1))
+    pixels = Pixels(nowhere, dark, dark > 0, centre_px, round_px, centre_px[..., 0] > 0, nowhere, round_px, None)
+    return [pixels.write(context.folder, projector.name)]
+
+
 def _pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     light = Light.read(context.folder, projector.name)
+    if not light.white.any():
+        return _no_pixels(projector, context)
     used = PlanUsed.read(context.folder, projector.name)
     plan = used.plan(projector.size_px)
     taken = read_captures(context.folder, projector.name)
@@ -228,13 +286,14 @@ def _first_shape(
 ) -> Sequence[Path]:
     """Raises CalibrationError as ``find_shape`` for what other projectors would see as well."""
     try:
-        found, _ = _shape(two, prior, shape, context)
+        found, correspondences = _shape(two, prior, shape, context)
     except CalibrationError as error:
         if error.code in SEEN_BY_ALL:
             raise
         context.reporter.say(f"{error.what} The other projectors may show the shape.", Level.WARNING)
         return ()
-    context.reporter.say(" and ".join(projector.name for projector in two) + f": {shape_sentence(found)}")
+    if all(own.valid.any() for own in correspondences):
+        context.reporter.say(" and ".join(projector.name for projector in two) + f": {shape_sentence(found)}")
     return ()
 
 
@@ -247,6 +306,8 @@ def _shape(
 ) -> tuple[FoundShape, Sequence[Correspondence]]:
     correspondences = [read_correspondence(context.folder, projector.name) for projector in projectors]
     rows, columns = correspondences[0].valid.shape
+    if not all(own.valid.any() for own in correspondences):  # the views that see it know where it stands
+        return FoundShape("unknown", (columns, rows)), correspondences
     sizes = [projector.size_px for projector in projectors]
     tell = partial(context.advance, note="geometry")
     return find_shape(shape, correspondences, (columns, rows), sizes, prior, progress=tell), correspondences
@@ -254,7 +315,8 @@ def _shape(
 
 def _reconstruct(rig: Rig, prior: CameraPrior, shape: AskedShape, context: Context) -> Sequence[Path]:
     found, correspondences = _shape(rig.projectors, prior, shape, context)
-    context.reporter.say(shape_sentence(found))
+    if all(own.valid.any() for own in correspondences):
+        context.reporter.say(shape_sentence(found))
     names = [projector.name for projector in rig.projectors]
     depth_m = _depth_m(found, correspondences)
     stride = stride_of(depth_m.shape)
@@ -322,36 +384,43 @@ __all__ = ["lens_troubles"]
 
 def join_geometry(
     run: Path,
-    projectors: Sequence[str],
+    projectors: Mapping[str, PoseTable | None],
     prior_of: Callable[[str], CameraPrior],
     asked: AskedShape,
     reporter: Reporter,
 ) -> bool:
     """Adjust all whole views of a run together, and write each one's geometry and place; whether that was done.
 
-    ``prior_of``: of the camera of a view. Raises CalibrationError as ``join_views`` where a surface is ``asked`` for;
-    else views that can't be joined stay as they are, and a warning says why.
+    One view alone is adjusted where poses were measured. ``projectors``: by name, what was measured of where they
+    stand; ``prior_of``: of the camera of a view. Raises CalibrationError as ``join_views`` where a surface is ``asked``
+    for; else views that can't be joined stay as they are, and a warning says why.
     """
     folders = view_folders(run)
-    if len(folders) < 2 or asked in ("unknown", "plane"):
+    alone = len(folders) < 2 and not (any(projectors.values()) and read_shape(run).shape == "surface")
+    if alone or asked in ("unknown", "plane"):
         return False
     masks = (read_metapixels(run, name).valid for name in projectors)
     sizes = [(valid.shape[1], valid.shape[0]) for valid in masks]
     try:
-        views = [_seen(name, folder, projectors, sizes, prior_of(name)) for name, folder in folders.items()]
-        joined = join_views(views, projectors, sizes)
+        views = [_seen(name, folder, list(projectors), sizes, prior_of(name)) for name, folder in folders.items()]
+        joined = join_views(views, list(projectors), sizes, list(projectors.values()))
     except CalibrationError as error:
         if asked == "surface":
             raise
+        if error.code == "pose-contradicted":
+            reporter.say(f"{error.what} {error.remedy} No measured pose is used now.", Level.WARNING)
+            without = dict.fromkeys(projectors)
+            return join_geometry(run, without, lambda name: replace(prior_of(name), pose=None), asked, reporter)
         reporter.say(
             f"The views have no common shape: {error.what} {error.remedy} What needs no shape works in all of them.",
             Level.WARNING,
         )
         return False
     for folder, view, one in zip(folders.values(), views, joined, strict=True):
-        write_geometry(folder, projectors, FoundShape("surface", view.camera_size, one.reconstruction))
+        write_geometry(folder, list(projectors), FoundShape("surface", view.camera_size, one.reconstruction))
         write_view_pose(folder, one.pose)
-    reporter.say(f"{len(joined)} views are joined: their cameras and all projectors have one place each.")
+    if len(joined) > 1:
+        reporter.say(f"{len(joined)} views are joined: their cameras and all projectors have one place each.")
     return True
 
 

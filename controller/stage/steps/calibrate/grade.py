@@ -98,13 +98,17 @@ def _verify(calibrated: Calibrated, context: Context) -> Sequence[Path]:
     calibration = calibrated.calibration
     figures, pictures = {}, []
     maps: dict[str, ErrorMaps] = {}
-    count = len(calibration.projectors)
+    # one of several views may not see a projector
+    seen = [n for n, part in enumerate(calibration.projectors) if part.metapixels.valid.any()]
     judged = side_by_side(
-        partial(_judged, calibrated, context.folder), count, bytes_each=JUDGING_BYTES * calibration.object_mask.size
+        lambda at: _judged(calibrated, context.folder, seen[at]),
+        len(seen),
+        bytes_each=JUDGING_BYTES * calibration.object_mask.size,
     )
-    for n, (part, one) in enumerate(zip(calibration.projectors, judged, strict=True)):
-        context.advance((n + 1) / (count + 1), part.name)
-        figures[part.name], maps[part.name], picture = one
+    for n, one in zip(seen, judged, strict=True):
+        name = calibration.projectors[n].name
+        context.advance((n + 1) / (len(calibration.projectors) + 1), name)
+        figures[name], maps[name], picture = one
         pictures.append(picture)
     geometry = known_geometry(context.folder, calibrated.projectors)
     troubles = {

@@ -55,6 +55,9 @@ def _separate(projector: RigProjector, context: Context) -> Sequence[Path]:
     used = PlanUsed.read(folder, name)
     plan = used.plan(projector.size_px)
     light, pixels = Light.read(folder, name), Pixels.read(folder, name)
+    if not pixels.seen.any():
+        nothing = Indirect(np.zeros_like(light.white), light.response, light.mixing, light.segment, paint=light.paint)
+        return [nothing.write(folder, name), IndirectFigures(0.0, 0.0, (0.0, 0.0, 0.0)).write(folder, name)]
     taken = read_captures(folder, name)
     captures = completed(Developed(taken, {"black": light.black, "white": light.white + light.black}), plan)
     noise = noise_of(taken[plan.sinusoids("phase-x")[0].name])

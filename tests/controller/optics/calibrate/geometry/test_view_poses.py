@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from controller.config.models import PoseTable
 from controller.core.arrays import Float64
 from controller.core.errors import CalibrationError
 from controller.optics.calibrate.geometry.values import CameraPrior
@@ -169,3 +171,117 @@ def test_distances_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(CalibrationError) as refused:
         joined(views)
     assert refused.value.code == "distances-contradict"
+
+
+TO_ROOM = Rotation.from_euler("xyz", (0.3, -1.1, 2.0))
+"""How the frame in which poses were measured is turned; it lies elsewhere, too."""
+
+
+def measured(device: Pinhole, off_m: Sequence[float] = (0, 0, 0), sigma_m: float = 0.001) -> PoseTable:
+    """Its true place in the room, moved by ``off_m``."""
+    x, y, z = TO_ROOM.apply(centre(device)) + np.array((4.0, -2.0, 1.0)) + off_m
+    return PoseTable(position_m=(x, y, z), sigma_m=sigma_m)
+
+
+def test_measured_poses_give_the_size_and_make_places_better() -> None:
+    cameras, projectors, views = stage(noise=2.0)
+    sizes, names = [PROJECTOR] * 4, ["a", "b", "c", "d"]
+
+    def off_m(found: Sequence[JoinedView]) -> float:
+        """The largest error of how far two devices are apart."""
+        own = [-one.pose.rotation.T @ one.pose.shift_m for one in found]
+        own += [centre(pose) for pose in found[0].reconstruction.geometry.projectors]
+        true = [centre(one) for one in (*cameras, *projectors)]
+        pairs = list(itertools.combinations(range(len(true)), 2))
+        return max(abs(float(np.linalg.norm(own[a] - own[b]) - np.linalg.norm(true[a] - true[b]))) for a, b in pairs)
+
+    distance = float(np.nanmin(np.linalg.norm(surface(cameras[0])[0] - centre(cameras[0]), axis=2)))
+    without = [replace(views[0], prior=replace(views[0].prior, distance_m=distance, distance_rel_sigma=1e-4))]
+    alone = off_m(join_views([*without, *views[1:]], names, sizes))
+    for v in (0, 1, 2):
+        views[v] = replace(views[v], prior=replace(views[v].prior, pose=measured(cameras[v])))
+    found = join_views(views, names, sizes, [measured(own) for own in projectors])
+    assert all(one.reconstruction.geometry.scale_known for one in found)
+    assert found[0].reconstruction.scale_rel_sigma < 0.002
+    assert off_m(found) < min(0.004, alone / 3)
+
+
+def test_poses_and_photographs_together_fit_as_well_as_scipys_least_squares() -> None:
+    """One view, poses that are off by their sigma: with the lenses as found, scipy finds no better places."""
+    from scipy.optimize import least_squares
+
+    noise, sigma_m = 0.5, 0.01
+    camera = looking_at_the_middle(0, 1.6, 0, CAMERA, 230.0)
+    projectors = [looking_at_the_middle(degrees, 1.9, height, PROJECTOR, 520.0)
+                  for degrees, height in ((-45, -0.2), (0, -0.8), (40, -0.3))]  # fmt: skip
+    view = seen_stage("front", camera, projectors, (0, 1, 2), noise)
+    part = np.zeros(CAMERA[::-1], np.bool_)
+    part[48:66, 66:90] = True
+    view = replace(view, correspondences=[replace(own, valid=own.valid & part) for own in view.correspondences])
+    random = np.random.default_rng(3)
+    poses = [measured(own, off_m=random.normal(0, sigma_m, 3), sigma_m=sigma_m) for own in projectors]
+    found = join_views([view], ["a", "b", "c"], [PROJECTOR] * 3, poses)[0].reconstruction
+    geometry, noise_px = found.geometry, found.noise_px
+    seen = np.stack([own.valid for own in view.correspondences], 2)
+    some = np.argwhere(seen.sum(axis=2) >= 2)
+    seen, depth = seen[tuple(some.T)], np.nanmedian(geometry.points_m[..., 2])
+    rays = np.column_stack([geometry.camera.rays(some[:, ::-1].astype(np.float64)), np.ones(len(some))])
+    points = rays * depth
+    px = np.stack([own.projector_px[tuple(some.T)] for own in view.correspondences], 1).astype(np.float64)
+    middles = np.array([centre(own) for own in geometry.projectors])
+    there = np.array([pose.position_m for pose in poses])
+    room, _ = Rotation.align_vectors(there - there.mean(axis=0), middles - middles.mean(axis=0))
+
+    def off(step: Float64) -> Float64:
+        depths, own, frame = step[: len(points)], step[len(points) : -6].reshape(3, 6), step[-6:]
+        at = points * np.exp(depths)[:, None]
+        parts = []
+        for n, pose in enumerate(geometry.projectors):
+            turn = Rotation.from_rotvec(own[n, :3]).as_matrix() @ pose.rotation
+            moved = replace(pose, rotation=turn, translation_m=-turn @ (middles[n] + own[n, 3:]))
+            apart = ((project(moved, at)[0] - px[:, n]) / noise_px)[seen[:, n]]
+            # the same loss: what is far off counts less
+            squared = np.maximum((apart**2).sum(axis=1, keepdims=True), 1e-12) / 2.4**2
+            parts.append((apart * np.sqrt(np.log1p(squared) / squared)).ravel())
+        turned = (Rotation.from_rotvec(frame[:3]) * room).apply(middles + own[:, 3:])
+        parts.append(
+            ((turned + frame[3:] + there.mean(axis=0) - room.apply(middles.mean(axis=0)) - there) / sigma_m).ravel()
+        )
+        return np.concatenate(parts)
+
+    rows = np.concatenate([np.repeat(np.flatnonzero(seen[:, n]), 2) for n in range(3)])
+
+    def by_step(step: Float64) -> Float64:
+        """Numerically; each depth moves the rows of its own point."""
+        now, found = off(step), np.zeros((len(rows) + 9, len(step)))
+        found[np.arange(len(rows)), rows] = (off(step + np.r_[np.full(len(points), 1e-6), np.zeros(24)]) - now)[
+            :-9
+        ] / 1e-6
+        for column in range(len(points), len(step)):
+            found[:, column] = (off(step + 1e-6 * (np.arange(len(step)) == column)) - now) / 1e-6
+        return found
+
+    def least(free: int) -> float:
+        """The least cost with the depths free, and so many others."""
+        start = np.zeros(len(points) + 24)
+
+        def whole(part: Float64) -> Float64:
+            return np.concatenate([part, start[len(part) :]])
+
+        best = least_squares(lambda part: off(whole(part)), start[: len(points) + free], method="lm", x_scale="jac",
+                             jac=lambda part: by_step(whole(part))[:, : len(part)])  # fmt: skip
+        return float(best.cost)
+
+    assert least(0) - least(24) < 24 / 10, "of half a chi-square, with 24 places free"
+
+
+def test_a_wrong_pose_is_named_and_one_that_is_not_certain_is_not() -> None:
+    _, projectors, views = stage()
+    poses = [measured(own) for own in projectors]
+    poses[2] = measured(projectors[2], off_m=(0.05, 0, 0))
+    with pytest.raises(CalibrationError) as refused:
+        join_views(views, ["a", "b", "c", "d"], [PROJECTOR] * 4, poses)
+    assert refused.value.code == "pose-contradicted"
+    assert refused.value.what.startswith("c ")
+    poses[2] = measured(projectors[2], off_m=(0.05, 0, 0), sigma_m=0.05)
+    assert join_views(views, ["a", "b", "c", "d"], [PROJECTOR] * 4, poses)

@@ -293,3 +293,43 @@ def test_a_code_waits_for_no_response_but_its_own(tmp_path: Path, journal: Journ
         after = steps[StepId(StepKind.CODES, name)].after
         assert [step for step in after if step.kind == StepKind.RADIOMETRY] == [own]
         assert steps[own].calculates
+
+
+class BehindTheObject(SimulatedCamera):
+    """Sees nothing of what the projector shows."""
+
+    def capture(self, destination: Path, *, deadline: Deadline) -> list[CapturedFile]:
+        shown = self.display.shown
+        shown.append({name: np.zeros_like(frame) for name, frame in shown[-1].items()})
+        try:
+            return super().capture(destination, deadline=deadline)
+        finally:
+            shown.pop()
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_view_that_sees_nothing_of_a_projector_goes_on_unless_it_is_the_only_one(
+    tmp_path: Path, journal: Journal, alone: bool
+) -> None:
+    stage = stage_of(tmp_path, SCENE, journal)
+    blind = BehindTheObject(display=stage.camera.display)
+    acquirer = Acquirer(blind.display, blind, iso=100, aperture_f=None, settle_s=0.0)
+    rig = replace(stage.rig, camera=blind, acquirer=acquirer)
+    if not alone:
+        rig = replace(rig, drawn_by=lambda name, deadline: SCENE.response())
+    steps = calibration_steps(rig, cast("CameraPrior", None), longest_exposure_s=4.0)
+    wanted = (StepKind.LIGHT, StepKind.RADIOMETRY, StepKind.CODES, StepKind.PIXELS, StepKind.INDIRECT)
+    refused = None
+    try:
+        for step in steps:
+            if step.id.kind in wanted:
+                step.run(stage.context)
+    except CalibrationError as error:
+        refused = error.code
+    assert (refused is not None) is alone
+    if alone:
+        return
+    run = stage.context.folder
+    assert not Pixels.read(run, NAME).valid.any()
+    assert not Light.read(run, NAME).white.any()
+    assert not Indirect.read(run, NAME).share.any()
