@@ -24,11 +24,18 @@ def carried(camera: CameraTruth, right_degrees: float) -> CameraTruth:
 
 
 class JudgeCamera:
-    """``camera``: of the stage's truth, or ``carried``; its rays are cast at once, which takes seconds."""
+    """``camera``: of the stage's truth, or ``carried``; its rays are cast at once, which takes seconds.
 
-    def __init__(self, stage: Path, camera: CameraTruth) -> None:
+    ``direct``: without the light that comes back from other surfaces
+    """
+
+    def __init__(self, stage: Path, camera: CameraTruth, *, direct: bool = False) -> None:
         whole = read_truth(stage)
-        self._truth = dataclasses.replace(whole, camera=camera, more_cameras=())
+        # one of the stage's own sees the very light that the bench has worked out for it
+        own = whole.seen_by(camera) if camera in whole.cameras else whole
+        self._truth = dataclasses.replace(own, camera=camera, more_cameras=())
+        if direct:
+            self._truth = dataclasses.replace(self._truth, engine="direct")
         thing, kept = object_of(stage, whole.object), light_folder(stage)
         samples = samples_of(self._truth, thing, kept, lambda share: None)
         transfer = IndirectTransfers(thing, kept).transfer(self._truth, samples.pixels, lambda share: None, keep=True)

@@ -111,3 +111,12 @@ def test_light_between_surfaces_is_worked_out_by_the_engine_that_is_named(tmp_pa
         prepared(tmp_path, "wrong", engine="candle")
     assert refused.value.code == "setting-wrong"
     assert "mitsuba" in refused.value.remedy
+
+
+def test_no_wall_hides_the_object_from_cameras_all_around_it(tmp_path: Path) -> None:
+    before, around = (
+        prepared(tmp_path, "two", room="room", cameras=2),
+        prepared(tmp_path, "four", room="room", cameras=4),
+    )
+    assert [surface.name for surface in before.surfaces] == ["table", "wall"]
+    assert [surface.name for surface in around.surfaces] == ["table"]
