@@ -206,6 +206,7 @@ def test_measured_poses_give_the_size_and_make_places_better() -> None:
     assert off_m(found) < min(0.004, alone / 3)
 
 
+@pytest.mark.slow
 def test_poses_and_photographs_together_fit_as_well_as_scipys_least_squares() -> None:
     """One view, poses that are off by their sigma: with the lenses as found, scipy finds no better places."""
     from scipy.optimize import least_squares
