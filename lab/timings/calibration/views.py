@@ -298,7 +298,7 @@ _judges: Final[dict[CameraTruth, JudgeCamera]] = {}
 
 def _judge(truth: BenchTruth, stage: Path, camera: CameraTruth) -> JudgeCamera:
     """Each is made once: its light takes long. A stage of one view has the truth of the whole one."""
-    if _judges.keys() - {camera} and next(iter(_judges)) not in truth.cameras:
+    if _judges and next(iter(_judges)) not in truth.cameras:
         _judges.clear()
     if camera not in _judges:
         _judges[camera] = JudgeCamera(stage, camera)
@@ -307,7 +307,8 @@ def _judge(truth: BenchTruth, stage: Path, camera: CameraTruth) -> JudgeCamera:
 
 def _jumps(points: FloatImage) -> Mask:
     """Pixels beside which another surface is, nearer or farther."""
-    low, high = (change(points, np.ones((3, 3), np.uint8)) for change in (cv2.erode, cv2.dilate))
+    beside = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(points, beside), cv2.dilate(points, beside)
     return np.asarray(~(np.linalg.norm(high - low, axis=-1) < 5 * SAME_M))
 
 

@@ -219,7 +219,7 @@ def _no_light(projector: RigProjector, context: Context) -> Sequence[Path]:
 def _no_pixels(projector: RigProjector, context: Context) -> Sequence[Path]:
     camera, size_px = Light.read(context.folder, projector.name).white.shape[:2], projector.size_px[::-1]
     nowhere, dark = np.full((*camera, 2), np.nan, np.float32), np.zeros(camera, np.float32)
-    centre_px, round_px = np.zeros((*size_px, 2), np.float32), np.tile(np.float32([1, 0, 1]), (*size_px, 1))
+    centre_px, round_px = np.zeros((*size_px, 2), np.float32), np.tile(np.array([1, 0, 1], np.float32), (*size_px, 1))
     pixels = Pixels(nowhere, dark, dark > 0, centre_px, round_px, centre_px[..., 0] > 0, nowhere, round_px, None)
     return [pixels.write(context.folder, projector.name)]
 
