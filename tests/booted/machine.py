@@ -156,10 +156,12 @@ class Machine:
     def install(self, package: Path) -> str:
         """Install a Debian package, or another version of it, as `apt install ./FILE` does; what that printed."""
         place = self.at(Path("/opt") / package.name)
-        if place != package:
-            shutil.copy(package, place)
-        # The disk of this machine is thrown away: nothing has to reach it for good.
-        return self.call("dpkg", "--force-unsafe-io", "--install", f"/opt/{package.name}")
+        shutil.copy(package, place)
+        try:
+            # The disk of this machine is thrown away: nothing has to reach it for good.
+            return self.call("dpkg", "--force-unsafe-io", "--install", f"/opt/{package.name}")
+        finally:
+            place.unlink()  # a gigabyte
 
     def switch_on(self, *, read_only: bool = False) -> None:
         """Boot, until the machine takes commands. ``read_only``: nothing can be written to its disk, and /tmp is on it;

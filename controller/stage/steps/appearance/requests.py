@@ -265,7 +265,7 @@ def make_target(kind: str, file: Path | None, options: Mapping[str, Any], calibr
     return through_camera(on_each(mask, lambda piece: in_box(geometry, piece, make), calibrated.objects(mask)))
 
 
-def _sheet(file: Path, colour: str | None) -> FloatImage:
+def _sheet(file: Path, colour: ColourSpace | None) -> FloatImage:
     """(rows, columns, 4): with alpha, also where the file has none."""
     sheet = np.maximum(read_picture(file, colour, soft=True), 0)
     return sheet if sheet.shape[2] == 4 else np.dstack([sheet, np.ones(sheet.shape[:2], np.float32)])

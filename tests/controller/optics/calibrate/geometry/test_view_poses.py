@@ -177,7 +177,7 @@ TO_ROOM = Rotation.from_euler("xyz", (0.3, -1.1, 2.0))
 """How the frame in which poses were measured is turned; it lies elsewhere, too."""
 
 
-def measured(device: Pinhole, off_m: Sequence[float] = (0, 0, 0), sigma_m: float = 0.001) -> PoseTable:
+def measured(device: Pinhole, off_m: Sequence[float] | Float64 = (0, 0, 0), sigma_m: float = 0.001) -> PoseTable:
     """Its true place in the room, moved by ``off_m``."""
     x, y, z = TO_ROOM.apply(centre(device)) + np.array((4.0, -2.0, 1.0)) + off_m
     return PoseTable(position_m=(x, y, z), sigma_m=sigma_m)
@@ -240,7 +240,7 @@ def test_poses_and_photographs_together_fit_as_well_as_scipys_least_squares() ->
         for n, pose in enumerate(geometry.projectors):
             turn = Rotation.from_rotvec(own[n, :3]).as_matrix() @ pose.rotation
             moved = replace(pose, rotation=turn, translation_m=-turn @ (middles[n] + own[n, 3:]))
-            apart = ((project(moved, at)[0] - px[:, n]) / noise_px)[seen[:, n]]
+            apart = ((project(moved, np.asarray(at, np.float64))[0] - px[:, n]) / noise_px)[seen[:, n]]
             # the same loss: what is far off counts less
             squared = np.maximum((apart**2).sum(axis=1, keepdims=True), 1e-12) / 2.4**2
             parts.append((apart * np.sqrt(np.log1p(squared) / squared)).ravel())
@@ -269,8 +269,13 @@ def test_poses_and_photographs_together_fit_as_well_as_scipys_least_squares() ->
         def whole(part: Float64) -> Float64:
             return np.concatenate([part, start[len(part) :]])
 
-        best = least_squares(lambda part: off(whole(part)), start[: len(points) + free], method="lm", x_scale="jac",
-                             jac=lambda part: by_step(whole(part))[:, : len(part)])  # fmt: skip
+        def apart(part: Float64) -> Float64:
+            return off(whole(part))
+
+        def slope(part: Float64) -> Float64:
+            return by_step(whole(part))[:, : len(part)]
+
+        best = least_squares(apart, start[: len(points) + free], method="lm", x_scale="jac", jac=slope)
         return float(best.cost)
 
     assert least(0) - least(24) < 24 / 4, "half of what 24 free values gain of noise alone"
