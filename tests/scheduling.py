@@ -42,7 +42,7 @@ LONGEST_FIRST: Final = (
     "tests/controller/optics/calibrate/geometry/test_self_calibration.py",
     "tests/controller/optics/calibrate/geometry/test_self_calibration_failures.py",
     "tests/controller/optics/calibrate/test_chain.py",
-    "tests/controller/optics/solve/bounded/test_regions.py",
+    "tests/lab/study/test_region_solver.py",
     "tests/controller/stage/cluster/test_cluster.py",
     "tests/controller/cli/test_extras.py",
     "tests/end_to_end/test_killed_demo.py",

@@ -51,7 +51,9 @@ def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False, onl
     with contextlib.ExitStack() as stack:
         context = open_context(stage.folder, runtime=stack.enter_context(used_runtime_folder(stage.folder)))
         # The player of an installed kiosk is systemd's.
-        if checked.stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder):
+        starts = stage.tables.display.driver == "player" and not kiosk_places.is_installed(stage.folder)
+        # Other computers are asked by way of it. Without them, it starts once the devices are there.
+        if starts and checked.elsewhere:
             stack.enter_context(_player(stage, context, plays=plays))
         for device in checked.elsewhere:
             device.ask(context, "check", deadline=deadline.within(OPEN_S))
@@ -77,6 +79,8 @@ def opened_rig(checked: Checked, *, deadline: Deadline, plays: bool = False, onl
                 absent[name] = error
             else:
                 _closed_by(stack, cameras[name])
+        if starts and not checked.elsewhere:
+            stack.enter_context(_player(stage, context, plays=plays))
         driver, settings = checked.display
         display = cast("Display", open_device(stage.tables.display, driver, settings, context, deadline))
         _closed_by(stack, display)

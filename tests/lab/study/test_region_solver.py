@@ -28,11 +28,17 @@ from lab.study.regions import (
     solve_regions,
 )
 from lab.timings.tools.synthetic import crop_calibration, synthetic_calibration
+from tests.controller.optics.solve.conftest import plane_calibration
 
 pytestmark = pytest.mark.slow
 
 Stage = Callable[..., Calibration]
 FAST = "clarabel"
+
+
+@pytest.fixture
+def stage() -> Stage:
+    return plane_calibration
 
 
 def crop(stage: Stage, *, blurred: bool = False, mixed: bool = True, seed: int = 0) -> Calibration:
