@@ -113,6 +113,13 @@ def painted(folder: Path, sheet: npt.NDArray[np.uint8]) -> None:
     Image.fromarray(sheet).save(folder / "t.png")
 
 
+def half_red(folder: Path) -> None:
+    """A sheet whose left half is red, and whose right half is clear."""
+    sheet = np.zeros((600, 800, 4), np.uint8)
+    sheet[:, :400] = (255, 0, 0, 255)
+    painted(folder, sheet)
+
+
 TEXTURE = PICTURE.replace("KIND", "texture")
 
 
@@ -120,9 +127,7 @@ def test_a_sheet_lies_on_the_mesh_and_leaves_the_object_where_it_is_clear(
     tmp_path: Path, calibrated: Calibrated
 ) -> None:
     lay_wall(calibrated.folder)
-    sheet = np.zeros((600, 800, 4), np.uint8)
-    sheet[:, :400] = (255, 0, 0, 255)
-    painted(tmp_path, sheet)
+    half_red(tmp_path)
     request = requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0]
     target = request.target()
     np.testing.assert_array_equal(target.mask, calibrated.transport.object_mask)
@@ -137,9 +142,7 @@ def test_where_no_camera_sees_a_projector_shows_what_lies_there_on_the_mesh(
     tmp_path: Path, calibrated: Calibrated
 ) -> None:
     lay_wall(calibrated.folder)
-    sheet = np.zeros((600, 800, 4), np.uint8)
-    sheet[:, :400] = (255, 0, 0, 255)
-    painted(tmp_path, sheet)
+    half_red(tmp_path)
     found = requests_of(load(tmp_path, STAGE + TEXTURE), calibrated)[0].sheet
     assert found is not None
     for n, own in enumerate(calibrated.geometry.projectors):
