@@ -74,7 +74,7 @@ def _wanted(folder: Path) -> float | None:
         file = folder / _CLOSED
         if here.endpoints and (not file.exists() or abs(time.time() - file.stat().st_mtime) > YOUNG_S):
             return None
-        return (here.folder).stat().st_ctime
+        return here.folder.stat().st_ctime
     except OSError:  # it is being exchanged
         return None
 

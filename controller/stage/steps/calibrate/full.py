@@ -292,7 +292,7 @@ def _first_shape(
             raise
         context.reporter.say(f"{error.what} The other projectors may show the shape.", Level.WARNING)
         return ()
-    if all(own.valid.any() for own in correspondences):
+    if _sees_all(correspondences):
         context.reporter.say(" and ".join(projector.name for projector in two) + f": {shape_sentence(found)}")
     return ()
 
@@ -301,12 +301,17 @@ SEEN_BY_ALL: Final = frozenset({"scene-flat", "not-flat", "camera-prior-contradi
 """Why a shape that is asked for is missing, where another projector does not help."""
 
 
+def _sees_all(correspondences: Sequence[Correspondence]) -> bool:
+    """Whether this view sees each of the projectors: one of several may not."""
+    return all(own.valid.any() for own in correspondences)
+
+
 def _shape(
     projectors: Sequence[RigProjector], prior: CameraPrior, shape: AskedShape, context: Context
 ) -> tuple[FoundShape, Sequence[Correspondence]]:
     correspondences = [read_correspondence(context.folder, projector.name) for projector in projectors]
     rows, columns = correspondences[0].valid.shape
-    if not all(own.valid.any() for own in correspondences):  # the views that see it know where it stands
+    if not _sees_all(correspondences):  # the views that see it know where it stands
         return FoundShape("unknown", (columns, rows)), correspondences
     sizes = [projector.size_px for projector in projectors]
     tell = partial(context.advance, note="geometry")
@@ -315,7 +320,7 @@ def _shape(
 
 def _reconstruct(rig: Rig, prior: CameraPrior, shape: AskedShape, context: Context) -> Sequence[Path]:
     found, correspondences = _shape(rig.projectors, prior, shape, context)
-    if all(own.valid.any() for own in correspondences):
+    if _sees_all(correspondences):
         context.reporter.say(shape_sentence(found))
     names = [projector.name for projector in rig.projectors]
     depth_m = _depth_m(found, correspondences)
