@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 
 from controller.core.arrays import Float64, FloatImage
@@ -24,7 +25,7 @@ from controller.optics.calibrate.photometry.separation import SinusoidContrast, 
 from controller.optics.calibrate.photometry.tile_fit import evened, fit_tiles, with_paint
 from controller.optics.calibrate.photometry.waveform import Wave, held_to
 from controller.optics.calibrate.values import Radiometry, SurfaceSpread
-from controller.optics.capture.patterns import PatternPlan
+from controller.optics.capture.patterns import CELL_PX, PatternPlan
 from controller.optics.capture.profile import CameraNoise
 
 FEWEST_TILES = 60
@@ -96,7 +97,10 @@ def measure_radiometry(
     white = coloured(captures, "white", black.shape[:2]) - black
     code = code or tile_code(captures, plan, black, white, known_px=known_px, noise=noise)
     places = np.stack([one.middle_px() for one in code], axis=-1)
-    check_size(places[code[0].sure & code[1].sure & lit_pixels(white)], plan.size_px)
+    # the noise of a dark projector is a code, too, but not one that its neighbours agree with
+    beside = np.ones((3, 3), np.uint8)
+    agree = (cv2.dilate(places, beside) - cv2.erode(places, beside) <= CELL_PX).all(axis=-1)
+    check_size(places[code[0].sure & code[1].sure & lit_pixels(white) & agree], plan.size_px)
     tiles = measure_tiles(captures, plan, black, white, code=code, indirect=indirect)
     clipped = float(np.mean(finite(black) & ~finite(white)))
     if tiles.ratio.shape[0] < FEWEST_TILES and clipped > OVEREXPOSED:

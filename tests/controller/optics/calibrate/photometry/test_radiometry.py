@@ -232,9 +232,11 @@ def test_a_missing_photograph_is_named(name: str) -> None:
     assert caught.value.code == "capture-missing"
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0, np.nan])
-def test_a_dead_projector_is_named_as_dark(value: float) -> None:
-    captures = {key: np.full_like(image, value) for key, image in before_response(scene()).items()}
+@pytest.mark.parametrize(("value", "noise"), [(0.0, 0.0), (1.0, 0.0), (np.nan, 0.0), (0.01, 0.001)])
+def test_a_dead_projector_is_named_as_dark(value: float, noise: float) -> None:
+    rng = np.random.default_rng(1)
+    shot = {key: rng.normal(value, noise, image.shape) for key, image in before_response(scene()).items()}
+    captures = {key: image.astype(np.float32) for key, image in shot.items()}
     with pytest.raises(CalibrationError) as caught:
         measure_radiometry(captures, PLAN)
     assert caught.value.code == "projector-dark"
