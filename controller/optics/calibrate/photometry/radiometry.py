@@ -28,7 +28,7 @@ from controller.optics.calibrate.values import Radiometry, SurfaceSpread
 from controller.optics.capture.patterns import CELL_PX, PatternPlan
 from controller.optics.capture.profile import CameraNoise
 
-FEWEST_TILES = 60
+FEWEST_TILES = 40
 OVEREXPOSED = 0.02
 """Of the photograph."""
 SUSPECT_ADDITIVITY = 0.02

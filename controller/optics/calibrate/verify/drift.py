@@ -184,7 +184,8 @@ def find_drift(
     drifts = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
     camera = _camera(calibration, drifts, seen)
     culprit = DriftCause.NONE if camera.found else DriftCause.UNKNOWN
-    if camera.moved(STILL_PX) and not _explained_by_projectors(camera, drifts):
+    seen_here = [one for n, one in enumerate(drifts) if light.lit[n].any()]
+    if camera.moved(STILL_PX) and not _explained_by_projectors(camera, seen_here):
         back = np.asarray(np.linalg.inv(camera.matrix), np.float64)
         patterns = [warp(pattern, back) for pattern in patterns]
         drifts = [_projector(light, n, part, frame, patterns[n]) for n, part, frame in parts]
@@ -204,7 +205,7 @@ def _culprit(
     camera: Motion, found: Sequence[ProjectorDrift], light: TransportModel, calibration: Calibration
 ) -> DriftCause:
     """After the camera's motion was taken out, patterns lie still on the object, unless it was the object."""
-    known = [(n, one) for n, one in enumerate(found) if one.known]
+    known = [(n, one) for n, one in enumerate(found) if one.known and light.lit[n].any()]
     if not known or not camera.found:
         return DriftCause.UNKNOWN
     elsewhere = []
@@ -227,7 +228,10 @@ def camera_px_per_pixel(part: ProjectorCalibration) -> float:
 def _projector(
     light: TransportModel, n: int, part: ProjectorCalibration, frame: FloatImage, seen: FloatImage
 ) -> ProjectorDrift:
-    """Register one projector's picture in its own pixels."""
+    """Register one projector's picture in its own pixels; one that this view does not see is as it was."""
+    if not light.lit[n].any():
+        still = replace(no_motion(frame.shape, 3), found=True)
+        return ProjectorDrift(part.name, still, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 0.0, 1.0)
     use = light.lit[n] & finite(seen)
     white = np.where(use[:, :, None], part.white, 0).astype(np.float32)
     strength = light.gaussian_mean(white * white, n)

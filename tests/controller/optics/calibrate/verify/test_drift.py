@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -11,7 +12,8 @@ import pytest
 
 from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration
-from controller.optics.calibrate.verify.drift import Drift, DriftPhotographs, find_drift, update_white
+from controller.optics.calibrate.verify.drift import Drift, DriftCause, DriftPhotographs, find_drift, update_white
+from controller.optics.calibrate.verify.drift_report import advice
 from controller.optics.transport import LightTransport, build_transport
 from lab.timings.tools.synthetic import synthetic_calibration
 
@@ -66,6 +68,29 @@ def test_a_lamp_is_as_strong_as_its_light_and_not_as_its_contrast(optics: Optics
 def test_a_lamp_that_flickers_has_not_dimmed_where_flicker_says_as_much() -> None:
     for one in checked(as_it_is, gain=0.98).projectors:
         assert (one.dimmed, one.flickering(0.01).dimmed, one.flickering(0.002).dimmed) == (True, False, True)
+
+
+@pytest.mark.parametrize(("shift_px", "culprit"), [(0, DriftCause.NONE), (3, DriftCause.CAMERA)])
+def test_a_projector_that_a_view_does_not_see_is_neither_dark_nor_has_it_moved(
+    shift_px: int, culprit: DriftCause
+) -> None:
+    calibration, _, frames = stage()
+    hidden = calibration.projectors[2]
+    nowhere = replace(hidden.metapixels, valid=np.zeros_like(hidden.metapixels.valid))
+    behind = replace(hidden, metapixels=nowhere, white=np.zeros_like(hidden.white), indirect=None)
+    parts = (*calibration.projectors[:2], behind)
+    calibration = replace(calibration, projectors=parts)
+    light = build_transport(calibration)
+
+    def seen(image: FloatImage) -> FloatImage:
+        return np.asarray(np.roll(image + calibration.black, shift_px, axis=1), np.float32)
+
+    patterns = {part.name: seen(light.forward_part(n, frames[n])) for n, part in enumerate(parts)}
+    white = seen(np.sum([part.white for part in parts], axis=0, dtype=np.float32))
+    photographs = DriftPhotographs(seen(np.zeros_like(white)), white, patterns)
+    drift = find_drift(light, calibration, frames, photographs)
+    assert (drift.culprit, drift.moved, drift.dimmed) == (culprit, (), ())
+    assert advice(drift) == ("nothing" if culprit is DriftCause.NONE else "full")
 
 
 def test_white_that_was_photographed_once_more_has_the_noise_of_all_photographs() -> None:
