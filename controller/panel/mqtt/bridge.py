@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import aiomqtt
 import anyio
+from anyio.abc import TaskGroup
 
 from controller.core.files import read_text
 from controller.kiosk.building.verbs import Verbs
@@ -105,11 +106,15 @@ class BuildingControl:
 
         unsubscribe = self._kiosk.subscribe(notify)
         pause_s = self._first_pause_s
+        task = asyncio.current_task()
         try:
             while True:
                 began_s = loop.time()
                 try:
-                    await self._connected()
+                    # A task group repeats its cancellation. `asyncio.wait_for`, inside every call of the client, can
+                    # lose one that arrives together with the broker's answer (Python 3.11), and would wait without end.
+                    async with anyio.create_task_group() as tasks:
+                        tasks.start_soon(self._connected, tasks)
                 except* ValueError as errors:
                     _LOG.warning("The MQTT password file is not text, or the topic is not valid: %s", errors.exceptions)
                 except* (aiomqtt.MqttError, OSError) as errors:
@@ -117,6 +122,9 @@ class BuildingControl:
                     self._lost(str(errors.exceptions[0]))
                 except* Exception:  # noqa: BLE001 - one connection must not end the panel or the retries
                     _LOG.exception("The connection to the MQTT broker failed. Reconnecting.")
+                # A group of errors replaces a cancellation that arrives in the same moment.
+                if task is not None and task.cancelling():
+                    raise asyncio.CancelledError
                 pause_s = self._first_pause_s if loop.time() - began_s > LONGEST_PAUSE_S else pause_s
                 await asyncio.sleep(pause_s)
                 pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
@@ -137,7 +145,7 @@ class BuildingControl:
             self._kiosk.record("mqtt-back", "The MQTT broker is connected again.")
             self._kiosk.warn("mqtt", "")
 
-    async def _connected(self) -> None:
+    async def _connected(self, tasks: TaskGroup) -> None:
         options, topic = self._options, self._options.topic
         password = await anyio.to_thread.run_sync(_password, options.password_file)
         tls = ssl.create_default_context(cafile=options.certificates) if options.encrypted else None
@@ -159,24 +167,18 @@ class BuildingControl:
             await client.publish(f"{topic}/available", "online", qos=1, retain=True)
             self._back()
             try:
-                await self._both_ways(client)
+                self._changed.set()
+                tasks.start_soon(self._publish, client)
+                async for message in client.messages:
+                    if message.topic.matches(f"{topic}/command/#"):
+                        await self._execute(client, message)
+                    elif message.retain and message.payload:
+                        self._found.add(str(message.topic))
+                        self._changed.set()
             finally:
                 # The broker publishes the will only after a lost connection, not after a regular one.
                 with anyio.move_on_after(LEAVE_S, shield=True), contextlib.suppress(aiomqtt.MqttError):
                     await client.publish(f"{topic}/available", "offline", qos=1, retain=True)
-
-    async def _both_ways(self, client: aiomqtt.Client) -> None:
-        self._changed.set()
-        # A task group repeats its cancellation. `asyncio.wait_for`, inside every publish, can lose one that arrives
-        # together with the broker's answer (Python 3.11); without the repetition this would wait forever.
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._publish, client)
-            async for message in client.messages:
-                if message.topic.matches(f"{self._options.topic}/command/#"):
-                    await self._execute(client, message)
-                elif message.retain and message.payload:
-                    self._found.add(str(message.topic))
-                    self._changed.set()
 
     async def _publish(self, client: aiomqtt.Client) -> None:
         last: dict[str, str] = {}

@@ -166,9 +166,9 @@ def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path, port: int) 
 
 
 @contextlib.asynccontextmanager
-async def forgetful_broker() -> AsyncIterator[tuple[int, asyncio.Queue[int]]]:
+async def forgetful_broker(asked: asyncio.Event | None = None) -> AsyncIterator[tuple[int, asyncio.Queue[int]]]:
     """Speaks as much of MQTT 3.1.1 as a publisher needs, but does not confirm a state on its first connection. Yields
-    its port, and for every state the number of its connection.
+    its port, and for every state the number of its connection. ``asked`` is set with the answer to a subscription.
     """
     states: asyncio.Queue[int] = asyncio.Queue()
     connections = itertools.count()
@@ -187,6 +187,8 @@ async def forgetful_broker() -> AsyncIterator[tuple[int, asyncio.Queue[int]]]:
                     writer.write(bytes((0x20, 2, 0, 0)))
                 elif kind == SUBSCRIBE:
                     writer.write(bytes((0x90, 3, *body[:2], 1)))
+                    if asked:
+                        asked.set()
                 elif kind == PUBLISH:
                     topic_end = 2 + int.from_bytes(body[:2], "big")
                     state = body[2:topic_end].endswith(b"/state")
@@ -313,6 +315,25 @@ def test_a_broker_that_is_away_is_an_event_and_a_line_of_the_status_until_it_is_
         await asyncio.gather(running, return_exceptions=True)
 
     asyncio.run(life())
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_it_ends_also_when_it_is_cancelled_as_the_broker_answers(tmp_path: Path, turns: int) -> None:
+    """A cancellation so many turns of the loop after the answer to its first request."""
+
+    async def story() -> None:
+        asked = asyncio.Event()
+        async with forgetful_broker(asked) as (port, _):
+            control = BuildingControl(MemoryKiosk(tmp_path / "pictures"), options(tmp_path, port))
+            running = asyncio.create_task(control.run())
+            await asked.wait()
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            running.cancel()
+            done, _ = await asyncio.wait([running], timeout=60)
+            assert done
+
+    asyncio.run(story())
 
 
 @pytest.mark.parametrize(
