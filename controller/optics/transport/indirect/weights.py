@@ -101,6 +101,8 @@ Part = Literal["all", "object", "room"]
 LEAST_DARK: Final = 0.3
 """Share of a block that must be dark, for its light to count."""
 FAINTEST: Final = 1e-3
+NO_LIGHT: Final = 1e-9
+"""Of the mean light that falls on blocks."""
 ROUNDS: Final = 12
 HEAVY: Final = 1e3
 TOGETHER: Final = 0.6
@@ -183,7 +185,7 @@ def fit_weights(
     together = _together(terms, alike)
     for _ in range(ROUNDS):
         now = np.tensordot(every, found, axes=(0, 0))
-        gain = np.divide(relative, now, out=np.zeros_like(total), where=use & (now > 0))
+        gain = np.divide(relative, now, out=np.zeros_like(total), where=use & (now > NO_LIGHT))
         rows = _root(np.sum([_products(one * gain) for one in off], axis=0))
         rows = np.vstack([rows, together * np.sqrt((rows**2).sum(axis=0)).mean()])
         heavy = HEAVY * max(float(np.abs(rows).max(initial=0)), 1e-30)

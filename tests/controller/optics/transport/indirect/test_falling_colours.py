@@ -15,8 +15,10 @@ from controller.optics.transport.indirect.blocks import BlockGrid
 from controller.optics.transport.indirect.weights import (
     BlockLight,
     FallingColours,
+    Term,
     corrected_factors,
     falling_colours,
+    fit_weights,
     lamp_colours,
 )
 
@@ -142,3 +144,15 @@ def test_without_any_light_nothing_is_known() -> None:
     found = falling_colours([dark, dark], dark, everywhere, GRID, SIDE)
     assert not found.known.any()
     assert found.white(np.zeros((BLOCKS, 3))) == pytest.approx(1)
+
+
+def test_where_next_to_no_light_falls_the_weights_are_those_of_the_rest() -> None:
+    one, none = scene(1), np.zeros((BLOCKS, 3), np.float32)
+    falls = np.where(np.arange(BLOCKS) % GRID[1] < GRID[1] // 2, 1e-41, 1)[:, None]
+    ways = [np.asarray(falls * factors, np.float32) for factors in (one.factors, one.factors**2)]
+    lights = [np.asarray(direct, np.float32) for direct in one.directs]
+    seen = [np.asarray(ways[0] @ light + 1e-3, np.float32) for light in lights]
+    whole, covered = np.asarray(np.sum(seen, axis=0), np.float32), np.ones(BLOCKS, np.float32)
+    whites = [BlockLight(light, none, own, whole, covered) for light, own in zip(lights, seen, strict=True)]
+    weights = fit_weights([Term(way, "all") for way in ways], whites, (), BlockGrid(GRID, SIDE, SHAPE))
+    assert weights[0] > 0.5 and np.isfinite(weights).all()
