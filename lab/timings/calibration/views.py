@@ -30,7 +30,7 @@ from controller.demo import DemoStage, prepare
 from controller.optics.solve.result.metrics import colour_difference
 from controller.run.progress import Silent
 from controller.stage.artefacts.calibrated import Calibrated, all_views
-from controller.stage.artefacts.solved import Solved, read_solved
+from controller.stage.artefacts.solved import read_solved
 from controller.stage.artefacts.views import VIEWS, view_folders
 from controller.stage.services.calibrate import calibrate
 from controller.stage.sessions.bench import BenchProcess
@@ -175,11 +175,11 @@ class _Judged:
     def view(self, n: int, photographs: int) -> Error:
         """Of a view's own camera."""
         solved = self._solved[n]
-        return self._error(n, self._camera(n), solved.target, solved.reachable, photographs)
+        return self._error(n, self._truth.cameras[n], solved.target, solved.reachable, photographs)
 
     def judge(self, n: int, right: float, photographs: int) -> Error:
         """Of camera ``n``, carried so many degrees to the right."""
-        camera = carried(self._camera(n), right)
+        camera = carried(self._truth.cameras[n], right)
         target, reachable = self._target(camera)
         own = np.asarray(target / self._gains[n], np.float32)
         return self._error(n, camera, own, reachable, photographs)
@@ -188,11 +188,10 @@ class _Judged:
         """The share of the surface that projectors light and cameras see which some camera's view solves for."""
         total = good = 0.0
         for n, view in self._views.items():
-            points, white = surface_points(self._thing, self._camera(n)).astype(np.float32), self._whites()
-            judge = JudgeCamera(self._stage, self._camera(n), direct=True)
-            light = (judge.light({name: frame for one in white for name, frame in one.items()}) - judge.light({})).mean(
-                2
-            )
+            points, whites = surface_points(self._thing, self._truth.cameras[n]).astype(np.float32), self._whites()
+            judge = JudgeCamera(self._stage, self._truth.cameras[n], direct=True)
+            white = judge.light({name: frame for one in whites for name, frame in one.items()})
+            light = (white - judge.light({})).mean(2)
             lit = np.isfinite(points).all(axis=-1) & (light > LIT * np.percentile(light, 99))
             often, solved = np.ones(lit.shape), view.transport.object_mask.copy()
             for m in self._views.keys() - {n}:
@@ -206,7 +205,7 @@ class _Judged:
 
     def seams(self, n: int, photographs: int) -> Float64:
         """(pixels,): CIEDE2000 between both sides of seams, by how the error of the picture changes there."""
-        camera, solved = self._camera(n), self._solved[n]
+        camera, solved = self._truth.cameras[n], self._solved[n]
         points = surface_points(self._thing, camera).astype(np.float32)
         there = [self._there(m, points)[2] for m in sorted(self._views) if m != n]
         label = np.sum([seen << bit for bit, seen in enumerate(np.asarray(there, np.int32))], axis=0)
@@ -229,9 +228,6 @@ class _Judged:
             steps.append(colour_difference(one, other, to_xyz, solved.exposure, seam)[seam])
         return np.concatenate(steps).astype(np.float64)
 
-    def _camera(self, n: int) -> CameraTruth:
-        return self._truth.cameras[n]
-
     def _error(self, n: int, camera: CameraTruth, target: FloatImage, reachable: Mask, photographs: int) -> Error:
         shown = self._shown(n, camera, photographs)
         inner = cv2.erode(reachable.astype(np.uint8), np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)) > 0
@@ -243,14 +239,11 @@ class _Judged:
         """What a camera sees of the frames, in the units of view ``n``."""
         frames = dict(zip(self._projectors, kept_frames(self._stage, NAME, photographs), strict=True))
         full, unit = self._units[n]
-        return np.asarray(unit * developed(self._judge(camera).light(frames), full), np.float32)
-
-    def _judge(self, camera: CameraTruth) -> JudgeCamera:
-        return _judge(self._truth, self._stage, camera)
+        return np.asarray(unit * developed(_judge(self._truth, self._stage, camera).light(frames), full), np.float32)
 
     def _unit(self, n: int) -> tuple[float, float]:
         """Full scale of a camera's light, and the controller's units for it."""
-        view, judge = self._views[n], self._judge(self._camera(n))
+        view, judge = self._views[n], _judge(self._truth, self._stage, self._truth.cameras[n])
         whites = [judge.light(frames) for frames in self._whites()]
         full, black = 1.02 * float(max(white.max() for white in whites)), judge.light({})
         lit = view.transport.object_mask
@@ -271,21 +264,16 @@ class _Judged:
         total, count = np.zeros(points.shape, np.float32), np.zeros(points.shape[:2], np.float32)
         reached = np.isfinite(points).all(axis=-1)
         for n, solved in self._solved.items():
-            seen, target, reachable = self._seen(n, solved, points)
+            x, y, seen = self._there(n, points)
+            target = cv2.remap(solved.target, x, y, cv2.INTER_LINEAR)
             total += np.where(seen[..., None], target * np.asarray(self._gains[n], np.float32), 0)
             count += seen
-            reached &= ~seen | reachable
+            reached &= ~seen | (cv2.remap(solved.reachable.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0)
         return np.asarray(total / np.maximum(count, 1)[..., None], np.float32), np.asarray(reached & (count > 0))
-
-    def _seen(self, n: int, solved: Solved, points: FloatImage) -> tuple[Mask, FloatImage, Mask]:
-        """Which ``points`` a view sees, and its target and its reach there."""
-        x, y, seen = self._there(n, points)
-        reachable = cv2.remap(solved.reachable.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
-        return seen, np.asarray(cv2.remap(solved.target, x, y, cv2.INTER_LINEAR)), np.asarray(reachable)
 
     def _there(self, n: int, points: FloatImage) -> tuple[FloatImage, FloatImage, Mask]:
         """Where ``points`` (rows, columns, 3) are in a view's picture, and which of them it sees."""
-        camera = self._camera(n)
+        camera = self._truth.cameras[n]
         at, _ = project(camera.pose, camera.lens, np.nan_to_num(points).reshape(-1, 3).astype(np.float64))
         x, y = (at[:, axis].reshape(points.shape[:2]).astype(np.float32) for axis in (0, 1))
         own = surface_points(self._thing, camera).astype(np.float32)
