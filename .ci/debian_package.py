@@ -26,6 +26,7 @@ ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from controller.kiosk.install.steps import DEBIAN, PACKAGES, PYTHON  # noqa: E402 - from this checkout
+from controller.kiosk.install.update import CHANGELOG  # noqa: E402
 from hal.runtime.caches import cache_folder  # noqa: E402
 
 LOCK: Final = ROOT / "requirements-kiosk.lock"
@@ -248,6 +249,7 @@ def _control(tree: Path, suite: str, version: str) -> None:
         packages=", ".join(PACKAGES),
     )  # fmt: skip
     (folder / "control").write_text(fields)
+    shutil.copy(ROOT / "CHANGELOG.md", folder / CHANGELOG)
     for name, text in (("preinst", _PREINST), ("postinst", _POSTINST), ("prerm", _PRERM), ("postrm", _POSTRM)):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)

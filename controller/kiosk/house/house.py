@@ -28,6 +28,7 @@ from controller.kiosk.backup import OURS
 from controller.kiosk.backup import Folder as BackupFolder
 from controller.kiosk.house.member import Order, Report
 from controller.kiosk.install.system import System
+from controller.kiosk.install.update import changelog, news
 from controller.kiosk.operations.dispatch import CALLER
 from controller.kiosk.operations.house import (
     HOUSE_FILE,
@@ -53,6 +54,8 @@ ROLLOUT: Final = "update-stages"
 MOST_EVENTS: Final = 2000
 _AT_ONCE: Final = 16
 _ORDER_S: Final = 10.0
+_COMPUTE_S: Final = 60.0
+"""A stage fits the picture to its view before it answers."""
 _BACKUP_S: Final = 3600.0
 _LOOK_S: Final = 30.0
 _BACKUP_WINDOW_S: Final = 6 * 3600.0
@@ -112,12 +115,14 @@ class _Package:
     file: Path
     digest: str
     version: str
+    changelog: str
 
 
 @lru_cache(maxsize=1)
 def _package_of(file: Path, changed_ns: int) -> _Package:
-    version = System(lambda line: None).look("dpkg-deb", "--field", str(file), "Version") or "unknown"
-    return _Package(file, sha256_of(file), version.strip())
+    here = System(lambda line: None)
+    version = here.look("dpkg-deb", "--field", str(file), "Version") or "unknown"
+    return _Package(file, sha256_of(file), version.strip(), changelog(here, file))
 
 
 class House:
@@ -213,15 +218,21 @@ class House:
         rows = [row for stage in list(self._stages.values()) for row in list(stage.events)]
         return sorted(rows, key=lambda row: row.event.unix_s)[-MOST_EVENTS:]
 
-    def do(self, stages: str, verb: str, **values: object) -> None:
-        """Raises UsageError("house-stages-unknown"), WorkError("house-order-failed") once all others have done it."""
+    def do(self, stages: str, verb: str, *, target: Path | None = None, **values: object) -> None:
+        """``target``: a picture that the stages get first. Raises UsageError("house-stages-unknown"), OSError, and
+        WorkError("house-order-failed") once all others have done it.
+        """
         who = CALLER.get()
 
         def order(name: str) -> str:
             if not self._stages[name].linked:
                 return f"{name}: it is not linked now."
+            picture, within_s = {}, _ORDER_S
             try:
-                self._link.ask(f"member/{name}/do", Order(verb, who, values), type(None), within_s=_ORDER_S)
+                if target is not None:
+                    picture, within_s = {"target": send(self._link, f"member/{name}/target", target)}, _COMPUTE_S
+                order = Order(verb, who, values | picture)
+                self._link.ask(f"member/{name}/do", order, type(None), within_s=within_s)
             except CodedError as error:
                 return f"{name}: {error.what}"
             self._greet(name)  # the page is to show it at once
@@ -274,15 +285,17 @@ class House:
 
     # -- updates
 
-    def plan(self, stages: str) -> str:
+    def plan(self, stages: str) -> list[str]:
         """Raises UsageError("house-no-update", "house-stages-unknown")."""
         package = self._package()
         if package is None:
             raise UsageError("house-no-update", what=f"There is no {UPDATE_FILE} beside {HOUSE_FILE}.",
                              remedy="Put the signed package of the new version there.")  # fmt: skip
-        first, *others = (f"{name} ({stage.version})" for name in self._named(stages) if (stage := self._now(name)))
+        chosen = [self._now(name) for name in self._named(stages)]
+        first, *others = (f"{stage.name} ({stage.version})" for stage in chosen)
         then = f" Once it has proved itself there: {', '.join(others)}." if others else ""
-        return f"Version {package.version} goes to {first}.{then}"
+        new = news(package.changelog, {stage.version for stage in chosen if stage.version})
+        return [f"Version {package.version} goes to {first}.{then}", *new]
 
     def update(self, stages: str) -> None:
         """Begin; it continues also after a restart. Raises as ``plan``."""
@@ -304,7 +317,10 @@ class House:
         names = begun.read_text().split() if begun.exists() else []
         ordered = [*(name for name in names if name in self._stages), *sorted(self._stages.keys() - set(names))]
         rows = tuple(self._update_of(name, package, "waits" if name in names else "") for name in ordered)
-        return Rollout(package.version if package is not None else "", begun.exists(), rows)
+        if package is None:
+            return Rollout("", begun.exists(), rows)
+        new = news(package.changelog, {stage.version for stage in rows if stage.version})
+        return Rollout(package.version, begun.exists(), rows, tuple(new))
 
     def _update_of(self, name: str, package: _Package | None, before: str) -> StageUpdate:
         """``before``: its state until it has the package."""

@@ -21,14 +21,14 @@ from controller.kiosk.install.update import Outcome, Packages, outcome
 from controller.kiosk.interface import Kiosk
 from controller.kiosk.operations.dispatch import local_values
 from controller.kiosk.operations.house import MEMBERSHIP, Invitation
-from controller.kiosk.operations.table import OPERATIONS
+from controller.kiosk.operations.table import OPERATIONS, compute
 from controller.kiosk.panel_address import own_addresses
 from controller.kiosk.state import EventRow, KioskState
 from controller.stage.link.joining import VALID_S, Joining
 from controller.stage.link.membership import Certified, Membership, leave, membership
 from controller.stage.link.peers import keep_peer, peer_folder
 from controller.stage.link.session import EVERYWHERE, Link, member_link
-from controller.stage.link.transfer import Offer
+from controller.stage.link.transfer import Arrivals, Offer
 from hal.errors import CodedError
 
 PAUSE_S: Final = 2.0
@@ -37,7 +37,8 @@ AGAIN_S: Final = 30.0
 CERTIFIED_S: Final = 600.0
 MOST_EVENTS: Final = 200
 PICTURE_PX: Final = 160
-_VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb}
+TARGETS: Final = "kiosk/house-targets"
+_VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb} | {compute.name: compute}
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """One of the building's verbs, and ``who`` asked at the house."""
+    """One of the building's verbs, or "compute", and ``who`` asked at the house. A target is one that has come."""
 
     verb: str
     who: str
@@ -126,7 +127,7 @@ class Member:
             try:
                 there = membership(self._folder)
                 if there is not None and self._running is None:
-                    self._running = _Reports(self._kiosk, there, self._computer, peer_folder(self._stage))
+                    self._running = _Reports(self._kiosk, there, self._computer, self._stage)
             except CodedError as error:
                 self._kiosk.record(error.code, f"{error.what} {error.remedy}", "error")
 
@@ -144,8 +145,8 @@ class Member:
 class _Reports:
     """The link of one membership, and the thread that publishes."""
 
-    def __init__(self, kiosk: Kiosk, member: Membership, computer: System | None, peers: Path) -> None:
-        self._kiosk, self._member, self._computer, self._peers = kiosk, member, computer, peers
+    def __init__(self, kiosk: Kiosk, member: Membership, computer: System | None, stage: Path) -> None:
+        self._kiosk, self._member, self._computer, self._peers = kiosk, member, computer, peer_folder(stage)
         self._certify_s = 0.0
         self._key = f"member/{member.name}"
         self._link: Link = member_link(member)
@@ -155,6 +156,8 @@ class _Reports:
         self._unsubscribe = kiosk.subscribe(self._changed.set)
         for name, answer in (("report", self._whole), ("picture", self._picture), ("backup", self._make_backup)):
             self._link.answer(f"{self._key}/{name}", bytes, answer)
+        self._targets = Arrivals(stage / TARGETS, lambda file: None)  # the kiosk checks what it computes
+        self._targets.listen(self._link, f"{self._key}/target")
         self._link.answer(f"{self._key}/do", Order, self._do)
         self._link.answer(f"{self._key}/part", int, self._part)
         if computer is not None:
@@ -216,7 +219,10 @@ class _Reports:
         operation = _VERBS.get(order.verb)
         if operation is None:
             raise UsageError("verb-unknown", what="There is no such verb.", remedy=f"Use one of {', '.join(_VERBS)}.")
-        values = local_values(operation, order.values)
+        sent = dict(order.values)
+        if operation is compute:
+            sent["target"] = str(self._targets.path(sent.get("target", "")))
+        values = local_values(operation, sent)
         with operation.logged(self._kiosk.record, f"{order.who} at the house {self._member.house}", values):
             operation.function(self._kiosk, **values)
 

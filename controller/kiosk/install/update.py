@@ -18,8 +18,9 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
@@ -46,6 +47,8 @@ STARTS: Final = PROGRAM.with_suffix(".starts")
 RESULT: Final = PROGRAM.with_suffix(".update")
 MARK: Final = ".update"
 """In a program's folder: which update it is."""
+CHANGELOG: Final = "changelog"
+"""In a package, beside its control file: `dpkg-deb` reads it there without unpacking the rest."""
 OFFERED: Final = STATE / "update.deb"
 PLAYS: Final = RUNTIME / "plays"
 """Of a computer that only plays: what its agent reported last."""
@@ -151,15 +154,32 @@ def needs(system: System, package: Path) -> list[str]:
     return sorted(re.findall(r"^Inst (\S+)", said, re.MULTILINE))
 
 
+def changelog(system: System, package: Path) -> str:
+    """That of a package (Markdown, a heading for each version); empty without one."""
+    return system.look("dpkg-deb", "--info", str(package), CHANGELOG) or ""
+
+
+def news(text: str, versions: Collection[str]) -> list[str]:
+    """The entries of a changelog that are newer than the oldest of ``versions``; a sentence if it doesn't have one."""
+    releases = re.split(r"^## ", text, flags=re.MULTILINE)[1:]
+    names = [release.split(maxsplit=1)[0] for release in releases]
+    if unknown := sorted(set(versions) - set(names)):
+        return [f"The package does not say what has changed since version {', '.join(unknown)}."]
+    newer = "".join(releases[: max(map(names.index, versions), default=0)])
+    entries = re.findall(r"^- (.*(?:\n +\S.*)*)", newer, re.MULTILINE)
+    return [" ".join(entry.split()) for entry in entries] or ["The changelog of the package has nothing newer."]
+
+
 def changes(system: System, package: Path) -> dict[str, Any]:
-    """What an update would change here: ``version``, what it ``needs``, and the files of the program that are ``new``,
-    ``changed`` and ``gone``. Raises WorkError("kiosk-step-failed"), and as ``needs``.
+    """What an update would change here: ``version``, the ``news`` in it, what it ``needs``, and the files of the
+    program that are ``new``, ``changed`` and ``gone``. Raises WorkError("kiosk-step-failed"), and as ``needs``.
     """
     with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:  # /tmp may be memory
         system.run("dpkg-deb", "--extract", str(package), folder)
         theirs, ours = (_files(root) for root in (Path(folder, *PROGRAM.parts[1:]), system.at(PROGRAM)))
     return {
         "version": (system.look("dpkg-deb", "--field", str(package), "Version") or "").strip(),
+        "news": news(changelog(system, package), [metadata.version("velatura")]),
         "needs": needs(system, package),
         "new": sorted(theirs.keys() - ours.keys()),
         "changed": sorted(name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Final, Protocol
 
 from pydantic import Field
 
 from controller.core.errors import UsageError
-from controller.kiosk.operations.arguments import AppearanceName
+from controller.kiosk.operations.arguments import AppearanceName, FitName, NewName, TargetFile
 from controller.kiosk.operations.fields import TEXT
 from controller.kiosk.operations.operation import Effect, Jpeg, Names, operation
 from controller.kiosk.roles import Role
@@ -98,12 +99,13 @@ class StageUpdate:
 @dataclass(frozen=True, slots=True)
 class Rollout:
     """An update of stages. ``version``: that of update.deb, empty without one; ``begun``: it is under way;
-    ``stages``: its own in their order, then the others.
+    ``stages``: its own in their order, then the others; ``news``: what changes, for the oldest of their versions.
     """
 
     version: str
     begun: bool
     stages: tuple[StageUpdate, ...]
+    news: tuple[str, ...] = ()
 
 
 class Stagehouse(Protocol):
@@ -112,10 +114,10 @@ class Stagehouse(Protocol):
     def now(self) -> HouseNow: ...
     def picture(self, stage: str) -> bytes | None: ...
     def events(self) -> Sequence[HouseEvent]: ...
-    def do(self, stages: str, verb: str, **values: object) -> None: ...
+    def do(self, stages: str, verb: str, *, target: Path | None = None, **values: object) -> None: ...
     def admit(self, address: str, code: str) -> None: ...
     def remove(self, stage: str) -> None: ...
-    def plan(self, stages: str) -> str: ...
+    def plan(self, stages: str) -> Sequence[str]: ...
     def update(self, stages: str) -> None: ...
     def stop_update(self) -> None: ...
     def rollout(self) -> Rollout: ...
@@ -197,9 +199,18 @@ def house_play(house: House, stages: Stages, name: AppearanceName) -> None:
     house.open().do(stages, "play", name=name)
 
 
+@operation("POST /house/appearances", Role.OPERATOR, Effect.CHANGES, done="{stages}: the computation has started.",
+           names=Names(command="house compute"))  # fmt: skip
+def house_compute(house: House, stages: Stages, name: NewName, target: TargetFile, fit: FitName = "fit") -> None:
+    """Let a stage of the house, a group or all compute an appearance from a target picture. Each fits it to its own
+    camera's view, and installs the appearance when it is done.
+    """
+    house.open().do(stages, "compute", target=target, name=name, fit=fit)
+
+
 @operation("GET /house/update", Role.TECHNICIAN, Effect.LOOKS, names=Names(command="house update-plan"))
-def house_update_plan(house: House, stages: Stages) -> str:
-    """What an update would change, and where first. Its package is the file update.deb beside house.toml."""
+def house_update_plan(house: House, stages: Stages) -> Sequence[str]:
+    """Where an update would go first, and what would change. Its package is the file update.deb beside house.toml."""
     return house.open().plan(stages)
 
 
@@ -249,6 +260,6 @@ def house_leave(house: House) -> None:
 
 
 HOUSE_OPERATIONS: Final = (
-    house_state, house_picture, house_events, house_open, house_close, house_play, house_add, house_remove,
-    house_update_plan, house_update, house_update_stop, house_join, house_leave,
+    house_state, house_picture, house_events, house_open, house_close, house_play, house_compute, house_add,
+    house_remove, house_update_plan, house_update, house_update_stop, house_join, house_leave,
 )  # fmt: skip

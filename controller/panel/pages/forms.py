@@ -48,8 +48,8 @@ LEADS_TO: Final = {
     "outline-target": "/appearances/new/{target}",
     "lay-mesh": "/mesh",
     "set-schedule": "/schedule",
-    **dict.fromkeys(("house-open", "house-close", "house-play", "house-add", "house-remove"), "/house"),
-    **dict.fromkeys(("house-join", "house-leave"), "/house"),
+    **dict.fromkeys(("house-open", "house-close", "house-play", "house-compute"), "/house"),
+    **dict.fromkeys(("house-add", "house-remove", "house-join", "house-leave"), "/house"),
     **dict.fromkeys(("house-update", "house-update-stop"), "/house/update"),
     "test-shots": "/aiming",
     "save-settings": "/settings",
@@ -306,7 +306,8 @@ def _back(operation: Operation, sent: Sent) -> str:
     if operation.name == "compute-scene":
         return "/appearances/new"
     target = sent.texts.get("target", "")
-    if operation.name in ("compute", "fit-target", "outline-target") and target.isascii() and target.isalnum():
+    of_target = ("compute", "house-compute", "fit-target", "outline-target")
+    if operation.name in of_target and target.isascii() and target.isalnum():
         return f"/appearances/new/{target}"
     return "/appearances/new" if operation.name in ("fit-target", "outline-target") else LEADS_TO[operation.name]
 

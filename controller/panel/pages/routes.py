@@ -383,7 +383,8 @@ class Pages:
 
     def _drawn_on(self, target: str) -> dict[str, Any]:
         outline, stamp = self._panel.targets.outline(target), self._panel.targets.path(target).stat().st_mtime_ns
-        return {"outline": outline, "stamp": stamp, "view": self._view_px(),
+        house = self._panel.house.open().now() if self._panel.house.there else None
+        return {"outline": outline, "stamp": stamp, "view": self._view_px(), "house": house,
                 "proposed": self._panel.targets.proposed(target)}  # fmt: skip
 
     def _reached(self, request: Request) -> dict[str, Any]:

@@ -396,7 +396,9 @@ class UpdatingHouse:
     def rollout(self) -> Rollout:
         states = ("trial", "failed", "waits", "comes", "done", "")
         stages = (StageUpdate(f"stage {one}", "0.8", one, "It is dark." * (one == "failed")) for one in states)
-        return Rollout("0.9", self.begun, tuple(stages))
+        return Rollout(
+            "0.9", self.begun, tuple(stages), tuple(f"`velatura {word}` sings." for word in ("x" * 20, *"abcdefgh"))
+        )
 
     def now(self) -> HouseNow:
         return HouseNow("museum", (), ("all floors",))

@@ -9,8 +9,10 @@ import re
 import subprocess
 import sys
 import threading
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,7 @@ from controller.kiosk.install.system import System
 from controller.kiosk.install.update import OFFERED, sign_package
 from controller.kiosk.operations import house as operations
 from controller.kiosk.operations.dispatch import CALLER
+from controller.kiosk.operations.table import compute
 from controller.kiosk.state import DriftCheck
 from controller.kiosk.store import archive
 from controller.run.progress import Silent
@@ -33,6 +36,7 @@ from tests.controller.kiosk.install.test_update import KEY, OTHER_KEY, debian_pa
 from tests.controller.kiosk.vase import vase
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, Served, csrf, served
+from tests.controller.panel.test_uploads import png_of
 from tests.ports import free_port
 from tests.waiting import wait_for
 
@@ -134,6 +138,31 @@ def test_orders_reach_one_a_group_or_all_and_stand_in_the_stages_own_log(museum:
     assert caught.value.code == "house-stages-unknown"
 
 
+def test_a_new_appearance_is_asked_of_a_group_and_each_stage_computes_its_own(museum: Museum) -> None:
+    picture, name = png_of(4, 2, zlib.compress(bytes(2 * (1 + 3 * 4)))), "new-wood"
+    with page(museum, needs_setup=True) as panel, panel.entered("otto") as otto:
+        form = {"csrf": csrf(otto.get("/house").text)}
+        uploaded = otto.post("/do/upload-target", data=form, files={"file": ("wood.png", picture)})
+        target = uploaded.headers["location"]
+        text = otto.get(target).text
+        assert 'value="wood"' in text
+        assert "What the object will look like" not in text, "this kiosk has no stage of its own"
+        form |= {"target": target.rsplit("/", 1)[1], "stages": "east wing", "fit": "fill"}
+        again = otto.post("/do/house-compute", data={**form, "name": "../wood"})
+        assert (again.status_code, again.headers.get("location")) != (303, "/house")
+        assert otto.post("/do/house-compute", data={**form, "name": name}).headers["location"] == "/house"
+    for one in ("knight", "vase"):
+        kiosk = museum.kiosks[one]
+        assert ("compute", (name, b"\x89PNG")) in kiosk.asked
+        wait_for(lambda kiosk=kiosk: name in [row.name for row in kiosk.appearances()])  # type: ignore[misc]
+        assert any(f"otto at the house City museum: {compute.about} ({name})" in text for _, text in kiosk.recorded)
+    assert not [asked for asked in museum.kiosks["bust"].asked if asked[0] == "compute"]
+    no_picture = museum.folder / "house.toml"
+    no_picture.write_text("name = 3")
+    with pytest.raises(WorkError, match="vase: The target can't be used"):
+        museum.house.do("vase", "compute", target=no_picture, name=name, fit="fit")
+
+
 def test_one_stage_that_fails_stops_no_other(museum: Museum) -> None:
     museum.members["bust"].leave()
     wait_for(lambda: not museum.stage("bust").linked)
@@ -212,7 +241,8 @@ def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(
         write_public_key(root / "etc/velatura/update-keys/house.pub", bytes(KEY.verify_key))
     with pytest.raises(UsageError, match=r"update\.deb"):
         museum.house.update("east wing")
-    package = debian_package(tmp_path, "2-1").rename(tmp_path / "house/update.deb")
+    changelog = f"## 2\n\n- It <sings>.\n\n## {metadata.version('velatura')}\n\n- It hums.\n"
+    package = debian_package(tmp_path, "2-1", changelog=changelog).rename(tmp_path / "house/update.deb")
     digest = hashlib.sha256(package.read_bytes()).hexdigest()
 
     def tell(name: str, state: str) -> None:
@@ -221,10 +251,14 @@ def test_an_update_goes_to_one_stage_and_to_the_others_once_that_is_well(
         museum.kiosks[name].note("info", state)
         wait_for(lambda: museum.stage(name).update.startswith(state))
 
-    assert re.match(r"Version 2-1 goes to knight .* proved itself there: vase", museum.house.plan("east wing"))
+    first, *new = museum.house.plan("east wing")
+    assert re.match(r"Version 2-1 goes to knight .* proved itself there: vase", first)
+    assert new == ["It <sings>."]
     with page(museum) as panel, panel.entered("tina", PASSWORD) as tina:
         text = tina.get("/house/update").text
         assert "Version 2-1" in text
+        assert "<li>It &lt;sings&gt;.</li>" in text
+        assert "It hums" not in text
         form = {"csrf": csrf(text), "stages": "east wing"}
         assert "Update east wing?" in tina.post("/do/house-update", data=form).text
         assert tina.post("/do/house-update", data={**form, "sure": "yes"}).headers["location"] == "/house/update"

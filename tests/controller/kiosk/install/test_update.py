@@ -11,8 +11,9 @@ import signal
 import subprocess
 import tracemalloc
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
 from nacl.signing import SigningKey
@@ -38,12 +39,16 @@ def program(folder: Path, version: str) -> None:
         (folder / name).write_text(version)
 
 
-def debian_package(folder: Path, version: str, *, depends: str = "python3 (>= 3.11), libxext6") -> Path:
+def debian_package(
+    folder: Path, version: str, *, depends: str = "python3 (>= 3.11), libxext6", changelog: str = ""
+) -> Path:
     tree = folder / f"tree-{version}"
     program(tree / "opt/velatura", version)
     (tree / "DEBIAN").mkdir()
     fields = f"Package: velatura\nVersion: {version}\nArchitecture: all\nMaintainer: x\nDescription: x\n"
     (tree / "DEBIAN/control").write_text(f"{fields}Depends: {depends}\n")
+    if changelog:
+        (tree / "DEBIAN" / update.CHANGELOG).write_text(changelog)
     file = folder / f"velatura_{version}.deb"
     subprocess.run(["dpkg-deb", "-Znone", "--build", tree, file], check=True, stdout=subprocess.DEVNULL)
     sign_package(file, KEY, file)
@@ -119,6 +124,49 @@ def test_a_signed_package_is_one_that_dpkg_still_reads(package: Path) -> None:
     before = package.read_bytes()
     sign_package(package, KEY, package)
     assert package.read_bytes() == before, "a signature takes the place of an old one"
+
+
+NEWER: Final = """# Changelog
+
+## Unreleased
+
+- A third thing, which
+  needs two lines.
+
+## 2.0 (2026-12-01)
+
+- A second thing.
+
+## 1.0 (2026-11-01)
+
+- A first thing.
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "versions", "said"),
+    [
+        (NEWER, ["2.0"], ["A third thing, which needs two lines."]),
+        (NEWER, ["2.0", "1.0"], ["A third thing, which needs two lines.", "A second thing."]),
+        (NEWER, ["Unreleased"], ["The changelog of the package has nothing newer."]),
+        (NEWER, ["0.9", "2.0"], ["The package does not say what has changed since version 0.9."]),
+        ("", ["1.0"], ["The package does not say what has changed since version 1.0."]),
+    ],
+)
+def test_what_is_new_is_everything_above_the_oldest_version(text: str, versions: list[str], said: list[str]) -> None:
+    assert update.news(text, versions) == said
+
+
+def test_an_update_says_what_is_new_before_it_is_carried_out(tmp_path: Path) -> None:
+    here = metadata.version("velatura")
+    for name, text, said in (
+        ("with", f"## 9.0\n\n- It sings.\n\n## {here} (2026-11-25)\n\n- It hums.\n", ["It sings."]),
+        ("without", "", [f"The package does not say what has changed since version {here}."]),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        computer = Computer(folder / "root", {})
+        assert update.changes(computer, debian_package(folder, "9.0-1", changelog=text))["news"] == said
 
 
 def test_a_large_package_is_signed_and_checked_in_parts(tmp_path: Path) -> None:
