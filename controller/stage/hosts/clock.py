@@ -30,14 +30,15 @@ class Tracking:
 def tracking(run: Callable[[Sequence[str]], str] | None = None) -> Tracking | None:
     """``chronyc -c tracking``; None without chrony. ``run`` gives what the command prints, or raises OSError."""
     try:
-        fields = (run or _printed)(_CHRONYC).strip().split(",")
+        fields = (run or printed)(_CHRONYC).strip().split(",")
         error_s = abs(float(fields[4])) + float(fields[10]) / 2 + float(fields[11])
         return Tracking(fields[13] != "Not synchronised", error_s)
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         return None
 
 
-def _printed(command: Sequence[str]) -> str:
+def printed(command: Sequence[str]) -> str:
+    """What a command says. Raises OSError, SubprocessError."""
     return subprocess.run(command, capture_output=True, text=True, timeout=2, check=True).stdout  # noqa: S603
 
 

@@ -296,6 +296,7 @@ class Conductor:
             "bundle": self.bundle_identity or base["bundle"],
             "lost_hosts": self._lost(),
             "clock_troubles": {"": self._clock.trouble, **{player.host: player.trouble for player in self._players}},
+            "frame_lock": all(player.state.frame_lock for player in self._players),
             **self._skew.figures(),
         }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from controller.bundle.reader import Bundle
 from controller.bundle.signing import Trust, write_public_key
 from controller.play.control.launch import SOCKET_NAME, PlayerProcess, PlayerSettings, end_leftover, hello
-from controller.stage.hosts.clock import HostClock
+from controller.stage.hosts.clock import HostClock, printed
 from hal.deadline import in_seconds
 from hal.errors import CodedError
 from hal.player import Inbox, PlayerClient
@@ -55,10 +56,24 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a screen reports. ``reports``: presentations by the common clock, newest last."""
+    """What a screen reports. ``reports``: presentations by the common clock, newest last; ``frame_lock``: as the
+    function of this name says.
+    """
 
     status: dict[str, Any] | None = None
     reports: tuple[tuple[float, float, str | None], ...] = ()
+    frame_lock: bool = False
+
+
+def frame_lock(display: str) -> bool:
+    """Whether each graphics card of an X screen ("": the environment's) says that its refresh is locked to a common
+    timing; False where there is no tool that tells. NVIDIA's is the only one.
+    """
+    where = [f"--ctrl-display={display}"] if display else []
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        said = printed(["nvidia-settings", *where, "--terse", "--query=FrameLockTiming"]).split()
+        return bool(said) and set(said) == {"1"}
+    return False
 
 
 class Screen:
@@ -77,6 +92,7 @@ class Screen:
         self._staged: dict[str, npt.NDArray[np.uint8]] = {}
         self._last: dict[str, Any] | None = None
         self._pid = self._reported = self._misses = 0
+        self._locked = False
 
     @property
     def socket(self) -> Path:
@@ -152,7 +168,7 @@ class Screen:
                 clock = {"op": "clock", "ahead_s": self._clock.ahead_s, "then": self.setup.then}
                 self.ask({**clock, "keep_s": max(0.001, keep_s)})
             if pid != self._pid:
-                self._pid, self._reported = pid, 0
+                self._pid, self._reported, self._locked = pid, 0, frame_lock(self._display)
                 if self._last is not None:
                     threading.Thread(target=self._again, args=(self._last,), daemon=True).start()
             rows = self.ask({"op": "reports", "after": self._reported})["reports"]
@@ -166,7 +182,7 @@ class Screen:
                     self._start()
             return State()
         self._misses = 0
-        return State(status, tuple((due, at, name) for _, due, at, name in rows))
+        return State(status, tuple((due, at, name) for _, due, at, name in rows), self._locked)
 
     def look(self) -> tuple[tuple[float, float, str | None], ...]:
         """A step, with the clock for as long as the setup says; new reports."""

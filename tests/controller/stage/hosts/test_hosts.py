@@ -17,7 +17,7 @@ from controller.stage.hosts.agent import Agent
 from controller.stage.hosts.clock import HostClock, Tracking, tracking
 from controller.stage.hosts.conductor import Skew
 from controller.stage.hosts.remote import Remote, key
-from controller.stage.hosts.screen import Screen
+from controller.stage.hosts.screen import Screen, frame_lock
 from controller.stage.link.membership import membership
 from controller.stage.link.session import house_link, member_link
 from controller.stage.link.transfer import PART_BYTES, Arrivals, Offer
@@ -56,6 +56,7 @@ def test_one_display_of_three_computers(three: Computers) -> None:
         assert status["mixed"] == 0
         assert 0 < status["skew_p50_s"] < 0.5
         assert status["lost_hosts"] == status["missing_outputs"] == []
+        assert status["frame_lock"] is False, "nothing here could tell"
         # A computer that is lost is named, and the others show no pattern without it. It plays on.
         three.kill("left")
         eventually(lambda: display.status(deadline=in_seconds(5))["lost_hosts"] == ["left"])
@@ -253,6 +254,31 @@ def test_without_chrony_there_is_no_tracking() -> None:
         raise FileNotFoundError
 
     assert tracking(missing) is None
+
+
+@pytest.mark.parametrize(
+    ("says", "locked"),
+    [
+        ("echo 1; echo 1", True),
+        ("echo 1; echo 0", False),
+        ("exit 1", False),
+        ("true", False),
+        ("echo 1; exit 1", False),
+    ],
+)
+def test_frame_lock_is_what_every_card_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, says: str, locked: bool
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    program = tmp_path / "nvidia-settings"
+    program.write_text(
+        f'#!/bin/sh\n[ "$*" = "--ctrl-display=:0.1 --terse --query=FrameLockTiming" ] || exit 1\n{says}\n'
+    )
+    program.chmod(0o755)
+    assert frame_lock(":0.1") is locked
+    assert not frame_lock("")
+    program.unlink()
+    assert not frame_lock(":0.1")
 
 
 def test_skew_is_from_the_first_to_the_last_player_and_other_pictures_are_mixed() -> None:
