@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from controller.kiosk.state import KioskState
+from controller.stage.link.membership import Membership
 from controller.stage.link.peers import PORT, peer, scheduler_at, tls_files
 
 BEFORE_S: Final = 600.0
@@ -58,15 +59,17 @@ def work(folder: Path, cancel: threading.Event) -> None:
             if process is None and wanted is not None and time.monotonic() >= again_s:
                 # Not at once after one that has ended by itself: its scheduler may be off.
                 running, again_s = wanted, time.monotonic() + _AGAIN_S
-                process = _begun(folder)
+                process = _begun(wanted[1])
             cancel.wait(_LOOK_S)
     finally:
         if process is not None:
             _end(process)
 
 
-def _wanted(folder: Path) -> float | None:
-    """None if nothing is to run, else what changes when it has to be started again: with another certificate."""
+def _wanted(folder: Path) -> tuple[float, Membership] | None:
+    """None if nothing is to run, else what changes when it has to be started again: with another certificate. And who
+    this computer is.
+    """
     try:
         here = peer(folder)
         if here is None:
@@ -74,15 +77,12 @@ def _wanted(folder: Path) -> float | None:
         file = folder / _CLOSED
         if here.endpoints and (not file.exists() or abs(time.time() - file.stat().st_mtime) > YOUNG_S):
             return None
-        return here.folder.stat().st_ctime
+        return here.folder.stat().st_ctime, here
     except OSError:  # it is being exchanged
         return None
 
 
-def _begun(folder: Path) -> subprocess.Popen[bytes] | None:
-    here = peer(folder)
-    if here is None:
-        return None
+def _begun(here: Membership) -> subprocess.Popen[bytes] | None:
     files = [str(file) for file in tls_files(here)]
     tls = [word for pair in zip(("--tls-ca-file", "--tls-cert", "--tls-key"), files, strict=True) for word in pair]
     if not here.endpoints:

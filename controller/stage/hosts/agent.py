@@ -131,7 +131,7 @@ class Agent:
             states = {name: one.step(one.setup.keep_s - silent_s) for name, one in self._screens.items()}
         plays = "playing" if all(state.status is not None for state in states.values()) else "fault"
         told = self.updates.plays(plays if states else "off") if self.updates is not None else NO_UPDATE
-        self._link.publish(key(self._name, "state"), Report(self._clock.now_s(), self._clock.trouble, states, told))
+        self._link.publish(key(self._name, "state"), Report(self._clock.trouble, states, told))
 
     def _beat(self, _: bytes) -> None:
         self._heard_s = time.monotonic()

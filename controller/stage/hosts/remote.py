@@ -48,7 +48,6 @@ class Report:
     and why of the last one of its program.
     """
 
-    common_s: float
     trouble: str
     states: dict[str, State] = field(default_factory=dict)
     update: tuple[str, str, str] = NO_UPDATE
