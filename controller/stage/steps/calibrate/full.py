@@ -35,7 +35,7 @@ from controller.optics.calibrate.photometry.projector_glare import DarkPart, len
 from controller.optics.calibrate.photometry.radiometry import measure_radiometry, white_segment
 from controller.optics.calibrate.values import Correspondence, Pinhole
 from controller.optics.capture.pattern_frames import frame
-from controller.optics.capture.raw import CAMERA_BLUR_PX
+from controller.optics.capture.raw import CAMERA_BLUR_PX, SRGB_TO_XYZ
 from controller.optics.transport.indirect.stripes import stride_of, stripe_parts, thinned
 from controller.run.progress import Reporter
 from controller.run.runner import Context, Step
@@ -199,13 +199,9 @@ def _radiometry(projector: RigProjector, context: Context) -> Sequence[Path]:
     return [light.write(context.folder, projector.name), figures, told]
 
 
-_SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""IEC 61966-2-1; for a camera without its own colour matrix."""
-
-
 def _to_xyz(taken: Mapping[str, TakenPhotograph]) -> Float64:
     matrix = next(iter(taken.values())).read().camera_to_xyz
-    return _SRGB_TO_XYZ if matrix is None else matrix
+    return SRGB_TO_XYZ if matrix is None else matrix
 
 
 def _no_light(projector: RigProjector, context: Context) -> Sequence[Path]:

@@ -14,7 +14,7 @@ from controller.core.blur import masked_blur
 from controller.optics.calibrate.values import Calibration
 from controller.optics.solve.appearance import StageLight
 from controller.optics.solve.bounded.engine import ALONE
-from controller.optics.solve.bounded.equations import SolveSettings
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings
 from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.result.refinement import (
     EDGE_PX,
@@ -66,7 +66,8 @@ class Result:
         self.target = (EXPOSURE * wave[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32)
         self.mask: Mask = np.zeros(CAMERA, np.bool_)
         self.mask[6:-6, 6:-6] = True
-        self.frames = solve_bounded(self.transport, self.target, self.calibration.black).frames
+        first = SolveSettings(tolerance=APPEARANCE_TOLERANCE)
+        self.frames = solve_bounded(self.transport, self.target, self.calibration.black, first).frames
 
     def seen(self, frames: tuple[FloatImage, ...]) -> FloatImage:
         return np.asarray(self.light(self.true.forward(frames)) + self.calibration.black, np.float32)
@@ -110,7 +111,7 @@ class Result:
             StageLight(self.transport, self.calibration.black),
             self.target,
             aimed,
-            SolveSettings(start=frames),
+            SolveSettings(start=frames, tolerance=APPEARANCE_TOLERANCE),
             ALONE,
             exposure=EXPOSURE,
         )
