@@ -190,8 +190,7 @@ class _Judged:
         for n, view in self._views.items():
             points, whites = surface_points(self._thing, self._truth.cameras[n]).astype(np.float32), self._whites()
             judge = JudgeCamera(self._stage, self._truth.cameras[n], direct=True)
-            white = judge.light({name: frame for one in whites for name, frame in one.items()})
-            light = (white - judge.light({})).mean(2)
+            light = (judge.light({k: frame for one in whites for k, frame in one.items()}) - judge.light({})).mean(2)
             lit = np.isfinite(points).all(axis=-1) & (light > LIT * np.percentile(light, 99))
             often, solved = np.ones(lit.shape), view.transport.object_mask.copy()
             for m in self._views.keys() - {n}:
