@@ -6,21 +6,26 @@ import contextlib
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 import pytest
+from pymodbus.client import ModbusTcpClient
 
 from controller.core.errors import UsageError
 from controller.stage.rig.lamp_guard import LampGuard
 from controller.stage.rig.lamp_ledger import LampFile
 from controller.stage.sessions.check import Checked, check_stage
-from controller.stage.sessions.open import open_projector
+from controller.stage.sessions.open import mains_circuits, open_device, open_projector
+from hal.conformance import PowerSwitchConformance
 from hal.deadline import in_seconds
 from hal.errors import DeviceGone, DeviceRefused, PluginError
+from hal.interfaces import PowerSwitch
 from hal.registry import OpenContext
 from hal.values import Power
 from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase, LampTiming, quick_profile
 from plugins.emulated.projectors.serial import EmulatedSerialProjector
 from tests.controller.stage.hosts.computers import Computers, running
+from tests.plugins.mains.test_network_mains import ModbusServer
 from tests.waiting import wait_for
 
 TIMING = LampTiming(warm_up_s=0.5, cool_down_s=1.0)
@@ -49,6 +54,19 @@ height_px = 30
 host = "left"
 """
 
+RELAYS = """
+[[relays]]
+name = "cupboard"
+driver = "modbus-relays"
+host = "left.local"
+address = "127.0.0.1:{port}"
+channels = 3
+boot_s = 0
+[[relays.mains]]
+channel = 1
+feeds = ["P"]
+"""
+
 
 @pytest.fixture(scope="module")
 def computers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Computers]:
@@ -67,8 +85,17 @@ def lamp(computers: Computers) -> Iterator[EmulatedLamp]:
         yield lamp
 
 
-def checked(computers: Computers, alone: str = "black", **changes: str) -> Checked:
+@pytest.fixture(scope="module")
+def relays() -> Iterator[ModbusServer]:
+    server = ModbusServer()
+    yield server
+    server.close()
+
+
+def checked(computers: Computers, alone: str = "black", relays: int | None = None, **changes: str) -> Checked:
+    """``relays``: the port of a board."""
     text = STAGE.format(port=computers.folder / "tty", alone=alone)
+    text += "" if relays is None else RELAYS.format(port=relays)
     for old, new in changes.items():
         text = text.replace(f'{old} = "', f'{old} = "{new}', 1)
     (computers.folder / "stage.toml").write_text(text)
@@ -169,3 +196,41 @@ def test_what_can_not_be_is_refused_before_anything_is_opened(computers: Compute
     with pytest.raises(PluginError, match="The computer left: There is no projector driver 'acme'"):
         older.ask(context, "check", deadline=in_seconds(10))
     assert lamp.strikes == 0
+
+
+class TestRelaysElsewhere(PowerSwitchConformance):
+    """A board on the other computer keeps what every board has to."""
+
+    @pytest.fixture
+    def power_switch(self, computers: Computers, relays: ModbusServer) -> Iterator[PowerSwitch]:
+        stage, context = checked(computers, relays=relays.port), OpenContext(computers.folder, runtime=computers.folder)
+        table, (driver, settings) = stage.stage.tables.relays[0], stage.relays[0]
+        board = cast("PowerSwitch", open_device(table, driver, settings, context, in_seconds(20)))
+        yield board
+        board.close()
+
+
+def test_a_relay_elsewhere_keeps_the_mains_of_a_lamp_that_burns(
+    computers: Computers, lamp: EmulatedLamp, relays: ModbusServer
+) -> None:
+    guard, context = lit(computers, lamp), OpenContext(computers.folder, runtime=computers.folder)
+    with contextlib.ExitStack() as stack, ModbusTcpClient("127.0.0.1", port=relays.port) as client:
+        stage = checked(computers, relays=relays.port)
+        (circuit,) = mains_circuits(stage, context, stack, in_seconds(20))
+        circuit.close(deadline=in_seconds(10))
+        assert client.read_coils(0, count=3).bits[:3] == [True, False, False], "another program sees it at the board"
+        with pytest.raises(DeviceRefused) as caught:
+            circuit.open({"P": guard}, deadline=in_seconds(10))
+        assert caught.value.code == "mains-lamp-hot"
+        guard.switch_off(deadline=in_seconds(10))
+        wait_for(lambda: guard.may_open_mains(deadline=in_seconds(5)))
+        circuit.open({"P": guard}, deadline=in_seconds(10))
+        assert not client.read_coils(0, count=1).bits[0]
+        # What is at a computer that is lost is not known.
+        computers.processes["left"].send_signal(signal.SIGSTOP)
+        wait_for(lambda: computers.status()["lost_hosts"] == ["left"])
+        with pytest.raises(DeviceGone, match="left"):
+            circuit.on(deadline=in_seconds(5))
+        computers.processes["left"].send_signal(signal.SIGCONT)
+        wait_for(lambda: computers.status()["lost_hosts"] == [])
+    guard.close()
