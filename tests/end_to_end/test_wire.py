@@ -117,17 +117,10 @@ def test_nothing_secret_passes_between_a_house_and_its_stage(tmp_path: Path, mon
     _only_tls_13(heard, ports[0])
 
 
-class Apart(several.Computers):
-    """They share no memory, by which Zenoh would bring what is large."""
-
-    def prefix(self, name: str) -> list[str]:
-        return ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /dev/shm && exec "$@"', "sh"]
-
-
 def test_nothing_secret_passes_between_a_stage_and_its_players(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ports = [free_port(), free_port()]
     monkeypatch.setattr(several, "free_port", iter(ports).__next__)
-    computers = Apart(tmp_path, ["left"], None)
+    computers = several.Computers(tmp_path, ["left"], None)
     computers.bundle = write_noise(tmp_path / "b.vel", outputs=computers.outputs)
     pictures = noise(computers.outputs, 11)
     with listening(tmp_path / "players.pcapng", ports) as heard, several.running(computers):

@@ -54,8 +54,7 @@ ROLLOUT: Final = "update-stages"
 MOST_EVENTS: Final = 2000
 _AT_ONCE: Final = 16
 _ORDER_S: Final = 10.0
-_COMPUTE_S: Final = 60.0
-"""A stage fits the picture to its view before it answers."""
+_COMPUTE_S: Final = 60.0  # a stage fits the picture to its view before it answers
 _BACKUP_S: Final = 3600.0
 _LOOK_S: Final = 30.0
 _BACKUP_WINDOW_S: Final = 6 * 3600.0
@@ -222,17 +221,14 @@ class House:
         """``target``: a picture that the stages get first. Raises UsageError("house-stages-unknown"), OSError, and
         WorkError("house-order-failed") once all others have done it.
         """
-        who = CALLER.get()
+        who, within_s = CALLER.get(), _ORDER_S if target is None else _COMPUTE_S
 
         def order(name: str) -> str:
             if not self._stages[name].linked:
                 return f"{name}: it is not linked now."
-            picture, within_s = {}, _ORDER_S
             try:
-                if target is not None:
-                    picture, within_s = {"target": send(self._link, f"member/{name}/target", target)}, _COMPUTE_S
-                order = Order(verb, who, values | picture)
-                self._link.ask(f"member/{name}/do", order, type(None), within_s=within_s)
+                sent = {} if target is None else {"target": send(self._link, f"member/{name}/target", target)}
+                self._link.ask(f"member/{name}/do", Order(verb, who, values | sent), type(None), within_s=within_s)
             except CodedError as error:
                 return f"{name}: {error.what}"
             self._greet(name)  # the page is to show it at once

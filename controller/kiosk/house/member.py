@@ -37,7 +37,6 @@ AGAIN_S: Final = 30.0
 CERTIFIED_S: Final = 600.0
 MOST_EVENTS: Final = 200
 PICTURE_PX: Final = 160
-TARGETS: Final = "kiosk/house-targets"
 _VERBS: Final = {one.building_verb: one for one in OPERATIONS if one.building_verb} | {compute.name: compute}
 
 
@@ -156,7 +155,7 @@ class _Reports:
         self._unsubscribe = kiosk.subscribe(self._changed.set)
         for name, answer in (("report", self._whole), ("picture", self._picture), ("backup", self._make_backup)):
             self._link.answer(f"{self._key}/{name}", bytes, answer)
-        self._targets = Arrivals(stage / TARGETS, lambda file: None)  # the kiosk checks what it computes
+        self._targets = Arrivals(stage / "kiosk/house-targets", lambda file: None)  # the kiosk checks what it computes
         self._targets.listen(self._link, f"{self._key}/target")
         self._link.answer(f"{self._key}/do", Order, self._do)
         self._link.answer(f"{self._key}/part", int, self._part)

@@ -67,9 +67,7 @@ def work(folder: Path, cancel: threading.Event) -> None:
 
 
 def _wanted(folder: Path) -> tuple[float, Membership] | None:
-    """None if nothing is to run, else what changes when it has to be started again: with another certificate. And who
-    this computer is.
-    """
+    """None if nothing is to run, else who this is, and when its certificate changed: it is started again after that."""
     try:
         here = peer(folder)
         if here is None:

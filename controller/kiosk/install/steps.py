@@ -97,11 +97,14 @@ def install_player(
     system.folder(CONFIGURATION)
     _packages(system, "chrony")
     _user(system)
+    system.run("systemctl", "stop", "--quiet", *SERVICES[1:], may_fail=True)
     for path, text in shipped(prefix).items():
-        system.write(path, text)
+        if path.stem in SERVICES[1:]:
+            system.remove(path)
+        else:
+            system.write(path, text)
     _folders(system)
     system.run("systemctl", "daemon-reload")
-    system.run("systemctl", "mask", "--quiet", "--now", *SERVICES[1:])
     system.run("systemctl", "enable", "--quiet", TARGET, AGENT, UPDATES)
     system.run("systemctl", "start", "velatura-x11", UPDATES)
     _outputs(system, again=not restart, say=say)
@@ -294,7 +297,7 @@ def _outputs(system: System, *, again: bool, say: Callable[[str], None]) -> None
         settings = PlayerSettings(player_outputs(found) or NO_OUTPUTS, None, bundle=STAGE / "bundles" / "current")
         text = "".join(f"{word}\n" for word in settings.arguments())
         if system.write(PLAYER_OPTIONS, text, mode=0o600, owner=f"{USER}:{USER}"):
-            system.run("systemctl", "try-restart", "velatura-player")
+            system.run("systemctl", "try-restart", "velatura-player", may_fail=True)
     if found:
         # Last: where they are, all this was done.
         write_outputs(system, found)

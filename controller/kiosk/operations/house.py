@@ -202,9 +202,7 @@ def house_play(house: House, stages: Stages, name: AppearanceName) -> None:
 @operation("POST /house/appearances", Role.OPERATOR, Effect.CHANGES, done="{stages}: the computation has started.",
            names=Names(command="house compute"))  # fmt: skip
 def house_compute(house: House, stages: Stages, name: NewName, target: TargetFile, fit: FitName = "fit") -> None:
-    """Let a stage of the house, a group or all compute an appearance from a target picture. Each fits it to its own
-    camera's view, and installs the appearance when it is done.
-    """
+    """Let a stage of the house, a group or all compute an appearance from a target picture, and install it."""
     house.open().do(stages, "compute", target=target, name=name, fit=fit)
 
 

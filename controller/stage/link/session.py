@@ -88,7 +88,8 @@ class Link:
         link = {"protocols": [protocol], "rx": {"max_message_size": MOST_BYTES}}
         link |= {"tls": config["tls"]} if "tls" in config else {}
         own = {key: value for key, value in config.items() if key != "tls"}
-        self._config = shared | own | {"transport": {"link": link}}
+        # No shared memory: the services of a kiosk may not have any, and what passes is to pass by TLS.
+        self._config = shared | own | {"transport": {"link": link, "shared_memory": {"enabled": False}}}
         self._endpoints = deque(endpoints)
         self._declarations: list[Callable[[], object]] = []
         self._declared: list[object] = []

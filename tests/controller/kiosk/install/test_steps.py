@@ -192,7 +192,10 @@ def test_a_program_that_fails_ends_it_with_what_it_said(debian: Path) -> None:
 def test_a_computer_with_outputs_of_another_stage_runs_the_agent_and_nothing_else(debian: Path) -> None:
     system = Recorded(debian, FRESH)
     steps.install_player(system, say=system.told.append, prefix=PREFIX)
-    assert "systemctl mask --quiet --now velatura-player velatura-controller" in system.ran
+    assert "systemctl stop --quiet velatura-player velatura-controller" in system.ran
+    units = {path.stem for path in system.at(Path("/etc/systemd/system")).glob("*.service")}
+    assert "velatura-agent" in units
+    assert not units & {"velatura-player", "velatura-controller"}, "systemd masks no unit whose file is there"
     assert "systemctl enable --quiet velatura.target velatura-agent velatura-update.path" in system.ran
     assert any(line.startswith("apt-get install") and "chrony" in line for line in system.ran)
     assert (debian / "etc/systemd/system/velatura-agent.service").exists()
