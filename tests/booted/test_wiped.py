@@ -97,3 +97,101 @@ def test_a_blank_machine_becomes_the_kiosk_of_a_backup_after_one_question(playin
     # where this Debian was calibrated, `board` plays into the file that the bench's camera sees, not on X
     assert time.monotonic() - began_s < RESTORED_S
     assert (machine.at(STAGE) / "backup-files/far.png").read_text() == "a picture"
+
+
+OTHER = Path("/opt/other")
+"""The stage of another computer, which stands beside the machine."""
+OTHER_STAGE = """
+[stage]
+name = "other"
+[[projectors]]
+name = "P"
+output = "P1"
+driver = "serial"
+host = "{host}"
+port = "/dev/ttyUSB0"
+profile = "nec"
+[[relays]]
+name = "cupboard"
+driver = "modbus-relays"
+host = "{host}"
+address = "127.0.0.1:5020"
+channels = 3
+[[relays.mains]]
+channel = 1
+feeds = ["P"]
+[camera]
+driver = "ptp"
+iso = 100
+address = "ptpip:127.0.0.1"
+[display]
+driver = "player"
+[[display.outputs]]
+name = "P1"
+width_px = 280
+height_px = 210
+host = "{host}"
+"""
+RELAYS = """
+import asyncio
+from pymodbus.datastore import ModbusDeviceContext, ModbusSequentialDataBlock, ModbusServerContext
+from pymodbus.server import StartAsyncTcpServer
+coils = ModbusSequentialDataBlock(1, [False] * 9)
+board = ModbusServerContext(devices=ModbusDeviceContext(co=coils), single=True)
+asyncio.run(StartAsyncTcpServer(board, address=("127.0.0.1", 5020)))
+"""
+USED = f"""
+from pathlib import Path
+import numpy as np
+from controller.stage.sessions.check import check_stage
+from controller.stage.sessions.open import open_device
+from hal.deadline import in_seconds
+from hal.registry import OpenContext
+from plugins.display.player import PlayerDisplay
+folder = Path("{OTHER}")
+display = PlayerDisplay(folder / "player.sock", None)
+display.show({{"P1": np.full((210, 280, 3), (10, 200, 30), np.uint8)}}, deadline=in_seconds(20))
+stage = check_stage(folder)
+board = open_device(stage.stage.tables.relays[0], *stage.relays[0], OpenContext(folder, runtime=folder), in_seconds(20))
+board.switch(1, True, deadline=in_seconds(10))
+print([board.state(channel, deadline=in_seconds(10)) for channel in (1, 2)])
+"""
+
+
+def test_a_blank_machine_plays_and_switches_for_a_stage_on_another_computer(bare: Kiosk) -> None:
+    machine, python, program = bare.machine, "/opt/velatura/bin/python", "/opt/velatura/bin/velatura"
+    machine.call(program, "kiosk", "uninstall", "--purge")
+    machine.call(program, "kiosk", "install", "--player")
+    told = ("journalctl", "--no-pager", "--output=cat", "--unit=velatura-agent")
+    machine.wait_for(lambda: "Code of this computer" in machine.call(*told))
+    (code,) = re.findall(r"Code of this computer: (\d{4}-\d{4})", machine.call(*told))
+    machine.wait_for(lambda: lit(machine.screen()))
+    machine.call("mkdir", OTHER)
+    machine.call(program, "kiosk", "agent", "--stage", OTHER, "--admit", "127.0.0.1", "--code", code)
+    host = machine.call("hostname").strip().lower()
+    machine.write(OTHER / "stage.toml", OTHER_STAGE.format(host=host))
+    conductor: list[str | Path] = [
+        python,
+        "-m",
+        "controller.play",
+        "--socket",
+        OTHER / "player.sock",
+        "--keys",
+        OTHER / "keys/players",
+    ]
+    conductor += ["--port", "7449", "--outputs", "P1:280x210", "--host", f"P1={host}", "--allow-unsigned", "--windows"]
+    relays = ("systemd-run", "--unit=relays", "--", python, "-c", RELAYS)
+    for again in (False, True):
+        if again:
+            bare.boot()
+        machine.wait_for(lambda: machine.called(*relays).returncode == 0)  # once systemd is there
+        machine.call("systemd-run", "--unit=conductor", "--setenv=HOME=/tmp", "--", *conductor)
+        machine.wait_for(lambda: machine.called(python, "-c", USED).stdout.strip() == "[True, False]")
+        screen = machine.screen()
+        assert screen is not None
+        assert (screen[:210, :280] == (10, 200, 30)).all()
+        assert not screen[210:].any()
+        assert not screen[:, 280:].any()
+    running = machine.call("systemctl", "show", "--value", "--property=NRestarts,User", "velatura-agent").split()
+    assert running == ["0", "velatura"]
+    assert machine.called("systemctl", "is-active", "--quiet", "velatura-controller").returncode != 0

@@ -26,7 +26,7 @@ from tests.end_to_end.kernel_copy import kernels_of_the_tables
 
 ROOT: Final = Path(__file__).parents[2]
 BOOTED: Final = (
-    "systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "python3",
+    "systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "python3", "chrony",
     "xserver-xorg-video-dummy",
 )  # fmt: skip
 """What a Debian on a computer has without us, and outputs without graphics hardware."""
