@@ -31,6 +31,8 @@ from controller.optics.capture.profile import CameraNoise
 FEWEST_TILES = 40
 OVEREXPOSED = 0.02
 """Of the photograph."""
+FEWEST_OF_OVEREXPOSED = 60
+"""More, because the lightest tiles are missing."""
 SUSPECT_ADDITIVITY = 0.02
 """From here on a white segment is looked for."""
 BETTER = 0.7
@@ -103,7 +105,7 @@ def measure_radiometry(
     check_size(places[code[0].sure & code[1].sure & lit_pixels(white) & agree], plan.size_px)
     tiles = measure_tiles(captures, plan, black, white, code=code, indirect=indirect)
     clipped = float(np.mean(finite(black) & ~finite(white)))
-    if tiles.ratio.shape[0] < FEWEST_TILES and clipped > OVEREXPOSED:
+    if tiles.ratio.shape[0] < FEWEST_OF_OVEREXPOSED and clipped > OVEREXPOSED:
         raise CalibrationError(
             "captures-overexposed",
             what=f"White is clipped in {100 * clipped:.0f} % of the photograph.",
