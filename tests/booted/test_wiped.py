@@ -160,6 +160,7 @@ print([board.state(channel, deadline=in_seconds(10)) for channel in (1, 2)])
 
 def test_a_blank_machine_plays_and_switches_for_a_stage_on_another_computer(bare: Kiosk) -> None:
     machine, python, program = bare.machine, "/opt/velatura/bin/python", "/opt/velatura/bin/velatura"
+    machine.call("systemctl", "disable", "--now", "bench")
     machine.call(program, "kiosk", "uninstall", "--purge")
     machine.call(program, "kiosk", "install", "--player")
     told = ("journalctl", "--no-pager", "--output=cat", "--unit=velatura-agent")
