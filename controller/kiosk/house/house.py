@@ -266,16 +266,18 @@ class House:
         hosts = [*self._settings.addresses, *own_addresses(), f"{socket.gethostname()}.local"]
         with self._changing:
             member = admit(self._authority, address, code, tuple(f"tls/{host}:{self._settings.port}" for host in hosts))
-            self._link.close()
-            self._open()
+            self._open_again()
         self._record("house-joined", f"The stage {member.name} has joined the house.", "info")
 
     def remove(self, stage: str) -> None:
         self._known(stage)
         with self._changing:
             self._authority.remove(stage)
-            self._link.close()
-            self._open()
+            self._open_again()
+
+    def _open_again(self) -> None:
+        self._link.close()
+        self._open()
 
     # -- updates
 
