@@ -6,7 +6,8 @@ Works in a copy of the code in ``build/mutants/SEED``, where a session of cosmic
 it continues where it stopped, with the tests as they are then. ``--again`` tries the survivors once more. For each
 change the N test files that are nearest to it by their imports run, in at most so many seconds of a clock; the first
 failure ends it, and counts only if that test holds without the change. Prints the survivors with file and line, apart
-from those of ``equivalent_mutants.toml``, which no test could notice; the exit code is 1 if there is one.
+from those of ``equivalent_mutants.toml``, for which none is run, as none could notice; the exit code is 1 if
+there is one.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import sys
 import time
 import tomllib
 from collections import defaultdict, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -48,6 +49,7 @@ class Nearness:
 
     def __init__(self, root: Path) -> None:
         self._importers: dict[str, set[str]] = defaultdict(set)
+        self._tests: list[str] = []
         paths = [path for part in (*PARTS, "lab", "tests") for path in (root / part).rglob("*.py")]
         names = {path.relative_to(root).as_posix() for path in paths}
         for name in names:
@@ -56,6 +58,7 @@ class Nearness:
                     if file in names and file != name:
                         self._importers[file].add(name)
             if Path(name).name.startswith("test_"):
+                self._tests.append(name)
                 for folder in Path(name).parents:
                     self._importers[(folder / "conftest.py").as_posix()].add(name)
 
@@ -68,12 +71,15 @@ class Nearness:
                 far[importer] = far[file] + 1
                 queue.append(importer)
         folder, name = f"tests/{Path(path).parent.as_posix()}/", Path(path).name
+        for test in self._tests:
+            if test.startswith(folder):  # it may start the module in a process of its own
+                far.setdefault(test, 2)
 
         def key(test: str) -> tuple[object, ...]:
             own = test == f"{folder}test_{name}"
             return test.startswith(LONG), not own, far[test] - test.startswith(folder), far[test], test
 
-        return sorted((file for file in far if Path(file).name.startswith("test_")), key=key)
+        return sorted(far.keys() & self._tests, key=key)
 
 
 def _imported(path: Path) -> Iterator[str]:
@@ -112,10 +118,14 @@ class Limits:
 
 @dataclass
 class Trial:
-    """Changes in a tree, each with the tests near to it; ``broken``: tests that fail without a change, too."""
+    """Changes in a tree, each with the tests near to it; ``broken``: tests that fail without a change, too.
+
+    ``known``: (path, before, after) of changes for which no test is run.
+    """
 
     tree: Path
     limits: Limits
+    known: Collection[tuple[str, ...]] = ()
     broken: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -127,14 +137,16 @@ class Trial:
         before = path.read_text(encoding="utf-8")
         with use_mutation(path, operator_of(change.operator_name), change.occurrence) as (_, after):
             pass
-        diff = "\n".join(_changed(before, after or ""))
+        changed = tuple(_changed(before, after or ""))
+        if (change.module_path.as_posix(), *changed) in self.known:
+            left = []
         sizes, killer, ran = iter(BATCHES), "", 0
         while left and not killer and time.monotonic() < until_s:
             batch, left = left[: (size := next(sizes, BATCHES[-1]))], left[size:]
             killer, done = self._killer(change, batch, until_s)
             ran += len(batch) if done else 0
         outcome = TestOutcome.KILLED if killer else TestOutcome.SURVIVED
-        return WorkResult(WorkerOutcome.NORMAL, killer or f"{ran} test files", outcome, diff)
+        return WorkResult(WorkerOutcome.NORMAL, killer or f"{ran} test files", outcome, "\n".join(changed))
 
     def _killer(self, change: MutationSpec, tests: list[str], until_s: float) -> tuple[str, bool]:
         """The test that fails with the change and holds without it, or empty; whether all were done in time."""
@@ -200,7 +212,7 @@ class Campaign:
             self._session.add_work_items(new)
             items |= {item.job_id: item for item in new}
         done = dict(self._session.results)
-        trial = Trial(self.tree, limits)
+        trial = Trial(self.tree, limits, self._equivalent)
         for job in sorted(items)[:count]:
             change, result = items[job].mutations[0], done.get(job)
             if result is None or (again and self._result(change, result).state in ("survived", "untried")):
@@ -221,8 +233,8 @@ class Campaign:
 
 
 def _copy(root: Path, tree: Path) -> None:
-    """All files that are not ignored; the product only if the tree has none yet."""
-    have = (tree / "complete").exists()
+    """All files that are not ignored; of a tree that has a product this is kept, as it was before any change."""
+    have, unchanged = (tree / "complete").exists(), tree.with_name("unchanged")
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=root, capture_output=True, text=True, check=True,
@@ -234,6 +246,9 @@ def _copy(root: Path, tree: Path) -> None:
             continue
         (tree / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(root / name, tree / name)
+    source, goal = (unchanged, tree) if have else (tree, unchanged)  # one that was killed has left its last change
+    for part in filter(lambda part: (source / part).is_dir(), PARTS):
+        shutil.copytree(source / part, goal / part, dirs_exist_ok=True)
     if (root / ".venv").exists() and not (tree / ".venv").exists():
         (tree / ".venv").symlink_to((root / ".venv").resolve())
     (tree / "complete").touch()

@@ -62,8 +62,10 @@ def test_a_change_is_killed_by_its_test_and_survives_an_empty_one(
     listed = Campaign(tree, folder, "1", equivalent)
     assert Counter(one.state for one in listed.run(2, Limits())) == {"killed": 1, "equivalent": 1}
 
-    # A test that fails without the change, too, kills nothing, and does not hide the next one.
+    # A test that fails without the change, too, kills nothing, and does not hide the next one. Nor does a change that
+    # a killed campaign has left.
     equivalent.write_text("")
+    (folder / "tree/hal/unwatched.py").write_text(WATCHED.replace("a > b", "a"))
     mended = "def test_of_a_busy_computer() -> None:\n    raise OSError\n\n\n"
     mended += TESTED.replace("watched", "unwatched").replace("2, 1", "1, 2")
     (tree / "tests/other/test_unwatched.py").write_text(mended)
@@ -104,7 +106,10 @@ def test_statements_and_conditions_are_left_out(code: str, changed: list[str]) -
 def test_the_nearest_tests_come_first(tree: Path) -> None:
     (tree / "hal/above.py").write_text("def late() -> None:\n    from hal import watched\n")
     (tree / "tests/hal/test_above.py").write_text("import hal.above\n")
-    assert Nearness(tree).tests_of("hal/watched.py") == ["tests/hal/test_watched.py", "tests/hal/test_above.py"]
+    (tree / "tests/hal/test_process.py").write_text("import subprocess\n")
+    assert Nearness(tree).tests_of("hal/watched.py") == [
+        f"tests/hal/test_{name}.py" for name in ("watched", "above", "process")
+    ]
 
 
 def test_equivalent_changes_are_no_part_of_the_share() -> None:
