@@ -308,15 +308,10 @@ class SolveTable(ConfigTable):
         le=100,
         description="the weight of smoothness in a compensation image (equal neighbours), 0 to 100",
     )
-    mode: Literal["full", "scale"] = Field(
-        default="full",
-        description='"full" (a solve for every appearance), or "scale" (base image x scale image, which loses detail '
-        "finer than a projector's pixels)",
-    )
-    base: Literal["minimum", "white", "high-pass"] = Field(
+    base: Literal["minimum", "white"] = Field(
         default="white",
-        description='the base image: "minimum" (the darkest white image at each pixel), "white" (even light), or '
-        '"high-pass" (the fine detail of each target, with a solve for each)',
+        description='the base image of live targets: "minimum" (the darkest white image at each pixel), or '
+        '"white" (even light)',
     )
     adapt: float = Field(
         default=0.5,

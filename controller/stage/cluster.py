@@ -27,9 +27,8 @@ import numpy as np
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, WorkError
 from controller.core.extras import extra_missing
-from controller.optics.solve.appearance import Base, StageLight, prepare_base
+from controller.optics.solve.appearance import StageLight
 from controller.optics.solve.bounded.engine import SolveContext
-from controller.optics.solve.bounded.equations import Solution
 from controller.optics.solve.engines import choose_engine
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
@@ -51,17 +50,15 @@ _CODE: Final = (
 class StageData:
     """Data for all appearances of a stage; a worker gets it once.
 
-    ``image``: the base image C_b, ``solution`` its frames; ``black``: K; ``indirect``: G, where there is one
+    ``black``: K; ``indirect``: G, where there is one
     """
 
     transport: LightTransport
-    image: FloatImage
-    solution: Solution
     black: FloatImage
     indirect: ReflectedLight | None = None
 
 
-_kept: Final[WeakKeyDictionary[StageData, tuple[Base, DriveLevels]]] = WeakKeyDictionary()
+_kept: Final[WeakKeyDictionary[StageData, DriveLevels]] = WeakKeyDictionary()
 
 
 def make_there(stage: StageData, asked: Target, options: SolveOptions) -> AppearanceResult:
@@ -69,12 +66,10 @@ def make_there(stage: StageData, asked: Target, options: SolveOptions) -> Appear
     with _RUNNING:
         if stage not in _kept:
             _kept.clear()  # keep one stage only: it fills a worker's memory
-            base = prepare_base(stage.transport, stage.image, stage.black, stage.solution)
-            _kept[stage] = base, DriveLevels.of_transport(stage.transport)
-        base, drive = _kept[stage]
-        light = StageLight(stage.transport, stage.black, stage.indirect, drive)
+            _kept[stage] = DriveLevels.of_transport(stage.transport)
+        light = StageLight(stage.transport, stage.black, stage.indirect, _kept[stage])
         engine = choose_engine("cpu", lambda note: None)
-        return solve_appearance(light, base, asked, options, SolveContext(engine))
+        return solve_appearance(light, asked, options, SolveContext(engine))
 
 
 @cache

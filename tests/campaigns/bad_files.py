@@ -150,7 +150,7 @@ def _words() -> Iterator[Case]:
         ("calibrate", "{stage}", "--quick", "--projector", "x" * 900),
         ("play", "{stage}", "x", "--fade", "nan"), ("play", "{stage}", "x", "--seconds", "-1"),
         ("play", "{stage}", "x", "--repeat", HUGE), ("play", "{stage}", "\udcff"),
-        ("appearance", "{stage}", "\U0001f4a1"), ("appearance", "{stage}", "--base", "pink"),
+        ("appearance", "{stage}", "\U0001f4a1"), ("appearance", "{stage}", "--device", "pink"),
         ("appearance", "{stage}", "--scheduler", "http://x"), ("keys", "{stage}", "--name", "../x"),
         ("keys", "{stage}", "--name", ""), ("keys", "{stage}", "--name", "x" * 4000),
         ("live", "{stage}", "{here}/nothing"), ("live", "{stage}", "{here}", "--fps", "nan"),

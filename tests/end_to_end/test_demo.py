@@ -55,7 +55,7 @@ def test_the_report_has_every_promised_key(report: Any) -> None:
     assert {"seconds", "iterations", "objective", "kkt"} <= report["solve"].keys()
     assert [one["name"] for one in report["appearances"]] == APPEARANCES
     for one in report["appearances"]:
-        assert {"mode", "seconds", "delta_e00_median", "delta_e00_p95", "rmse", "sharpness_lambda"} <= one.keys()
+        assert {"seconds", "delta_e00_median", "delta_e00_p95", "rmse", "sharpness_lambda"} <= one.keys()
     assert {"bytes", "ratio"} <= report["bundle"].keys()
     assert {"swaps_per_s", "interval_p50_ms", "interval_p99_ms", "rss_bytes"} <= report["playback"].keys()
     assert {"cores", "memory_bytes"} <= report["machine"].keys()

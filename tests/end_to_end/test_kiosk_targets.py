@@ -39,7 +39,7 @@ from controller.stage.blender.run import find_blender
 from controller.stage.report.pictures import crop_around, to_screen
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.check import check_stage
-from controller.stage.steps.appearance.solving import options_of, solved_base
+from controller.stage.steps.appearance.solving import options_of
 from tests.controller.panel.browser import CHROMIUM, chromium, enter, tab
 from tests.controller.panel.served import served
 from tests.controller.stage.blender.test_render import PAINT_SCENE
@@ -313,8 +313,8 @@ def test_a_new_appearance_that_can_not_be_solved_is_taken_out_of_stage_toml(kios
 
 
 def test_a_preview_shows_what_the_computation_will_make(kiosk: StageKiosk, tmp_path: Path) -> None:
-    """Mesa's lavapipe; the judge is the processor, at all pixels. By base times scale, which spares the device in
-    software most of its sweeps. The end of the process that solves, by a driver or for a job, is none of the kiosk's.
+    """Mesa's lavapipe; the judge is the processor, at all pixels. The end of the process that solves, by a driver or
+    for a job, is none of the kiosk's.
     """
     target = tmp_path / "squares.png"
     rows, columns = np.indices((CAMERA_PX[1], CAMERA_PX[0])) // 40
@@ -342,11 +342,10 @@ def test_a_preview_shows_what_the_computation_will_make(kiosk: StageKiosk, tmp_p
 
 
 def agrees_with_the_processor(found: Computed, kiosk: StageKiosk, target: Path) -> None:
-    names, options = kiosk.service.checked.names, options_of(SolveTable(mode="scale"))
+    names, options = kiosk.service.checked.names, options_of(SolveTable())
     calibrated = Calibrated(finished_calibration(kiosk.stage), names)
     black, transport = calibrated.calibration.black, calibrated.transport
-    base = solved_base(calibrated, options)
-    made = solve_appearance(calibrated.light, base, load_target(target, CAMERA_PX), options)
+    made = solve_appearance(calibrated.light, load_target(target, CAMERA_PX), options)
     seen = calibrated.predicted_light(made.frames) + black
     exposure, whole = float(made.figures["exposure"] or 0), visible_object(transport.object_mask)
     judged = by_pixels(
@@ -379,7 +378,7 @@ def solves_on(kiosk: StageKiosk, device: str) -> None:
     """A new service with this device, as after a change of stage.toml."""
     toml = kiosk.stage / "stage.toml"
     text = toml.read_text()
-    toml.write_text(text.partition("\n[solve]")[0] + f'\n[solve]\nmode = "scale"\ndevice = "{device}"\n')
+    toml.write_text(text.partition("\n[solve]")[0] + f'\n[solve]\ndevice = "{device}"\n')
     log = kiosk.service.log
     kiosk.detach()
     kiosk.attach(Service(check_stage(kiosk.stage), log))

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 class SolveChoice:
     """How appearances are solved, where it is not as stage.toml says."""
 
-    base: Annotated[
-        Literal["minimum", "white", "high-pass"] | None, typer.Option(help="Base image (default: from stage.toml).")
-    ] = None
     scheduler: Annotated[
         str | None,
         typer.Option(help="Solve on a Dask cluster: tcp://host:8786 or tls://host:8786 (default: that of its house)."),
@@ -59,7 +56,6 @@ def appearance(
                 names=tuple(names or ()),
                 scenes=tuple(blender or ()),
                 accept_grade=accept_grade,
-                base=solve.base,
                 scheduler=solve.scheduler,
                 refinement=refinement_of(stage, solve.refine),
                 device=solve.device,

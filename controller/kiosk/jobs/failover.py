@@ -119,7 +119,7 @@ def _publish(
         context.check()
         solved = read_solved(context.folder, name, left)
         frames = {outputs[projector][0]: frame for projector, frame in solved.frames.items()}
-        return NewAppearance(name, black | frames, metadata={"mode": solved.figures["mode"]})
+        return NewAppearance(name, black | frames)
 
     write_bundle(
         built,

@@ -24,8 +24,8 @@ from controller.stage.sessions.check import Checked
 FIGURES: Final = "computed.json"
 PICTURE: Final = "computed.jpg"
 IDLE_S: Final = 120.0
-LONGEST_S: Final = 600.0
-"""For one answer, with what is read first: a driver may hang, and a processor beside other work is slow."""
+SILENT_S: Final = 300.0
+"""Without a word a driver hangs. What says that it continues may take long: on a processor with other work."""
 
 
 class ComputedPreviews:
@@ -81,30 +81,17 @@ class ComputedPreviews:
                     pipe.close()
 
     def _asked(self, stage: str, task: dict[str, str]) -> dict[str, Any]:
-        process = self._ready(stage)
+        process, line = self._ready(stage), "\n"
         assert process.stdin is not None
-        assert process.stdout is not None
-        slow = threading.Event()
-
-        def give_up() -> None:
-            slow.set()
-            process.kill()
-
-        limit = threading.Timer(LONGEST_S, give_up)
-        limit.daemon = True
-        limit.start()
-        line = ""
-        try:
+        with contextlib.suppress(OSError, ValueError):  # it has ended, or was ended: then it says nothing
             process.stdin.write(json.dumps(task) + "\n")
             process.stdin.flush()
-            line = process.stdout.readline()
-        except (OSError, ValueError):
-            pass  # it has ended, or was ended
-        finally:
-            limit.cancel()
-        if not line:
-            self.end()
-            raise _slow() if slow.is_set() else _ended()
+        while line.isspace():  # it continues
+            try:
+                line = _said(process)
+            except WorkError:
+                self.end()
+                raise
         self._rest()
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
@@ -146,13 +133,34 @@ def _stage_line(checked: Checked, run: Path) -> str:
     return json.dumps({"run": str(run), "names": checked.names, "solve": solve})
 
 
+def _said(process: subprocess.Popen[str]) -> str:
+    """Its next line; its end without one is an error, and its silence ends it."""
+    slow = threading.Event()
+
+    def give_up() -> None:
+        slow.set()
+        process.kill()
+
+    limit = threading.Timer(SILENT_S, give_up)
+    limit.daemon = True
+    limit.start()
+    line = ""
+    with contextlib.suppress(OSError, ValueError):
+        assert process.stdout is not None
+        line = process.stdout.readline()
+    limit.cancel()
+    if not line:
+        raise _slow() if slow.is_set() else _ended()
+    return line
+
+
 def _ended() -> WorkError:
     return WorkError("preview-ended", what="The preview was ended before it was there.",
                      remedy="Look at the picture again when no job of the kiosk runs.")  # fmt: skip
 
 
 def _slow() -> WorkError:
-    return WorkError("preview-slow", what=f"There was no preview within {LONGEST_S:.0f} seconds.",
+    return WorkError("preview-slow", what=f"The preview's process said nothing for {SILENT_S:.0f} seconds.",
                      remedy="Compute the appearance: that may take as long as it needs.")  # fmt: skip
 
 

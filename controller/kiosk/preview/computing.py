@@ -1,8 +1,8 @@
 """Solves targets for previews: python -m controller.kiosk.preview.computing. Its parent is ``computed``.
 
 The first line of its input is a ``Stage``, each further one a ``Task``, as JSON. To each task it answers with a line:
-the values of a ``Computed`` without its pictures, or an error's code and sentences. It ends when its input ends, also
-in the middle of a solve.
+the values of a ``Computed`` without its pictures, or an error's code and sentences; before that with empty lines, as
+long as it solves. It ends when its input ends, also in the middle of a solve.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TextIO
@@ -37,7 +37,7 @@ from controller.optics.solve.targets.files import load_target
 from controller.optics.solve.targets.values import Target
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.report.pictures import to_screen
-from controller.stage.steps.appearance.solving import options_of, solved_base
+from controller.stage.steps.appearance.solving import options_of
 from hal.runtime.compute import free_bytes
 
 NICENESS: Final = 5
@@ -75,21 +75,18 @@ class Solver:
         self._options = options_of(table)
         self._calibrated = Calibrated(Path(stage.run), stage.names, self._engine)
         check_memory(solve_peak_bytes(stage_size(self._calibrated.calibration)), free_bytes())
-        if self._options.mode == "scale":
-            self._calibrated.keep_base(solved_base(self._calibrated, self._options))
         self._light = self._calibrated.light
 
-    def answer(self, task: Task) -> dict[str, Any]:
+    def answer(self, task: Task, progress: Callable[[int, float], None]) -> dict[str, Any]:
         """Solve a target and draw the result. Raises as ``solve_appearance`` and ``load_target``."""
         began_s = time.perf_counter()
         calibrated = self._calibrated
         calibration = calibrated.calibration
         made = solve_appearance(
             self._light,
-            calibrated.base if self._options.mode == "scale" else None,
             self._target(Path(task.target)),
             self._options,
-            SolveContext(calibrated.engine, folder=calibrated.folder),
+            SolveContext(calibrated.engine, progress, folder=calibrated.folder),
         )
         seen = calibrated.predicted_light(made.frames) + calibration.black
         return {
@@ -161,7 +158,7 @@ def serve(source: TextIO, out: TextIO) -> None:
     for line in lines:
         try:
             solver = solver or Solver(stage)
-            answer = solver.answer(Task(**line))
+            answer = solver.answer(Task(**line), lambda sweep, kkt: print(file=out, flush=True))
         except VelaturaError as error:
             answer = _failed(error)
         except Exception as error:  # noqa: BLE001 - a driver's own errors are not known

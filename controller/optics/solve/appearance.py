@@ -1,4 +1,4 @@
-"""New appearances at interactive speed: base times scale (paper 3, eqs 4-6), and the full solve.
+"""Pictures at interactive speed: base times scale (paper 3, eqs 4-6).
 
 C_t = C_b x C_s for every camera pixel; the base's frames P_b are solved once; each projector pixel's P_s is the mean of
 C_s over its metapixel; then P_t = P_b x P_s. Light is counted above the black image K, and the product is taken in the
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-import cv2
 import numpy as np
 
 from controller.core import channels
@@ -34,17 +33,11 @@ from controller.optics.transport.indirect.indirect_light import ReflectedLight
 from controller.optics.transport.planes import frame_planes, plane_frames, planes_above
 
 BaseKind = Literal["minimum", "white"]
-BaseChoice = Literal["minimum", "white", "high-pass"]
-Mode = Literal["scale", "full"]
 
 FAINTEST_BASE: Final = 1e-2
 """Below this fraction of the mean base light, a pixel is not used in its metapixels' means."""
 HEADROOM: Final = 0.5
 """A white base uses this part of the reachable light, so that scales above 1 are possible."""
-FINE_DETAIL: Final = 0.02
-"""Share of a target's light above one projector's frequency limit from which a full solve is advised."""
-WELL_BELOW: Final = 0.5
-"""Fraction of the frequency limit above which a high-pass base keeps detail, so that the scale has none near it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,18 +85,6 @@ class Base:
         return Base(image, solution, inverse, coverage, mixed)
 
 
-@dataclass(frozen=True, slots=True)
-class Appearance:
-    """Frames (rows, columns, 3) linear in [0, 1], one a projector.
-
-    ``fine_detail``: what a scale loses of the target; ``solution``: of a full solve. The other one is None.
-    """
-
-    frames: tuple[FloatImage, ...]
-    fine_detail: float | None
-    solution: Solution | None
-
-
 def base_image(calibration: Calibration, kind: BaseKind = "white") -> FloatImage:
     """The base image C_b as radiance, (rows, columns, 3); the black image alone outside the object.
 
@@ -137,23 +118,6 @@ def _where_lit(white: FloatImage) -> FloatImage:
     """A white image, infinite where the projector hardly shines."""
     faint = np.float32(1e-3) * white.max(initial=0)
     return np.where(white.max(axis=2, keepdims=True) > faint, white, np.float32(np.inf))
-
-
-def high_pass_base(transport: LightTransport, level: FloatImage, target: FloatImage, black: FloatImage) -> FloatImage:
-    """A base image for one target: ``level`` with the target's detail above one projector's frequency limit.
-
-    The scale image that remains is smooth, so that the product keeps all of the target (paper 3.3, Fig. 12).
-
-    Parameters
-    ----------
-    level : (rows, columns, 3) an even base image (``base_image(calibration, "white")``), with the black image
-    target, black : (rows, columns, 3) radiance
-    """
-    even = np.maximum(level - black, 0)
-    scale = np.divide(np.maximum(target - black, 0), even, out=np.zeros_like(even), where=even > 0)
-    low = _low_pass(transport, scale, (even > 0).astype(np.float32), of_limit=WELL_BELOW)
-    detail = np.divide(scale, low, out=np.zeros_like(scale), where=low > 0)
-    return np.asarray(black + even * detail, np.float32)
 
 
 def solve_base(
@@ -198,66 +162,6 @@ def scale_frames(
     light = planes_above(target, black)
     out = (engine or Processor()).scaled(transport, light, base.inverse, base.mixed, base.coverage)
     return plane_frames(out, transport.sizes)
-
-
-def fine_detail(transport: LightTransport, base: Base, target: FloatImage, black: FloatImage) -> float:
-    """Share of the target's light (rms) that the scale image would need above one projector's frequency limit F.
-
-    F is half a cycle a projector pixel, whose pitch in the camera is the root of camera pixels by projector pixels.
-    """
-    mask = transport.object_mask
-    whole = fine = 0.0
-    for channel, inverse in enumerate(base.inverse):
-        light = np.maximum(target[..., channel] - black[..., channel], 0)
-        scale = light * inverse
-        left = scale - _low_pass(transport, scale, (inverse > 0).astype(np.float32))
-        np.divide(left, inverse, out=left, where=inverse > 0)
-        whole += float((light[mask].astype(np.float64) ** 2).sum())
-        fine += float((left[mask & (inverse > 0)].astype(np.float64) ** 2).sum())
-    return float(np.sqrt(fine / whole)) if whole > 0 else 0.0
-
-
-def _low_pass(
-    transport: LightTransport, image: FloatImage, present: FloatImage, *, of_limit: float = 1.0
-) -> FloatImage:
-    """The image, (rows, columns) or with channels, below that part of the coarsest projector's frequency limit."""
-    pitch = max((_pitch(transport, n) for n in range(len(transport.sizes))), default=1.0)
-    # A Gaussian that halves the amplitude at F: exp(-2 (pi sigma F)^2) = 1/2 with F = 1 / (2 pitch).
-    sigma = pitch * float(np.sqrt(2 * np.log(2))) / np.pi / of_limit
-    blurred, weight = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image, present))
-    return np.divide(blurred, weight, out=np.zeros_like(blurred), where=weight > 0)
-
-
-def _pitch(transport: LightTransport, n: int) -> float:
-    pixels = int((transport.per_weight[transport.span(n)] > 0).sum())
-    return float(np.sqrt(transport.lit[n].sum() / pixels)) if pixels else 0.0
-
-
-def make_appearance(
-    light: StageLight,
-    base: Base | None,
-    target: FloatImage,
-    settings: SolveSettings = DEFAULT_SETTINGS,
-    context: SolveContext = ALONE,
-    *,
-    mode: Mode = "full",
-) -> Appearance:
-    """Frames for a target radiance: by a full solve, or by base and scale.
-
-    ``target`` (rows, columns, 3): to be made by direct light, black image included; ``settings`` are of a full solve
-
-    A full solve starts from the target alone (``initial_estimate``): fewer sweeps than from base x scale (decision 8).
-    """
-    transport, black = light.transport, light.black
-    check_target(transport.camera_shape, target)
-    if mode == "scale":
-        assert base is not None, "a scale needs a base"
-        scaled = scale_frames(transport, base, target, black, engine=context.engine)
-        if settings.correction is not None:
-            scaled = scale_frames(transport, base, settings.correction(scaled), black, engine=context.engine)
-        return Appearance(tuple(scaled), fine_detail(transport, base, target, black), None)
-    solution = solve_bounded(transport, target, black, settings, context)
-    return Appearance(solution.frames, None, solution)
 
 
 def traditional_compensation(calibration: Calibration, target: FloatImage, n: int) -> list[FloatImage]:

@@ -19,19 +19,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from controller.core.arrays import FloatImage, Mask, moved_to_file
-from controller.optics.solve.appearance import (
-    FINE_DETAIL,
-    Appearance,
-    Base,
-    BaseChoice,
-    Mode,
-    StageLight,
-    high_pass_base,
-    make_appearance,
-    solve_base,
-)
+from controller.optics.solve.appearance import BaseKind, StageLight
 from controller.optics.solve.bounded.engine import ALONE, SolveContext
-from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, SolveSettings, appearance_weights
+from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, Solution, SolveSettings, appearance_weights
+from controller.optics.solve.bounded.solver import solve_bounded
 from controller.optics.solve.reach.adaptation import adapted_target
 from controller.optics.solve.reach.drive_levels import DriveLevels
 from controller.optics.solve.reach.feasibility import (
@@ -44,11 +35,6 @@ from controller.optics.solve.reach.feasibility import (
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport
 from controller.optics.transport.indirect.indirect_light import ReflectedLight
-
-ADVICE_FULL_SOLVE = (
-    'The target has finer detail than one projector can scale. To keep it, use mode "full" or base "high-pass".'
-)
-
 
 ADAPTATIONS: Final = 2
 """An adapted target throws back other light than was asked for, and so needs another floor."""
@@ -67,7 +53,7 @@ WIDEST: Final = 0.15
 class SolveOptions:
     """``share`` of the object's pixels that each target's exposure makes reachable; ``smoothness`` of eq. 3.
 
-    ``base``: the base image; with "high-pass" each appearance solves one of its own
+    ``base``: the base image, with which live targets are made
     ``adapt``: how far targets are bent into what the stage can make, from 0 (cut off) to 1
     ``exposure``: instead of that by ``share``, where a target asks for one
     ``unseen``: what projector pixels show that no camera sees, see ``continued``
@@ -75,15 +61,15 @@ class SolveOptions:
 
     share: float
     smoothness: float
-    mode: Mode = "full"
-    base: BaseChoice = "white"
+    base: BaseKind = "white"
     adapt: float = 0.0
     exposure: float | None = None
     unseen: Unseen = "black"
 
     def inputs(self) -> dict[str, str]:
         """What an appearance depends on, as the journal compares it."""
-        inputs = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": self.mode, "base": self.base}
+        # the last two had other values once: what was solved since then stays valid
+        inputs = {"share": repr(self.share), "smoothness": repr(self.smoothness), "mode": "full", "base": "white"}
         if self.adapt != 0:
             inputs["adapt"] = repr(self.adapt)
         if self.unseen != "black":
@@ -91,9 +77,8 @@ class SolveOptions:
         return inputs
 
     def base_inputs(self) -> dict[str, str]:
-        """The inputs of the base image; the mode and brightness of appearances are not among them."""
-        shared = "white" if self.base == "high-pass" else self.base
-        return {"smoothness": repr(self.smoothness), "base": shared}
+        """The inputs of the base image; the brightness of appearances is not among them."""
+        return {"smoothness": repr(self.smoothness), "base": self.base}
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +90,8 @@ class AppearanceResult:
     ``reachable`` (rows, columns) bool: valid pixels of the picture where ``target`` is reachable
     ``asked`` (rows, columns, 3) float32: radiance that was asked for, before any adaptation
     ``asked_reachable``, ``valid`` (rows, columns) bool: where that is reachable; where the picture says something
-    ``figures``: mode, exposure, held_back (of ``ExposedTarget``), seconds, reachable_share, fine_detail, advice,
-        iterations, kkt; with adaptation also adapted_share, that of the pixels where ``target`` is reachable
+    ``figures``: exposure, held_back (of ``ExposedTarget``), seconds, reachable_share, iterations, kkt; with
+        adaptation also adapted_share, that of the pixels where ``target`` is reachable
     """
 
     frames: tuple[FloatImage, ...]
@@ -119,11 +104,9 @@ class AppearanceResult:
 
 
 def solve_appearance(
-    light: StageLight, base: Base | None, requested: Target, options: SolveOptions, context: SolveContext = ALONE
+    light: StageLight, requested: Target, options: SolveOptions, context: SolveContext = ALONE
 ) -> AppearanceResult:
     """Make an appearance of the picture ``requested``, reflectance-like, as seen from the camera.
-
-    ``base``: only of use in the mode "scale"
 
     With ``light.indirect`` the frames leave room in the target for the light by way of other surfaces.
     Raises what ``exposures`` and ``solve_bounded`` raise.
@@ -133,14 +116,11 @@ def solve_appearance(
     valid = requested.mask
     del requested  # the picture is large, and of no more use
     began_s = time.perf_counter()
-    made = _solved(light, base, aim, options, context)
+    made = _solved(light, aim, options, context)
     figures = aim.figures | {
-        "mode": options.mode,
         "seconds": time.perf_counter() - began_s,
-        "fine_detail": made.fine_detail,
-        "advice": None if (made.fine_detail or 0) < FINE_DETAIL else ADVICE_FULL_SOLVE,
-        "iterations": 0 if made.solution is None else made.solution.iterations,
-        "kkt": None if made.solution is None else made.solution.kkt,
+        "iterations": made.iterations,
+        "kkt": made.kkt,
     }
     frames = made.frames if options.unseen == "black" else continued(light.transport, made.frames)
     reachable, asked_reachable = (part.reachable & valid for part in (aim.possible, aim.asked_possible))
@@ -276,7 +256,7 @@ def aim_at(
     return Aim(wanted, direct, possible, asked, asked_possible, exposure, figures)
 
 
-def _solved(light: StageLight, base: Base | None, aim: Aim, options: SolveOptions, context: SolveContext) -> Appearance:
+def _solved(light: StageLight, aim: Aim, options: SolveOptions, context: SolveContext) -> Solution:
     """Frames for an aim; its direct light is corrected once for what the frames' own light throws back."""
     black, reflected = light.black, light.indirect
     weights = appearance_weights(target_radiance(aim.wanted, black, 1.0), aim.possible.reachable, aim.exposure)
@@ -288,7 +268,4 @@ def _solved(light: StageLight, base: Base | None, aim: Aim, options: SolveOption
 
     correction = None if reflected is None else left
     settings = SolveSettings(options.smoothness, weights, tolerance=APPEARANCE_TOLERANCE, correction=correction)
-    if base is not None and options.base == "high-pass" and options.mode == "scale":
-        image = high_pass_base(light.transport, base.image, aim.direct, black)
-        base = solve_base(light.transport, image, black, SolveSettings(options.smoothness), context)
-    return make_appearance(light, base, aim.direct, settings, context, mode=options.mode)
+    return solve_bounded(light.transport, aim.direct, black, settings, context)

@@ -148,7 +148,6 @@ def _figures(
 def _appearance_figures(appearance: AppearanceComparison) -> dict[str, Any]:
     return {
         "name": appearance.name,
-        "mode": appearance.solved.figures["mode"],
         "seconds": appearance.solved.figures["seconds"],
         "delta_e00_median": appearance.ours.delta_e00_median,
         "delta_e00_p95": appearance.ours.delta_e00_p95,
@@ -214,10 +213,7 @@ def _row(appearance: AppearanceComparison, before: Any, calibration: Calibration
         figures=(
             *judged_rows(appearance.judged),
             *as_rows(appearance.alone, appearance.ours),
-            (
-                "solved",
-                f"{appearance.solved.figures['mode']}, {float(str(appearance.solved.figures['seconds'])):.2f} s",
-            ),
+            ("solved", f"{float(str(appearance.solved.figures['seconds'])):.2f} s"),
             *refined_row(appearance.solved.figures.get("refined")),
         ),
         pictures=(

@@ -44,7 +44,7 @@ from controller.stage.steps import costs
 from controller.stage.steps.appearance.cluster_solve import answering_on
 from controller.stage.steps.appearance.publishing import BundleTarget, publish_step
 from controller.stage.steps.appearance.requests import requests_of, scene_request
-from controller.stage.steps.appearance.solving import base_choice, options_of, solve_steps
+from controller.stage.steps.appearance.solving import options_of, solve_steps
 from controller.stage.steps.calibrate.dots import dot_steps
 from controller.stage.steps.calibrate.drift import changed_lamps, swapped_views
 from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
@@ -199,7 +199,6 @@ class AppearanceOrder:
     ----------
     names : of stage.toml; none: all, unless there are scenes
     scenes : Blender scenes to render in addition to ``names``, or only these if no names are given
-    base : the base image instead of stage.toml's
     refinement : how photographs then correct them; None keeps refined frames
     device : what solves, instead of stage.toml's
     scheduler : a Dask cluster that solves the appearances; None: that of the stage's house, if it has workers now
@@ -208,7 +207,6 @@ class AppearanceOrder:
 
     names: Sequence[str] = ()
     scenes: Sequence[str] = ()
-    base: str | None = None
     refinement: Refinement | None = None
     device: str | None = None
     scheduler: str | None = None
@@ -223,7 +221,6 @@ def make_appearances(
     Without a refinement it uses no device: the projectors may be off, or playing.
     Raises what ``choose_engine``, ``usable_calibration``, ``requests_of``, ``answering_on`` and the steps raise.
     """
-    chosen = None if order.base is None else base_choice(order.base)
     checked = check_stage(session.stage)
     folder = checked.stage.folder
     solve = checked.stage.tables.solve
@@ -233,7 +230,6 @@ def make_appearances(
         calibrated = all_views(run, checked.names, engine)
         requests = requests_of(checked.stage, calibrated, order.names) if order.names or not order.scenes else []
         requests += [scene_request(calibrated, scene, folder=Path.cwd()) for scene in order.scenes]
-        options = options_of(solve) if chosen is None else replace(options_of(solve), base=chosen)
         scale = costs.scale(size for _, size in output_sizes(checked).values())
         with (
             kernels_compiled(reporter) as compiled,
@@ -244,7 +240,7 @@ def make_appearances(
                 *compiled,
                 *([] if is_graded(run) else [verify_step(calibrated.first, (), scale)]),
                 gate_step(worst_grade(checked), accepted=order.accept_grade, reporter=reporter),
-                *solve_steps(calibrated, requests, options, (), scale, answering=answering),
+                *solve_steps(calibrated, requests, options_of(solve), (), scale, answering=answering),
             ]
             names = [request.name for request in requests]
             publish = publishing(checked, calibrated.first, names)

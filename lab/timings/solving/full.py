@@ -133,7 +133,8 @@ def _answers(run: Path, names: list[str], target: Path) -> Iterator[float]:
         for _ in range(UPLOADS):
             began_s = time.perf_counter()
             print(json.dumps(task), file=process.stdin, flush=True)
-            answer: dict[str, Any] = json.loads(process.stdout.readline())
+            line = next(line for line in process.stdout if not line.isspace())
+            answer: dict[str, Any] = json.loads(line)
             assert "error" not in answer, answer
             yield time.perf_counter() - began_s
         process.stdin.close()

@@ -37,7 +37,7 @@ from lab.timings.tools.synthetic import PROJECTOR, write_synthetic_run
 
 SIZES: Final = tuple(PROJECTOR)
 GOAL: Final = 240.0
-OPTIONS: Final = SolveOptions(share=0.9, smoothness=1e-3, mode="full", adapt=1.0)
+OPTIONS: Final = SolveOptions(share=0.9, smoothness=1e-3, adapt=1.0)
 WATCHED_EVERY_S: Final = 0.002
 _PROCESS: Final = re.compile(r"^(RssAnon|RssFile|RssShmem):\s+(\d+)", re.MULTILINE)
 
@@ -126,7 +126,7 @@ def one_run(run: Path, names: list[str]) -> dict[str, Any]:
     made = step(
         "appearance",
         lambda: solve_appearance(
-            StageLight(transport, black), base, _target(black), OPTIONS, context=SolveContext(folder=run)
+            StageLight(transport, black), _target(black), OPTIONS, context=SolveContext(folder=run)
         ),
     )
     watch.end()
@@ -165,8 +165,8 @@ def _warm() -> None:
         names = write_synthetic_run(Path(folder), projector=(34, 44), camera=(82, 122))
         calibration = read_calibration(Path(folder), names)
         transport, image = build_transport(calibration), base_image(calibration, "white")
-        base = prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
-        solve_appearance(StageLight(transport, calibration.black), base, _target(calibration.black), OPTIONS)
+        prepare_base(transport, image, calibration.black, solve_bounded(transport, image, calibration.black))
+        solve_appearance(StageLight(transport, calibration.black), _target(calibration.black), OPTIONS)
         np.percentile(image, 50)
 
 

@@ -154,7 +154,7 @@ def _whole(transport: LightTransport, calibration: Calibration, reflectance: Flo
         aim_at(drive, light.black, indirect, target.image, options)
         aims.append(time.process_time() - began)
         began, sweeps[:] = time.process_time(), [0]
-        solve_appearance(light, None, target, options, context)
+        solve_appearance(light, target, options, context)
         spent.append(time.process_time() - began)
     whole, aim = min(spent), min(aims)
     how = f"{len(sweeps) - 1} sweeps of two solves; the least of {len(spent)}"

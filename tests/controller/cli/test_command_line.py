@@ -55,7 +55,7 @@ def test_every_command_has_json_as_its_last_option_before_help(root: Any) -> Non
 
 
 def test_options_with_choices_list_them(root: Any) -> None:
-    named = {"mode", "photographs", "base", "device", "size", "room", "kind", "level", "fit", "role"}
+    named = {"mode", "photographs", "device", "size", "room", "kind", "level", "fit", "role"}
     for words, command in commands(root):
         context = command.context_class(command)
         for option in command.params:

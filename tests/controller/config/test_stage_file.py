@@ -103,7 +103,7 @@ WRONG = {
     "misspelt key": (swapped("width_px", "width"), "stage-key-unknown", 28, "mean 'width_px'", "height_px"),
     "table for a list": (ONE_OUTPUT_TABLE, "stage-key-type", 26, "outputs", "[[display.outputs]]"),
     "value for a table": (CAMERA_IS_A_NUMBER, "stage-key-type", 1, "camera", "the table [camera]"),
-    "wrong choice": (STAGE + '[solve]\nmode = "best"\n', "stage-key-value", 35, "mode", '"full"'),
+    "wrong choice": (STAGE + '[solve]\nbase = "best"\n', "stage-key-value", 35, "base", '"white"'),
     "wrong flag": (STAGE + "[bundle]\nallow_unsigned = 1\n", "stage-key-type", 35, "allow_unsigned", "true or false"),
     "wrong item of a list": (STAGE + '[bundle]\ntrusted_keys = ["aa"]\n', "stage-key-value", 35, "trusted_keys", "64"),
     "short point": (STAGE + SHORT_POINT, "stage-key-value", 35, "from_px", "[x, y]"),

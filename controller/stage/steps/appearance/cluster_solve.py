@@ -63,8 +63,7 @@ def _answer_spread(
 
 
 def _stage_data(calibrated: Calibrated) -> StageData:
-    base, black = calibrated.base, calibrated.calibration.black
-    return StageData(calibrated.transport, base.image, base.solution, black, calibrated.reflected)
+    return StageData(calibrated.transport, calibrated.calibration.black, calibrated.reflected)
 
 
 _LOST: Final = ("no-workers", "workers-lost")

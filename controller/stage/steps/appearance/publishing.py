@@ -36,7 +36,7 @@ from controller.stage.artefacts.published import BUNDLE, BundleFigures, read_thu
 from controller.stage.artefacts.solved import is_solved, read_solved
 from hal.notices import Level
 
-METADATA = ("title", "mode", "exposure", "reachable_share")
+METADATA = ("title", "exposure", "reachable_share")
 """Figures of the solve that a bundle contains; all are the same in a repeated solve."""
 SHOWN_MS = (15_000, 1_000)
 """Show and fade times in the bundle's playlist for appearances without times in stage.toml."""

@@ -7,15 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final
 
 from controller.config.models import SolveTable
 from controller.core.arrays import ByteImage, FloatImage
-from controller.core.errors import UsageError
 from controller.core.storage import sha256_of
 from controller.optics.calibrate.values import Calibration
 from controller.optics.capture.patterns import Pattern, PatternKind, plan_patterns
-from controller.optics.solve.appearance import Base, BaseChoice, base_image, solve_base
+from controller.optics.solve.appearance import Base, base_image, solve_base
 from controller.optics.solve.bounded.engine import SolveContext
 from controller.optics.solve.bounded.equations import SolveSettings
 from controller.optics.solve.memory_need import check_memory, solve_peak_bytes, stage_size
@@ -43,9 +42,7 @@ MOSTLY: Final = 0.5
 
 def options_of(table: SolveTable) -> SolveOptions:
     """How appearances are solved by [solve] of stage.toml, wherever they are."""
-    return SolveOptions(
-        table.exposure_share, table.smoothness, table.mode, table.base, table.adapt, unseen=table.unseen
-    )
+    return SolveOptions(table.exposure_share, table.smoothness, table.base, table.adapt, unseen=table.unseen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +62,6 @@ class AppearanceRequest:
     prepare_s: float = 0.0
     preparing: str = "Rendering"
     sheet: SheetOf | None = None
-
-
-def base_choice(name: str) -> BaseChoice:
-    """The base image with this name. Raises UsageError("base-unknown")."""
-    known: tuple[BaseChoice, ...] = get_args(BaseChoice)
-    for choice in known:
-        if choice == name:
-            return choice
-    raise UsageError(
-        "base-unknown", what=f"The base image {name} is unknown.", remedy=f"Choose one of {', '.join(known)}."
-    )
 
 
 def solve_steps(
@@ -158,7 +144,7 @@ def solved_base(
 ) -> Base:
     """The base image for these options. Raises as ``solve_bounded``."""
     black = calibrated.calibration.black
-    image = base_image(calibrated.calibration, "white" if options.base == "high-pass" else options.base)
+    image = base_image(calibrated.calibration, options.base)
     settings, context = SolveSettings(options.smoothness), SolveContext(calibrated.engine, progress)
     return solve_base(calibrated.transport, image, black, settings, context)
 
@@ -181,8 +167,7 @@ def answer_here(
 ) -> AppearanceResult:
     """An ``Answering`` by this computer."""
     solving = SolveContext(calibrated.engine, _watched(context), folder=calibrated.folder)
-    base = calibrated.base if options.mode == "scale" else None
-    return solve_appearance(calibrated.light, base, request.target(), options, solving)
+    return solve_appearance(calibrated.light, request.target(), options, solving)
 
 
 def _solve_appearance(
@@ -196,8 +181,6 @@ def _solve_appearance(
     made = (answering or partial(answer_here, calibrated))(request, options, context)
     if request.sheet is not None and options.unseen == "smooth":
         made = replace(made, frames=continued(calibrated.transport, made.frames, request.sheet))
-    if made.figures["advice"] is not None:
-        context.reporter.say(f"{request.title}: {made.figures['advice']}", Level.WARNING)
     for line in _limits(request.title, made.figures, options.share):
         context.reporter.say(line, Level.WARNING)
     differs = calibrated.differences(made.target, made.valid, float(str(made.figures["exposure"])))

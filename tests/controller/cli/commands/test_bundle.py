@@ -81,7 +81,7 @@ def stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     for name in ("gold", "old"):
         target, reachable = np.zeros((2, 2, 3), np.float32), np.ones((2, 2), np.bool_)
         linear = {projector: (frame / 255).astype(np.float32) for projector, frame in FRAMES.items()}
-        figures: dict[str, object] = {"name": name, "mode": "full", "exposure": 2.0, "title": name}
+        figures: dict[str, object] = {"name": name, "exposure": 2.0, "title": name}
         Solved(FRAMES, linear, target, reachable, figures).write(run, name)
     return folder
 
@@ -240,7 +240,7 @@ def test_a_bundle_is_looked_at_compared_signed_and_exported(
     one, other = stage / "bundle.vel", stage / "other.vel"
     told(capsys, "bundle", "build", stage)
     told(capsys, "bundle", "build", stage, "old", "--out", other)
-    assert told(capsys, "bundle", "inspect", one)["appearances"][0]["metadata"]["mode"] == "full"
+    assert told(capsys, "bundle", "inspect", one)["appearances"][0]["metadata"]["exposure"] == 2.0
     assert told(capsys, "bundle", "diff", one, one)["same"] is True
     assert told(capsys, "bundle", "diff", one, other)["appearances"]["added"] == ["old"]
     public = generate_key(tmp_path / "k")

@@ -25,7 +25,7 @@ from controller.stage.link.membership import Authority, Membership, join, reques
 from controller.stage.link.peers import keep_peer, peer, scheduler_at, tls_files
 from controller.stage.steps.appearance.cluster_solve import answering_on
 from controller.stage.steps.appearance.solving import AppearanceRequest
-from tests.controller.stage.cluster.test_cluster import CALIBRATION, OPTIONS, assert_same, here, picture, solved
+from tests.controller.stage.cluster.test_cluster import CALIBRATION, OPTIONS, assert_same, here, picture, transport
 from tests.ports import free_port
 from tests.waiting import wait_for
 
@@ -87,9 +87,8 @@ def solved_until_it_opens(stage: Path, knight: Path, cluster: Cluster, monkeypat
     """An appearance of the stage without a scheduler, before its worker is ended and after."""
     monkeypatch.setattr(peers, "runtime_path", lambda stage: stage)
     shutil.copytree(knight / "peer", peers.peer_folder(stage) / "peer")
-    transport, base = solved()
-    light = StageLight(transport, CALIBRATION.black)
-    calibrated: Any = SimpleNamespace(engine=Processor(), transport=transport, base=base, calibration=CALIBRATION,
+    light = StageLight(transport(), CALIBRATION.black)
+    calibrated: Any = SimpleNamespace(engine=Processor(), transport=transport(), calibration=CALIBRATION,
                                       reflected=None, light=light, folder=stage)  # fmt: skip
     said: list[str] = []
     context: Any = SimpleNamespace(advance=lambda done, note: said.append(note), check=lambda: None,

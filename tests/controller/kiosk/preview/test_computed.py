@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from controller.core.errors import VelaturaError
+from controller.kiosk.preview import computed
 from controller.kiosk.preview.computed import ComputedPreviews
 from controller.stage.sessions.check import check_stage
 from tests.controller.kiosk.vase import TEXT, graded_run, vase
@@ -59,3 +61,25 @@ def test_the_process_that_has_begun_to_read_answers(tmp_path: Path, monkeypatch:
     finally:
         previews.end()
     assert begun[0].returncode is not None
+
+
+@pytest.mark.parametrize(("does", "code"), [("print(flush=True)", "array-file-unreadable"), ("pass", "preview-slow")])
+def test_a_solve_may_take_long_but_not_without_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str, code: str
+) -> None:
+    """Another program in its place: for 4.5 s, in which it says that it continues, or nothing."""
+    error = {"error": {"usage": False, "code": "array-file-unreadable", "what": "No.", "remedy": "Look."}}
+    program = tmp_path / "python"
+    program.write_text(
+        f"#!{sys.executable}\nimport json, time\ninput(), input(), print(flush=True)\n"
+        f"for _ in range(15):\n    time.sleep(0.3)\n    {does}\nprint(json.dumps({error}))\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(computed, "SILENT_S", 3.0)
+    stage = a_stage(tmp_path / "stage", "cpu")
+    previews = ComputedPreviews()
+    with pytest.raises(VelaturaError) as caught:
+        previews.of(check_stage(stage), stage / "target.png")
+    assert caught.value.code == code
+    previews.end()

@@ -80,17 +80,13 @@ def _indirect(calibration: Calibration, *, has_paint: bool, has_spread: bool) ->
 def _appearance_bytes(calibration: Calibration, know: Callable[[], IndirectLight | None], folder: Path) -> int:
     def solve() -> None:
         transport = build_transport(calibration)
-        base = solve_base(transport, base_image(calibration), calibration.black, SolveSettings(tolerance=0.1)).in_files(
-            folder
-        )
         indirect = know()
         tracemalloc.reset_peak()
         shape = calibration.black.shape
         solve_appearance(
             StageLight(transport, calibration.black, None if indirect is None else indirect.in_files(folder)),
-            base,
             Target(np.random.default_rng(1).random(shape, np.float32), np.ones(shape[:2], np.bool_)),
-            SolveOptions(share=0.9, smoothness=1e-3, mode="full", adapt=1.0),
+            SolveOptions(share=0.9, smoothness=1e-3, adapt=1.0),
             context=SolveContext(folder=folder),
         )
 

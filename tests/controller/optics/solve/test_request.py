@@ -1,4 +1,4 @@
-"""An appearance from picture to frames: what is reported of it, and what is advised."""
+"""An appearance from picture to frames, and what is reported of it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from controller.core.arrays import FloatImage, Mask
 from controller.optics.solve import request
-from controller.optics.solve.appearance import Base, Mode, StageLight, base_image, solve_base
+from controller.optics.solve.appearance import StageLight
 from controller.optics.solve.bounded.engine import ALONE, IterationControl, Processor, SolveContext, corrected
 from controller.optics.solve.bounded.equations import APPEARANCE_TOLERANCE, Solution, SolveInput, SolveSettings
 from controller.optics.solve.request import SolveOptions, continued, solve_appearance
@@ -29,11 +29,6 @@ def transport() -> LightTransport:
     return build_transport(STAGE)
 
 
-@pytest.fixture(scope="module")
-def base(transport: LightTransport) -> Base:
-    return solve_base(transport, base_image(STAGE), STAGE.black, SolveSettings(smoothness=OPTIONS.smoothness))
-
-
 def picture(pitch_px: float) -> Target:
     y, x = np.mgrid[0:120, 0:160].astype(np.float32)
     wave: FloatImage = 0.5 + 0.3 * np.sin(2 * np.pi * x / pitch_px) * np.sin(2 * np.pi * y / pitch_px)
@@ -42,31 +37,15 @@ def picture(pitch_px: float) -> Target:
     return Target(np.repeat(wave[..., None], 3, axis=2).astype(np.float32), mask)
 
 
-@pytest.mark.parametrize(
-    ("pitch_px", "mode", "advised"),
-    [
-        (5, "full", False),
-        (5, "scale", True),
-        (40, "scale", False),
-    ],
-)
-def test_a_full_solve_is_advised_where_a_scale_loses_fine_detail(
-    transport: LightTransport, base: Base, pitch_px: float, mode: Mode, advised: bool
-) -> None:
-    found = solve_appearance(StageLight(transport, STAGE.black), base, picture(pitch_px), replace(OPTIONS, mode=mode))
-    assert found.figures["mode"] == mode
-    assert (found.figures["advice"] is not None) is advised
-
-
 def test_an_appearance_ends_where_no_one_would_see_more_sweeps(
-    transport: LightTransport, base: Base, monkeypatch: pytest.MonkeyPatch
+    transport: LightTransport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a target with fine detail and parts out of reach; the judge is a solve to the end."""
-    options = replace(OPTIONS, share=0.7, mode="full")
+    options = replace(OPTIONS, share=0.7)
     seen = {}
     for tolerance in (APPEARANCE_TOLERANCE, 1e-6):
         monkeypatch.setattr(request, "APPEARANCE_TOLERANCE", tolerance)
-        found = solve_appearance(StageLight(transport, STAGE.black), base, picture(7), options)
+        found = solve_appearance(StageLight(transport, STAGE.black), picture(7), options)
         light, mask = transport.forward(found.frames) + STAGE.black, transport.object_mask
         white = float(found.figures["exposure"] or 0)
         apart = colour_difference(light, found.target, STAGE.camera_to_xyz, white, mask)[mask]
@@ -77,19 +56,19 @@ def test_an_appearance_ends_where_no_one_would_see_more_sweeps(
     assert few < many / 2
 
 
-def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport, base: Base) -> None:
-    found = solve_appearance(StageLight(transport, STAGE.black), base, picture(40), OPTIONS)
+def test_reachable_pixels_are_those_where_the_target_says_something(transport: LightTransport) -> None:
+    found = solve_appearance(StageLight(transport, STAGE.black), picture(40), OPTIONS)
     assert not found.reachable[:10].any()
     assert found.reachable[10:].mean() > 0.85
 
 
-def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport, base: Base) -> None:
+def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transport: LightTransport) -> None:
     options = replace(OPTIONS, adapt=1.0)
     asked = picture(60)
     asked = replace(asked, image=asked.image**4)
     light = StageLight(transport, np.asarray(STAGE.black + 0.1 * np.median(transport.reach()), np.float32))
-    found = solve_appearance(light, base, asked, options)
-    plain = solve_appearance(light, base, asked, replace(options, adapt=0.0))
+    found = solve_appearance(light, asked, options)
+    plain = solve_appearance(light, asked, replace(options, adapt=0.0))
     values = {key: value for key, value in found.figures.items() if isinstance(value, float)}
     assert values["reachable_share"] < 0.7 < 0.8 < values["adapted_share"]
     np.testing.assert_allclose(found.asked, plain.target)
@@ -98,14 +77,14 @@ def test_adaptation_brings_more_into_reach_and_keeps_what_was_asked_for(transpor
     assert found.reachable.sum() > found.asked_reachable.sum()
     assert not found.valid[:10].any()
     assert OPTIONS.inputs() != options.inputs()
-    assert "adapt" not in OPTIONS.inputs(), "results of stages that do not adapt stay valid"
+    former = {"share": "0.9", "smoothness": "0.001", "mode": "full", "base": "white"}
+    assert OPTIONS.inputs() == former, "what was solved by an older version stays valid"
 
 
 def test_the_base_is_not_solved_again_for_another_way_of_using_it() -> None:
-    quick = replace(OPTIONS, mode="scale", share=0.5, adapt=1.0)
+    quick = replace(OPTIONS, share=0.5, adapt=1.0)
     assert quick.inputs() != OPTIONS.inputs()
     assert quick.base_inputs() == OPTIONS.base_inputs()
-    assert replace(OPTIONS, base="high-pass").base_inputs() == OPTIONS.base_inputs()
     assert replace(OPTIONS, base="minimum").base_inputs() != OPTIONS.base_inputs()
     assert replace(OPTIONS, smoothness=0.5).base_inputs() != OPTIONS.base_inputs()
 
@@ -122,14 +101,13 @@ def thrown_back(*, near: float, strength: float, side: int = 8) -> IndirectLight
     return IndirectLight(factors.astype(np.float32), paint, np.ones((120, 160), np.bool_), grid, side)
 
 
-@pytest.mark.parametrize("mode", ["scale", "full"])
-def test_indirect_light_is_left_room_for(transport: LightTransport, base: Base, mode: Mode) -> None:
+def test_indirect_light_is_left_room_for(transport: LightTransport) -> None:
     """What surfaces throw back differs somewhat from what is known of it."""
     truth, known = thrown_back(near=0.7, strength=0.4), thrown_back(near=0.5, strength=0.4)
     wave = picture(60)
     errors = {}
     for name, indirect in (("none", None), ("known", known), ("truth", truth)):
-        found = solve_appearance(StageLight(transport, STAGE.black, indirect), base, wave, replace(OPTIONS, mode=mode))
+        found = solve_appearance(StageLight(transport, STAGE.black, indirect), wave, OPTIONS)
         direct = transport.forward(found.frames)
         seen = STAGE.black + direct + truth.forward(direct)
         there = found.reachable & transport.object_mask
@@ -145,42 +123,42 @@ class Again(Processor):
         return super().solve(corrected(Processor(), given, control), control)
 
 
-def test_a_target_that_is_corrected_keeps_the_equations(transport: LightTransport, base: Base) -> None:
+def test_a_target_that_is_corrected_keeps_the_equations(transport: LightTransport) -> None:
     light, target = StageLight(transport, STAGE.black, thrown_back(near=0.5, strength=0.4)), picture(20)
     seen = []
     for engine in (Processor(), Again()):
-        found = solve_appearance(light, base, target, replace(OPTIONS, share=0.6), SolveContext(engine))
+        found = solve_appearance(light, target, replace(OPTIONS, share=0.6), SolveContext(engine))
         seen.append(transport.forward(found.frames) / np.float32(found.figures["exposure"] or 0))
     np.testing.assert_allclose(seen[0], seen[1], atol=0.01)
 
 
-def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightTransport, base: Base) -> None:
+def test_too_dark_is_what_gets_more_indirect_light_than_wanted(transport: LightTransport) -> None:
     target = picture(60)
     target.image[40:80, 60:100] = 0.01
     indirect = thrown_back(near=0.3, strength=0.5)
     with_it, without = (
-        solve_appearance(StageLight(transport, STAGE.black, one), base, target, OPTIONS) for one in (indirect, None)
+        solve_appearance(StageLight(transport, STAGE.black, one), target, OPTIONS) for one in (indirect, None)
     )
     assert without.reachable[45:75, 65:95].mean() > 0.9
     assert with_it.reachable[45:75, 65:95].mean() < 0.1
     assert with_it.reachable[85:].mean() > 0.8
 
 
-def test_the_brightest_target_counts_on_indirect_light(transport: LightTransport, base: Base) -> None:
+def test_the_brightest_target_counts_on_indirect_light(transport: LightTransport) -> None:
     """With a fifth more light on everything, targets may be about so much brighter."""
     even = thrown_back(near=0.0, strength=0.4)
     with_it, without = (
-        solve_appearance(StageLight(transport, STAGE.black, one), base, picture(40), OPTIONS) for one in (even, None)
+        solve_appearance(StageLight(transport, STAGE.black, one), picture(40), OPTIONS) for one in (even, None)
     )
     ratio = float(with_it.figures["exposure"] or 0) / float(without.figures["exposure"] or 1)
     assert 1.02 < ratio < 1.4
 
 
 @pytest.mark.parametrize("adapt", [0.0, 1.0])
-def test_the_whole_picture_is_told_as_the_target(transport: LightTransport, base: Base, adapt: float) -> None:
+def test_the_whole_picture_is_told_as_the_target(transport: LightTransport, adapt: float) -> None:
     indirect = thrown_back(near=0.5, strength=0.4)
-    options = replace(OPTIONS, adapt=adapt, mode="full")
-    found = solve_appearance(StageLight(transport, STAGE.black, indirect), base, picture(40), options)
+    options = replace(OPTIONS, adapt=adapt)
+    found = solve_appearance(StageLight(transport, STAGE.black, indirect), picture(40), options)
     direct = transport.forward(found.frames)
     seen = STAGE.black + direct + indirect.forward(direct)
     there = found.reachable & transport.object_mask
@@ -198,8 +176,7 @@ def test_what_no_camera_sees_continues_what_is_seen_beside_it() -> None:
     ]
     light = StageLight(build_transport(replace(STAGE, projectors=tuple(parts))), STAGE.black)
     smooth, black = (
-        solve_appearance(light, None, picture(40), replace(OPTIONS, unseen=unseen)).frames
-        for unseen in ("smooth", "black")
+        solve_appearance(light, picture(40), replace(OPTIONS, unseen=unseen)).frames for unseen in ("smooth", "black")
     )
     for n, (one, other) in enumerate(zip(smooth, black, strict=True)):
         assert not other[gap].any()

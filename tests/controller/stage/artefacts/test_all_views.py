@@ -110,7 +110,7 @@ def test_one_solve_is_right_from_both_sides_and_each_view_has_its_results(tmp_pa
 
     with Journal(tmp_path) as journal:
         steps = solve_steps(calibrated, [AppearanceRequest("look", "Look", target, {})],
-                            SolveOptions(0.9, 0.001, "full"), ())  # fmt: skip
+                            SolveOptions(0.9, 0.001), ())  # fmt: skip
         Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
     for folder, camera in zip((tmp_path, view_folder(tmp_path, "right")), CAMERAS.values(), strict=True):
         solved, own = read_solved(folder, "look", names), Calibrated(folder, names)
@@ -133,7 +133,7 @@ def solved_grey(calibrated: Calibrated, names: list[str]) -> list[float]:
     )
     with Journal(calibrated.folder) as journal:
         request = AppearanceRequest("grey", "Grey", lambda: grey, {})
-        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001), ())
         Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
     off = []
     for folder in calibrated.folders:
@@ -173,7 +173,7 @@ def test_where_views_ask_for_different_colours_is_told_and_kept(tmp_path: Path) 
         with Journal(tmp_path) as journal:
             target = Target(calibrated.joined(images), calibrated.joined(masks))
             request = AppearanceRequest(name, name, partial(Target, target.image, target.mask), {})
-            steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+            steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001), ())
             Runner(steps, journal, reporter=told).run("appearance", deadline=in_seconds(120))
         shares.append(float(str(read_solved(tmp_path, name, names).figures["views_differ_share"])))
     assert shares[0] < 0.01, "too little to be told"
@@ -239,12 +239,12 @@ def test_what_was_solved_for_fewer_views_is_solved_again(tmp_path: Path) -> None
         target = Target(of.joined(grey), of.joined([np.ones(size, np.bool_) for size in sizes]))
         with Journal(tmp_path) as journal:
             request = AppearanceRequest("look", "Look", partial(Target, target.image, target.mask), {})
-            steps = solve_steps(of, [request], SolveOptions(0.9, 0.001, "full"), ())
+            steps = solve_steps(of, [request], SolveOptions(0.9, 0.001), ())
             Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(120))
     assert is_solved(folder, "look")
-    replaced = [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())]
+    replaced = [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001), ())]
     (folder / "verification.json").write_text("{}")
-    assert [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001, "full"), ())] != replaced
+    assert [dict(step.inputs) for step in solve_steps(calibrated, [], SolveOptions(0.9, 0.001), ())] != replaced
 
 
 def test_views_that_become_whole_before_the_first_use_count(tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def test_solutions_without_a_projector_stay_beside_those_with_all(tmp_path: Path
     grey = Target(np.full((*CAMERAS["left"], 3), 0.3, np.float32), np.ones(CAMERAS["left"], np.bool_))
     survivors, request = Survivors(tmp_path, names[1:], own), AppearanceRequest("look", "Look", lambda: grey, {})
     with Journal(own) as journal:
-        steps = solve_steps(survivors, [request], SolveOptions(0.9, 0.001, "full"), ())
+        steps = solve_steps(survivors, [request], SolveOptions(0.9, 0.001), ())
         Runner(steps, journal, reporter=Silent()).run("takeover", deadline=in_seconds(120))
     assert is_solved(own, "look")
     assert not is_solved(tmp_path, "look")

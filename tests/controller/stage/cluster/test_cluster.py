@@ -16,7 +16,7 @@ from distributed import Client, Scheduler
 
 from controller.core.arrays import FloatImage
 from controller.core.errors import UsageError, VelaturaError, WorkError
-from controller.optics.solve.appearance import Base, StageLight, base_image, solve_base
+from controller.optics.solve.appearance import StageLight
 from controller.optics.solve.request import AppearanceResult, SolveOptions, solve_appearance
 from controller.optics.solve.targets.values import Target
 from controller.optics.transport import LightTransport, build_transport
@@ -28,18 +28,16 @@ from lab.timings.tools.synthetic import synthetic_calibration
 from tests.controller.stage.cluster.machines import Machines, machines
 
 CALIBRATION = synthetic_calibration(projector=(34, 40), camera=(96, 120))
-OPTIONS = SolveOptions(share=0.9, smoothness=0.001, mode="full")
+OPTIONS = SolveOptions(share=0.9, smoothness=0.001)
 
 
 @cache
-def solved() -> tuple[LightTransport, Base]:
-    transport = build_transport(CALIBRATION)
-    return transport, solve_base(transport, base_image(CALIBRATION), CALIBRATION.black)
+def transport() -> LightTransport:
+    return build_transport(CALIBRATION)
 
 
 def stage_data() -> StageData:
-    transport, base = solved()
-    return StageData(transport, base.image, base.solution, CALIBRATION.black)
+    return StageData(transport(), CALIBRATION.black)
 
 
 def picture(number: int) -> Target:
@@ -49,8 +47,7 @@ def picture(number: int) -> Target:
 
 
 def here(number: int) -> AppearanceResult:
-    transport, base = solved()
-    return solve_appearance(StageLight(transport, CALIBRATION.black), base, picture(number), OPTIONS)
+    return solve_appearance(StageLight(transport(), CALIBRATION.black), picture(number), OPTIONS)
 
 
 def assert_same(found: AppearanceResult, expected: AppearanceResult) -> None:

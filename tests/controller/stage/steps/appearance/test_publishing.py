@@ -43,7 +43,7 @@ def _no_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
 def solve(run: Path, name: str, value: int, seconds: float = 1.0) -> None:
     run.mkdir(parents=True, exist_ok=True)
     frames = {p: np.full((rows, columns, 3), value, np.uint8) for p, (_, (columns, rows)) in OUTPUTS.items()}
-    figures: dict[str, object] = {"name": name, "mode": "full", "exposure": 2.0, "title": name, "seconds": seconds}
+    figures: dict[str, object] = {"name": name, "exposure": 2.0, "title": name, "seconds": seconds}
     target, reachable = np.zeros((2, 2, 3), np.float32), np.ones((2, 2), np.bool_)
     linear = {projector: (frame / 255).astype(np.float32) for projector, frame in frames.items()}
     Solved(frames, linear, target, reachable, figures).write(run, name)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from controller.config.models import SolveTable
-from controller.core.arrays import FloatImage, Mask
+from controller.core.arrays import Mask
 from controller.optics.solve.bounded.engine import IterationControl, Processor
 from controller.optics.solve.bounded.equations import Solution, SolveInput
 from controller.optics.solve.request import AppearanceResult, SolveOptions
 from controller.optics.solve.targets.values import Target
-from controller.optics.transport import LightTransport
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
@@ -37,25 +36,17 @@ class Watched(Processor):
         self.did.append("solve")
         return super().solve(given, control)
 
-    def scaled(
-        self, transport: LightTransport, light: FloatImage, inverse: FloatImage, mixed: FloatImage, coverage: FloatImage
-    ) -> FloatImage:
-        self.did.append("scale")
-        return super().scaled(transport, light, inverse, mixed, coverage)
-
 
 def test_the_base_and_every_appearance_are_made_by_it(tmp_path: Path) -> None:
     names = write_synthetic_run(tmp_path, projector=(14, 18), camera=CAMERA)
     engine = Watched()
     calibrated = Calibrated(tmp_path, names, engine)
     picture = Target(0.5 * synthetic_target(CAMERA), np.ones(CAMERA, np.bool_))
-    for mode, expected in (("full", ["solve", "solve"]), ("scale", ["solve", "solve", "scale"])):
-        request = AppearanceRequest(mode, mode, lambda: picture, {})
-        options = SolveOptions(0.9, 0.001, mode)  # type: ignore[arg-type]
+    request = AppearanceRequest("one", "One", lambda: picture, {})
+    for share, expected in ((0.9, ["solve", "solve"]), (0.8, ["solve", "solve", "solve"])):
+        steps = solve_steps(calibrated, [request], SolveOptions(share, 0.001), ())
         with Journal(tmp_path) as journal:
-            Runner(solve_steps(calibrated, [request], options, ()), journal, reporter=Silent()).run(
-                "appearance", deadline=in_seconds(60)
-            )
+            Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(60))
         # the base is kept: it is the same for both
         assert engine.did == expected
 
@@ -71,7 +62,7 @@ def test_an_outline_that_was_drawn_says_what_the_object_is_and_what_was_solved_f
     def solved() -> tuple[Mask, list[str]]:
         engine = Watched()
         calibrated = Calibrated(tmp_path, names, engine)
-        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001, "full"), ())
+        steps = solve_steps(calibrated, [request], SolveOptions(0.9, 0.001), ())
         with Journal(tmp_path) as journal:
             Runner(steps, journal, reporter=Silent()).run("appearance", deadline=in_seconds(60))
         return calibrated.calibration.object_mask, engine.did
@@ -107,7 +98,6 @@ def test_a_small_dark_part_that_keeps_all_dark_is_named(tmp_path: Path, held_bac
         "exposure": 1.0,
         "reachable_share": 0.9,
         "held_back": held_back,
-        "advice": None,
     }
     made = AppearanceResult(
         tuple(np.ones((14, 18, 3), np.float32) for _ in names),
