@@ -51,7 +51,7 @@ def test_a_change_is_killed_by_its_test_and_survives_an_empty_one(
     assert sorted(by_path) == ["hal/unwatched.py:2", "hal/watched.py:2"]
     killed, survivor = by_path["hal/watched.py:2"], by_path["hal/unwatched.py:2"]
     assert (killed.state, killed.why) == ("killed", "tests/hal/test_watched.py::test_larger")
-    assert (survivor.state, survivor.before, survivor.why) == ("survived", "return a < b", "1 test files")
+    assert (survivor.state, survivor.before, survivor.why) == ("survived", "return a < b", "2 test files")
     assert survivor.after != survivor.before
     assert (folder / "tree/hal/unwatched.py").read_text() == (tree / "hal/unwatched.py").read_text()
 
