@@ -115,10 +115,11 @@ class LogFile:
 
     def open_again(self, known: Content) -> None:
         """Open a file that was not available. Raises sqlite3.Error and OSError."""
-        self._end_replacing()
         if self.torn:
-            # It would take new events, and lose some of them.
+            # It would take new events, and lose some of them. So would a new one from before: not all is in it.
             self._replace(known)
+        else:
+            self._end_replacing()
         self._database, self.available = self._connected(self.path), True
 
     def is_lost(self, error: Exception) -> bool:

@@ -41,6 +41,7 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     written(path, *["before"] * 100)
     # The schema's page is not damaged where it is ``whole``.
     damage(path, whole - 2000)
+    damaged = path.read_bytes()
 
     def replace(old: Path, new: Path) -> Path:
         if is_full:
@@ -61,7 +62,8 @@ def test_a_damaged_log_on_a_full_disk_is_replaced_when_there_is_space(
     log = EventLog(path, durable=False)
     assert [row.code for row in log.after(0)][-5:] == ["full", *["after"] * 4]
     log.close()
-    assert len(list(path.parent.glob("*.damaged-*"))) == 1
+    (kept,) = path.parent.glob("*.damaged-*")
+    assert kept.read_bytes()[whole:] == damaged[whole:], "not one that took its place"
 
 
 def test_a_log_that_is_damaged_in_its_middle_takes_nothing_more_once_a_full_disk_has_space(tmp_path: Path) -> None:
