@@ -67,6 +67,7 @@ def test_its_figures_are_what_a_good_calibration_gives(report: Any, finished_dem
     # in the room, light between surfaces makes grade B of two projectors
     assert {row["grade"] for row in report["verification"].values()} <= {"A", "B"}
     assert all(0.04 < row["indirect"]["median"] < 0.12 for row in report["verification"].values())
+    assert 0.9 < sum(row["light_share"] for row in report["verification"].values()) < 2, "they overlap in part"
     assert report["metapixels"]["fitted"] > 0.3 * 3 * 280 * 210
     assert report["bundle"]["ratio"] > 1.5
     assert all(0.5 < one["reachable_share"] <= 1 for one in report["appearances"])

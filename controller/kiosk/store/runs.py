@@ -16,6 +16,7 @@ from controller.stage.artefacts.grade import (
     BEFORE,
     PICTURE,
     RESOLUTION,
+    errors_by_view,
     graded,
     passes,
     worst_letter,
@@ -174,8 +175,8 @@ def results(stage: Path, run: str, worst_grade: float) -> Results:
             pictures[name] = folder / file
     figures = [
         (f"Error of {name}" + (f" in view {view}" if len(views) > 1 else ""), f"{percent:.2f} %")
-        for view, of_view in views.items()
-        for name, percent in (graded(of_view) or {}).items()
+        for view, errors in errors_by_view(folder).items()
+        for name, percent in errors.items()
     ]
     grade = next((grade for grade in grades(stage, worst_grade) if grade.run == run), None)
     return Results(run, grade, pictures, tuple(figures))

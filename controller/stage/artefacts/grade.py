@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from controller.core.arrays import ByteImage, load_arrays, save_arrays
 from controller.core.storage import write_atomically
+from controller.optics.calibrate.verify.grade import grade_of
 from controller.run.step_id import StepId
 from controller.stage.artefacts.names import json_path, read_json, write_json
 from controller.stage.artefacts.views import view_folders
@@ -25,6 +26,8 @@ ACROSS: Final = 3
 LEGEND: Final = 0.5
 """More than the height of a projector's legend, by its width."""
 FIGURES: Final = "verification.json"
+LIGHT_SHARE: Final = "light_share"
+"""Among a projector's figures: its white light of that of all projectors, over the pixels that it lights."""
 BEFORE, RESOLUTION = "before.png", "resolution.png"
 """Pictures of the report, for the panel: all projectors at white, and the finest metapixel at each pixel."""
 _MAPS: Final = "verification.npz"
@@ -103,26 +106,46 @@ def graded(run: Path) -> dict[str, float] | None:
     return {name: 100 * float(row["relative_rms"]) for name, row in read_grade_figures(run).items()}
 
 
+def errors_by_view(run: Path) -> dict[str, dict[str, float]]:
+    """Per cent of error of each projector, by view; of those that were graded.
+
+    Related to its light where it has most: in a view that sees only how it grazes the sides, a large error of its own
+    light is a small one of all.
+    """
+    figures = {view: read_grade_figures(folder) for view, folder in view_folders(run).items()}
+    shares: dict[str, list[float | None]] = {}
+    for rows in figures.values():
+        for name, row in rows.items():
+            shares.setdefault(name, []).append(row.get(LIGHT_SHARE))
+
+    def percent(name: str, row: Mapping[str, Any]) -> float:
+        known = [share for share in shares[name] if share is not None]
+        related = row[LIGHT_SHARE] / max(known) if len(known) == len(shares[name]) else 1.0
+        return 100 * float(row["relative_rms"]) * related
+
+    return {view: {name: percent(name, row) for name, row in rows.items()} for view, rows in figures.items() if rows}
+
+
 def worst_letter(run: Path) -> str:
     """The grade of the worst projector in any view, "A" being the best."""
-    figures = [read_grade_figures(folder).values() for folder in view_folders(run).values()]
-    return max(str(row["grade"]) for rows in figures for row in rows)
+    worst = worst_of(run)
+    return grade_of(math.nan if worst is None else worst[1] / 100).value
 
 
 def worst_of(run: Path) -> tuple[str, float] | None:
     """The projector with the largest error in any view, in per cent; None for a run that was not graded."""
-    rows = [_worst_in(folder) for folder in view_folders(run).values()]
-    return max((row for row in rows if row is not None), key=_percent, default=None)
+    return max(map(_worst, errors_by_view(run).values()), key=_percent, default=None)
 
 
 def worst_view(run: Path) -> tuple[str, Path]:
     """The view with the largest error, and its folder; the first one, if none was graded."""
-    rows = {view: _worst_in(view[1]) for view in view_folders(run).items()}
-    return max(rows, key=lambda view: -1.0 if (row := rows[view]) is None else _percent(row))
+    rows, folders = errors_by_view(run), view_folders(run)
+    view = max(rows, key=lambda view: _percent(_worst(rows[view])), default=next(iter(folders)))
+    return view, folders[view]
 
 
-def _worst_in(folder: Path) -> tuple[str, float] | None:
-    return max((graded(folder) or {}).items(), key=_percent, default=None)
+def _worst(errors: Mapping[str, float]) -> tuple[str, float]:
+    return max(errors.items(), key=_percent)
 
 
 def _percent(row: tuple[str, float]) -> float:

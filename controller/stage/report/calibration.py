@@ -26,6 +26,7 @@ from controller.stage.artefacts.geometry import known_points_m, read_geometry_fi
 from controller.stage.artefacts.grade import (
     BEFORE,
     RESOLUTION,
+    errors_by_view,
     graded,
     is_graded,
     passes,
@@ -33,11 +34,13 @@ from controller.stage.artefacts.grade import (
     read_grade_figures,
     read_troubles,
     trouble_row,
+    worst_letter,
+    worst_of,
 )
 from controller.stage.artefacts.names import REPORT_PAGE
 from controller.stage.artefacts.pattern_plans import patterns_figures, photographs_sentence
 from controller.stage.artefacts.projectors import PixelFigures, read_radiometry_figures
-from controller.stage.artefacts.views import VIEWS, first_view, view_folders
+from controller.stage.artefacts.views import VIEWS, view_folders
 from controller.stage.report import plots
 from controller.stage.report.galleries import causes_gallery, light_gallery, views_gallery, whites
 from controller.stage.report.page import Goal, Page, PageTable, ReportPicture, write_report
@@ -116,8 +119,9 @@ def _views(run: Path, views: Mapping[str, Path]) -> tuple[PageTable, ...]:
     """The error of each projector in each view, and where the view's own report is; () for the only view."""
     if len(views) == 1:
         return ()
-    errors = {name: graded(folder) or {} for name, folder in views.items()}
-    named = [(name, [f"{errors[view].get(name, np.nan):.2f} %" for view in views]) for name in errors[first_view(run)]]
+    errors = errors_by_view(run)
+    names = dict.fromkeys(name for of_view in errors.values() for name in of_view)
+    named = [(name, [f"{errors.get(view, {}).get(name, np.nan):.2f} %" for view in views]) for name in names]
     reports = [str((folder / REPORT_PAGE).relative_to(run)) for folder in views.values()]
     rows = (*((f"Error of {name}", *values) for name, values in named), ("Report", *reports))
     return (PageTable("Views", ("", *views), rows),)
@@ -207,12 +211,11 @@ def _keep(path: Path, picture: ByteImage) -> None:
 
 
 def _goals(run: Path, figures: Mapping[str, Any], limit: float) -> tuple[Goal, ...]:
-    worst = max(row["relative_rms"] for row in figures["verification"].values())
-    grade = max(str(row["grade"]) for row in figures["verification"].values())
+    worst = worst_of(run) or (("", float("nan")))
     fitted_count = figures["metapixels"].values()
     return (
-        Goal("Grade", grade, note="of the worst projector"),
-        Goal("Largest error of a prediction", f"{100 * worst:.2f} %", f"at most {limit:g} %", passes(run, limit)),
+        Goal("Grade", worst_letter(run), note="of the worst projector"),
+        Goal("Largest error of a prediction", f"{worst[1]:.2f} %", f"at most {limit:g} %", passes(run, limit)),
         shape_goal(figures),
         Goal("Metapixels", f"{sum(count or 0 for count in fitted_count):,}", note="with position and size"),
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from controller.core import channels
@@ -106,6 +105,8 @@ def grade_of(relative_rms: float) -> Grade:
 
 def _error_map(error: Float64, light: Float64, use: Mask) -> FloatImage:
     """From (rows, columns): squared error and squared light of each pixel."""
+    import cv2  # what only reads grades does without
+
     floor = 1e-4 * float(light.sum()) / max(int(np.count_nonzero(use)), 1)
     near_error, near_light = (cv2.boxFilter(one, -1, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)) for one in (error, light))
     ratio = np.sqrt(np.maximum(near_error, 0) / np.maximum(near_light, floor))

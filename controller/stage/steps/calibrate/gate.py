@@ -15,7 +15,7 @@ from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
 from controller.stage.artefacts.grade import (
     PICTURE,
-    graded,
+    errors_by_view,
     passes,
     read_grade_figures,
     worst_letter,
@@ -32,13 +32,12 @@ WORSE: Final = 1.25
 
 def grade_figures(folder: Path) -> dict[str, str]:
     """For a command's result: the grade, each projector's error, and the error map."""
-    views = {name: figures for name, view in view_folders(folder).items() if (figures := graded(view))}
     texts = {
-        name: ", ".join(f"{projector} {percent:.2f} %" for projector, percent in figures.items())
-        for name, figures in views.items()
+        name: ", ".join(f"{projector} {percent:.2f} %" for projector, percent in errors.items())
+        for name, errors in errors_by_view(folder).items()
     }
     text = "; ".join(texts.values() if len(texts) == 1 else [f"view {name}: {one}" for name, one in texts.items()])
-    return {"grade": worst_letter(folder), "error": text, "map": str(worst_view(folder)[1] / PICTURE)} if views else {}
+    return {"grade": worst_letter(folder), "error": text, "map": str(worst_view(folder)[1] / PICTURE)} if texts else {}
 
 
 def accept(folder: Path, reporter: Reporter, worst_grade: float) -> None:

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 
 from controller.bundle.describe import png
-from controller.core.arrays import ByteImage, FloatImage
+from controller.core.arrays import ByteImage, FloatImage, Mask
 from controller.core.errors import TroubleCode
 from controller.optics.calibrate.photometry.glare import veiled, veiling_glare
 from controller.optics.calibrate.photometry.reflectance import gloss_strength, glossy
 from controller.optics.calibrate.photometry.surface_spread import spreading, typical_spread
-from controller.optics.calibrate.values import ProjectorCalibration
+from controller.optics.calibrate.values import Calibration, ProjectorCalibration
 from controller.optics.calibrate.verify.error_attribution import (
     ErrorAttribution,
     attribute_error,
@@ -34,7 +34,7 @@ from controller.run.step_id import StepId
 from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.camera import Exposures
 from controller.stage.artefacts.geometry import known_geometry
-from controller.stage.artefacts.grade import ErrorMaps, in_rows, write_grade
+from controller.stage.artefacts.grade import LIGHT_SHARE, ErrorMaps, in_rows, write_grade
 from controller.stage.artefacts.kinds import StepKind
 from controller.stage.artefacts.photographs import PATTERN, VERIFICATION, TakenPhotograph, codes_of, noise_of
 from controller.stage.artefacts.projectors import IndirectFigures, drawn_by
@@ -137,8 +137,15 @@ def _judged(calibrated: Calibrated, folder: Path, n: int) -> tuple[dict[str, obj
     known = taken.profile is not None and taken.profile.noise != CameraNoise()
     found = verify(expected, seen, calibration.black, transport.lit[n], variance if known else None)
     why = attribute_error(transport, calibration, n, shown, seen, variance=variance, indirect=indirect)
-    figures = _figures(found, why) | _indirect_figures(folder, part.name)
+    share = _light_share(calibration, n, transport.lit[n])
+    figures = _figures(found, why) | {LIGHT_SHARE: share} | _indirect_figures(folder, part.name)
     return figures, ErrorMaps(found.error_map, why.labels), attribution_picture(why, calibration, part.name)
+
+
+def _light_share(calibration: Calibration, n: int, lit: Mask) -> float:
+    whites = [part.white[lit] for part in calibration.projectors]
+    whole = np.add.reduce(whites)
+    return float(np.linalg.norm(whites[n]) / np.linalg.norm(whole))
 
 
 def _shown(folder: Path, part: ProjectorCalibration, pattern: Pattern, size_px: tuple[int, int]) -> FloatImage:

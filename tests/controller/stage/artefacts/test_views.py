@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from controller.stage.artefacts.grade import FIGURES, worst_of, worst_view
+import pytest
+
+from controller.stage.artefacts.grade import FIGURES, errors_by_view, worst_letter, worst_of, worst_view
 from controller.stage.artefacts.names import write_json
 from controller.stage.artefacts.views import (
     first_view,
@@ -55,6 +57,22 @@ def test_the_worst_view_and_projector_are_of_all_views(tmp_path: Path) -> None:
     assert worst_view(tmp_path) == ("back", folder)
     write_json(tmp_path / FIGURES, {"left": {"relative_rms": 0.06}, "right": {"relative_rms": 0.0}})
     assert worst_view(tmp_path) == ("front", tmp_path)
+
+
+@pytest.mark.parametrize(("share", "worst", "grade"), [(0.02, ("right", 3.0), "B"), (0.5, ("left", 50.0), "D")])
+def test_light_that_only_grazes_what_a_view_sees_counts_as_little_as_it_gives(
+    tmp_path: Path, share: float, worst: tuple[str, float], grade: str
+) -> None:
+    write_view(tmp_path, "front", 0)
+    folder = view_folder(tmp_path, "back")
+    folder.mkdir(parents=True)
+    write_view(folder, "back", 1)
+    right = {"relative_rms": 0.03, "light_share": 0.5}
+    write_json(tmp_path / FIGURES, {"left": {"relative_rms": 0.01, "light_share": 0.5}, "right": right})
+    write_json(folder / FIGURES, {"left": {"relative_rms": 0.5, "light_share": share}, "right": right})
+    assert worst_of(tmp_path) == pytest.approx(worst)
+    assert worst_letter(tmp_path) == grade
+    assert errors_by_view(tmp_path)["back"] == pytest.approx({"left": 100 * share, "right": 3.0})
 
 
 def test_any_name_has_a_folder_of_its_own(tmp_path: Path) -> None:
