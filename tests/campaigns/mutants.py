@@ -41,7 +41,7 @@ ROOT: Final = Path(__file__).parents[2]
 EQUIVALENT: Final = Path(__file__).with_name("equivalent_mutants.toml")
 BATCHES: Final = (4, 8, 16)
 """Test files of one start of pytest: the nearest alone, so that most changes are noticed within seconds."""
-FAILED: Final = re.compile(r"^(?:FAILED|ERROR) (\S+?\.py\S*)", re.MULTILINE)
+FAILED: Final = re.compile(r"^(?:FAILED|ERROR) (\S+?\.py.*?)(?: - .*)?$", re.MULTILINE)
 
 
 class Nearness:
@@ -118,9 +118,9 @@ class Limits:
 
 @dataclass
 class Trial:
-    """Changes in a tree, each with the tests near to it; ``broken``: tests that fail without a change, too.
+    """Changes in a tree, each with the tests near to it, but ``known``: (path, before, after), for which none runs.
 
-    ``known``: (path, before, after) of changes for which no test is run.
+    ``broken``: tests that fail without a change, too.
     """
 
     tree: Path

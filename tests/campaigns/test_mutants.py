@@ -66,7 +66,8 @@ def test_a_change_is_killed_by_its_test_and_survives_an_empty_one(
     # a killed campaign has left.
     equivalent.write_text("")
     (folder / "tree/hal/unwatched.py").write_text(WATCHED.replace("a > b", "a"))
-    mended = "def test_of_a_busy_computer() -> None:\n    raise OSError\n\n\n"
+    mended = "import pytest\n\n\n@pytest.mark.parametrize('why', ['too busy'])\n"
+    mended += "def test_of_a_busy_computer(why: str) -> None:\n    raise OSError(why)\n\n\n"
     mended += TESTED.replace("watched", "unwatched").replace("2, 1", "1, 2")
     (tree / "tests/other/test_unwatched.py").write_text(mended)
     states = [one.state for one in Campaign(tree, folder, "1", equivalent).run(2, Limits())]

@@ -26,7 +26,7 @@ time.sleep(600)
 def test_the_link_of_a_killed_program_is_not_followed(tmp_path: Path) -> None:
     master, slave = os.openpty()
     os.set_blocking(master, False)
-    port, path = tmp_path / "tty-left", os.ttyname(slave)
+    port, path = tmp_path / "run" / "tty-left", os.ttyname(slave)
     command = [sys.executable, "-c", OWNER, str(port), path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
         assert owner.stdout is not None
@@ -40,7 +40,7 @@ def test_the_link_of_a_killed_program_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(DeviceGone) as gone:
         SerialLink(port, baud=9600, deadline=in_seconds(5))
     assert gone.value.code == "port-missing"
-    assert list(tmp_path.iterdir()) == []
+    assert list(port.parent.iterdir()) == []
     with pytest.raises(BlockingIOError):
         os.read(master, 1)
     os.close(master)

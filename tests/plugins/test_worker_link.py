@@ -138,3 +138,11 @@ def test_a_call_after_the_closing_is_refused_at_once_though_another_hangs() -> N
     with pytest.raises(DeviceGone):
         board.call(lambda opened: None, deadline=in_seconds(30))
     go.set()
+
+
+def test_a_call_that_comes_too_late_opens_nothing() -> None:
+    board = Board()
+    with pytest.raises(DeviceTimeout):
+        board.call(lambda opened: None, deadline=in_seconds(0))
+    board.close()
+    assert board.opened == 0

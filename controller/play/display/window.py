@@ -221,14 +221,12 @@ class WindowOutput:
         return True
 
     def prepare(self, frames: FrameSet) -> None:
-        self._window.switch_to()
         self._canvas.load(frames)
         self._share = 0.0
         self._draw()
 
     def load_live(self, maps: LiveMaps) -> None:
         """As ``live.LiveOutput``."""
-        self._window.switch_to()
         if self._live is not None:
             self._live.close()
             self._live = None
@@ -237,7 +235,6 @@ class WindowOutput:
     def prepare_live(self, target: npt.NDArray[np.uint8], brightness: float) -> None:
         """As ``live.LiveOutput``; after ``load_live``."""
         assert self._live is not None
-        self._window.switch_to()
         self._live.render(target, brightness, self._canvas.pictures)
         self._share = 0.0
         self._draw()
@@ -245,16 +242,13 @@ class WindowOutput:
     def live_frames(self) -> FrameSet:
         """As ``live.LiveOutput``."""
         assert self._live is not None
-        self._window.switch_to()
         return self._live.read_back(self._canvas.pictures)
 
     def load_fade(self, before: FrameSet, after: FrameSet) -> None:
-        self._window.switch_to()
         self._canvas.load_both(before, after)
 
     def mix(self, share: float) -> None:
         self._share = share
-        self._window.switch_to()
         self._draw()
 
     def _draw(self) -> None:
@@ -286,7 +280,6 @@ class WindowOutput:
         self._window.dispatch_events()
         if self._damaged and not self.continued:
             self._damaged = False
-            self._window.switch_to()
             self._draw()
             self._window.flip()
 

@@ -41,7 +41,7 @@ class PlayedSequence:
     """
 
     items: tuple[tuple[str, float, float], ...]
-    repeat: int = 0
+    repeat: int
     for_s: float | None = None
 
     @property

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from controller.config import Stage, check_driver_settings, load_stage, write_stage
+from controller.config.models import StageTables
 from controller.core.errors import UsageError
 from hal.registry import Driver
 
@@ -309,3 +310,12 @@ def test_an_outline_has_regions_of_three_corners_inside_the_picture(tmp_path: Pa
     assert "outline" in error.what
     right = load(tmp_path, f"{STAGE}\n[object]\noutline = [[[0, 0.2], [1, 0.4], [0.5, 0.9]]]\n").tables.object.outline
     assert right == (((0, 0.2), (1, 0.4), (0.5, 0.9)),)
+
+
+def test_the_numbers_that_are_taken_are_those_that_the_description_names() -> None:
+    tables = StageTables.model_json_schema()["$defs"].values()
+    for key, field in (row for table in tables for row in table.get("properties", {}).items()):
+        taken = {name: value for one in (field, *field.get("anyOf", ())) for name, value in one.items()}
+        named = re.search(r"([\d.]+)(?: \(none\))? to ([\d.]*\d)", field.get("description", ""))
+        if named and "minimum" in taken:
+            assert (key, taken["minimum"], taken["maximum"]) == (key, *map(float, named.groups()))

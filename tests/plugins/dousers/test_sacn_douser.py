@@ -22,7 +22,7 @@ from sacn import DataPacket, sACNreceiver
 from controller.stage.rig.douser import ProjectorWithDouser
 from hal.conformance import DouserConformance
 from hal.deadline import in_seconds
-from hal.errors import DeviceError, DeviceGone, DeviceRefused, PluginError
+from hal.errors import DeviceError, DeviceGone, DeviceRefused, DeviceTimeout, PluginError
 from hal.interfaces import Douser
 from hal.notices import Notice
 from hal.registry import OpenContext, load_drivers, open_device
@@ -113,6 +113,8 @@ def test_a_receiver_that_nobody_here_wrote_hears_two_dousers_as_one_source(recei
     wait_for(lambda: heard.packets[-1].dmxData[8] == 10)
     # The one that was closed stays as it is, and the stream continues for the other.
     assert (heard.packets[-1].dmxData[2], heard.presence) == (255, ["available"])
+    with pytest.raises(DeviceTimeout):  # the blades need longer
+        right.move(True, deadline=in_seconds(0.09))
     right.close()
     wait_for(lambda: heard.presence == ["available", "timeout", "timeout", "timeout"])
 

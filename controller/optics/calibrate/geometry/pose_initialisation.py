@@ -45,8 +45,6 @@ def fundamental(camera_px: Float64, projector_px: Float64) -> tuple[Float64, Mas
 
     ``camera_px`` (points, 2) should be scaled so that its pixels are about as large as the projector's.
     """
-    if len(camera_px) < _FEWEST:
-        return None
     matrix, inliers = _sought(camera_px, projector_px)
     if matrix is None or matrix.shape != (3, 3) or inliers is None or int(inliers.sum()) < _FEWEST:
         return None

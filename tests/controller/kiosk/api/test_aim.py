@@ -58,7 +58,9 @@ def test_the_hints_say_what_to_turn_and_no_more(tmp_path: Path) -> None:
     (dark,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, exposure=0.24).hints
     (bright,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, exposure=0.99).hints
     (soft,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, camera_focus=0.39).hints
+    (clipped,) = aimed(stage, projectors=[], too_dark=0, too_soft=0, clipped=0.021).hints
     assert ("too dark" in dark, "too bright" in bright, "focus the camera" in soft) == (True, True, True)
+    assert "2% of the object is too bright" in clipped
 
 
 def metapixels(pitch_px: float, spread_px: float, *, slant: float = 1.0) -> Metapixels:

@@ -181,6 +181,13 @@ def test_wrong_schedules_are_refused(schedule: Schedule) -> None:
         check_schedule(schedule, ["shine"])
 
 
+def test_of_hours_at_the_same_time_those_that_began_last_count() -> None:
+    rows = (ScheduleRow("mon", "10:00", "18:00", "day"), ScheduleRow("mon", "12:00", "14:00", "noon"))
+    both = Schedule("Europe/Vienna", rows)
+    shown = [planned(f"2026-05-04T{hour}:00", both).appearance for hour in ("11:00", "13:00", "15:00")]
+    assert shown == ["day", "noon", "day"]
+
+
 def test_24_00_is_the_end_of_a_day_wherever_a_time_is_taken() -> None:
     rows = (ScheduleRow("daily", "18:00", "24:00"),)
     schedule = of_table(ScheduleTable(time_zone="Europe/Vienna", drift_check="24:00", hours=(
@@ -188,11 +195,8 @@ def test_24_00_is_the_end_of_a_day_wherever_a_time_is_taken() -> None:
     check_schedule(schedule)
     check_overlaps(schedule)
     assert schedule.rows == expanded(rows)
-    assert [planned(f"2026-05-04T{at_}:00", schedule).open for at_ in ("17:59", "18:00", "23:59")] == [
-        False,
-        True,
-        True,
-    ]
+    opened = [planned(f"2026-05-04T{at_}:00", schedule).open for at_ in ("17:59", "18:00", "23:59")]
+    assert opened == [False, True, True]
     assert planned("2026-05-05T00:00:00", schedule).open is False
     assert planned("2026-05-04T00:00:00", schedule).due, "the check at midnight"
     whole = Schedule("Europe/Vienna", (ScheduleRow("mon", "00:00", "24:00"), ScheduleRow("tue", "24:00", "02:00")))

@@ -144,7 +144,7 @@ def test_a_report_that_is_there_is_not_made_again_and_an_unknown_run_has_none(tm
     for folder in (run, photographs):
         (folder / "report.html").write_text("as it was")
         assert runs.report(stage, folder.name, checked).read_text() == "as it was"
-    for name in ("20260103-100000-calibrate", "..", f"../runs/{FIRST}"):
+    for name in ("20260103-100000-calibrate", "..", f"../runs/{FIRST}", 99 * "x"):
         with pytest.raises(UsageError) as caught:
             runs.report(stage, name, checked)
-        assert caught.value.code == "run-unknown"
+        assert (caught.value.code, caught.value.what.count("x")) == ("run-unknown", min(80, name.count("x")))

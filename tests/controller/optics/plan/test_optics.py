@@ -99,6 +99,7 @@ def test_what_lies_beside_the_picture_behind_or_turned_away_gets_nothing() -> No
     lit = lit_by(FACING, Surface(points, normals, np.ones(3)), Nothing())
     assert not lit.reached.any()
     assert not lit.lux.any()
+    assert not lit.cosine.any()
 
 
 def test_the_balls_far_side_and_what_another_thing_shades_get_nothing(

@@ -11,8 +11,6 @@ from controller.core.arrays import FloatImage
 from controller.optics.calibrate.values import Calibration, Metapixels, ProjectorCalibration, Radiometry
 from controller.optics.transport import LightTransport
 
-IDENTITY_MIXING = np.eye(3)
-
 
 def random_calibration(
     seed: int,

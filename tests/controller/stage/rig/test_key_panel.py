@@ -101,6 +101,8 @@ def test_every_state_looks_unlike_another_and_dim_keys_are_those_that_do_nothing
     assert len(pictures) == len(State)
     assert key_picture(play, State.READY, (72, 72)).max() > 200
     assert key_picture(play, State.OFF, (72, 72)).max() < 120
+    low = (key_picture(play, State.READY, (400, 40)) > 150).any(axis=(1, 2))
+    assert 12 <= np.count_nonzero(low) <= 20, "capital letters in 60 % of the height"
 
 
 def test_an_unplugged_panel_is_told_once_and_used_again(monkeypatch: pytest.MonkeyPatch) -> None:

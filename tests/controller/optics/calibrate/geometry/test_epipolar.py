@@ -50,4 +50,5 @@ def test_where_no_sample_helps_another_method_says_what_there_is(monkeypatch: py
 
 def test_points_that_fit_nothing_have_none() -> None:
     dice = np.random.default_rng(4)
-    assert fundamental(dice.uniform(0, 300, (60, 2)), dice.uniform(0, 100, (60, 2))) is None
+    for count in (0, 7, 60):
+        assert fundamental(dice.uniform(0, 300, (count, 2)), dice.uniform(0, 100, (count, 2))) is None
