@@ -135,13 +135,16 @@ class Grade:
 @dataclass(frozen=True, slots=True)
 class DriftCheck:
     """One drift check: ``advice`` "nothing", "quick", "full" or "look"; ``moved_px`` the rms motion of the camera's or
-    the object's picture, camera pixels, None if it was not recognised.
+    the object's picture, camera pixels, None if it was not recognised; ``apart_s`` from the first output's change
+    to the last one's, by the camera, and its uncertainty (95 %), None if that was not measured.
     """
 
     run: str
     unix_s: float
     advice: str
     moved_px: float | None
+    apart_s: float | None = None
+    uncertain_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 metal; the room ``hard``.
 
 ``plugins.emulated.optics`` asks for this module where a stage has such effects (``plugins.emulated.core.extensions``);
-``Spread``, ``colours`` and ``xyz_to_camera`` are part of it.
+``SeparateOutputs``, ``Spread``, ``colours`` and ``xyz_to_camera`` are part of it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from lab.emulated.outputs import SeparateOutputs
 from lab.emulated.spectra import colours, xyz_to_camera
 from lab.emulated.subsurface import Spread
 from plugins.emulated.core.truth import BenchTruth, CameraTruth, Dithering, Panels, ProjectorTruth, Subsurface
@@ -228,6 +229,6 @@ def _hard_projector(projector: ProjectorTruth, rng: np.random.Generator) -> Proj
 
 
 __all__ = (
-    "Mirrors", "Spread", "colours", "confusion_px", "defocused", "exposed_s", "fresnel", "hard", "mean_light",
-    "reflected", "seen_of_turns", "sensor_flaws", "xyz_to_camera",
+    "Mirrors", "SeparateOutputs", "Spread", "colours", "confusion_px", "defocused", "exposed_s", "fresnel", "hard",
+    "mean_light", "reflected", "seen_of_turns", "sensor_flaws", "xyz_to_camera",
 )  # fmt: skip

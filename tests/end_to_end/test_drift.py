@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
+import statistics
+import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from controller.core.errors import CalibrationError
+from controller.core.errors import CalibrationError, UsageError
+from controller.core.storage import runtime_path
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.stage.artefacts.grade import graded, read_grade_figures
@@ -23,9 +27,12 @@ from controller.stage.services.calibrate import AppearanceOrder, calibrate, make
 from controller.stage.services.recalibrate import check_drift, recalibrate
 from controller.stage.sessions.calibrations import finished_calibration
 from controller.stage.sessions.session import OwnSession
+from hal.codecs.player import LONGEST_HEAD_BYTES, parse_set
+from hal.errors import ProtocolError
 from lab.emulated.bumps import Bump, write_bumps
-from tests.end_to_end.kiosk import with_ports_of_its_own
-from tests.end_to_end.program import REPOSITORY
+from plugins.emulated.core.truth import read_truth, write_truth
+from tests.end_to_end.kiosk import copied, with_ports_of_its_own
+from tests.end_to_end.program import REPOSITORY, Bench, Command
 
 pytestmark = pytest.mark.long
 LEFT = Bump("projector", "left", shift_px=(1.2, -0.7))
@@ -134,6 +141,62 @@ def test_camera_and_object_are_told_apart_and_ask_for_a_full_calibration(
     assert (found["culprit"], found["advice"]) == (culprit, "full")
     if culprit == "camera":
         assert found["camera"]["shift_px"] == pytest.approx((2.0, 1.0), abs=0.1)
+
+
+@contextlib.contextmanager
+def presented(files: Sequence[Path]) -> Iterator[list[dict[int, float]]]:
+    """When each memory output presented each of its sets, read from its head as they come."""
+    seen: list[dict[int, float]] = [{} for _ in files]
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(0.01):
+            for path, found in zip(files, seen, strict=True):
+                with contextlib.suppress(OSError, ProtocolError, struct.error):
+                    sequence, at_s = parse_set(path.read_bytes()[:LONGEST_HEAD_BYTES])
+                    found.update({} if sequence % 2 else {sequence: at_s})
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        yield seen
+    finally:
+        ended.set()
+        looking.join()
+
+
+def test_the_camera_tells_how_far_apart_two_players_change(bumpy: Bumpy, tmp_path: Path) -> None:
+    """Three projectors that overlap, on two screens with a player each; two of them are late on top of that."""
+    before = sorted((bumpy.stage / "runs").iterdir())
+    with pytest.raises(UsageError) as caught:
+        check_drift(
+            session=OwnSession(bumpy.stage), details=True, reporter=Silent(), cancel=threading.Event(), skew=True
+        )
+    assert caught.value.code == "skew-one-player"
+    assert sorted((bumpy.stage / "runs").iterdir()) == before
+    stage = copied(bumpy.stage, tmp_path / "stage")
+    (stage / "bench" / "bumps.toml").unlink(missing_ok=True)
+    (stage / "run").mkdir()
+    settings = stage / "stage.toml"
+    settings.write_text(settings.read_text().replace('name = "P2"\n', 'name = "P2"\nscreen = ":1"\n'))
+    files = [runtime_path(stage) / f"screen-{number}" / "out.frame" for number in (0, 1)]
+    truth, late_s = read_truth(stage), (0.0, 0.021, 0.008)
+    projectors = tuple(
+        replace(one, frames=str(files[one.output == "P2"]), late_s=late)
+        for one, late in zip(truth.projectors, late_s, strict=True)
+    )
+    write_truth(stage, replace(truth, projectors=projectors, time_scale=1.0))
+    with Bench(stage), presented(files) as seen:
+        outcome = Command("drift", stage, "--skew").outcome()
+    assert outcome.code == 0, outcome
+    found = outcome.result["skew"]["outputs"]
+    # The players' own times differ, too. What they presented together is next to each other; two sets end the run.
+    here, there = (sorted(times.values()) for times in seen)
+    players_s = statistics.mean(min((other - one for other in there), key=abs) for one in here[-10:-2])
+    for name, true_s in (("P1", 0.0), ("P2", 0.021 + players_s), ("P3", 0.008)):
+        row = found[name]
+        assert abs(row["late_s"] - true_s) <= row["uncertain_s"] + 5e-4, (name, true_s, found)
+    assert found["P3"]["uncertain_s"] < 1e-3, "of one player, without what makes players late"
 
 
 def test_nothing_is_published_below_the_set_grade_unless_a_person_accepts_it(bumpy: Bumpy) -> None:

@@ -89,14 +89,19 @@ def calibrate(
     work(do, stage=stage)
 
 
-def drift(stage: StageFolder) -> None:
+def drift(
+    stage: StageFolder,
+    skew: Annotated[bool, typer.Option("--skew", help="Measure also how far apart several computers change.")] = False,
+) -> None:
     """Check whether anything moved or dimmed since the calibration. Takes a few photographs."""
 
     def do(reporter: Reporter, cancel: threading.Event) -> Mapping[str, Any]:
         from controller.stage.services.recalibrate import check_drift
         from controller.stage.sessions.session import OwnSession
 
-        return check_drift(session=OwnSession(stage), details=console.as_json(), reporter=reporter, cancel=cancel)
+        return check_drift(
+            session=OwnSession(stage), details=console.as_json(), reporter=reporter, cancel=cancel, skew=skew
+        )
 
     work(do, stage=stage)
 

@@ -156,7 +156,7 @@ class JobHandlers:
 
         with self.lend() as rig:
             result = check_drift(
-                session=BorrowedSession(self._stage, rig), details=True, reporter=reporter, cancel=cancel
+                session=BorrowedSession(self._stage, rig), details=True, reporter=reporter, cancel=cancel, skew=None
             )
         reporter.job = replace(reporter.job, run=run_name(result))
         advice = str(result["advice"])

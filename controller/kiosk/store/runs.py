@@ -70,7 +70,9 @@ def drifts(stage: Path) -> tuple[DriftCheck, ...]:
             found = read_json(json_path(run, StepKind.DRIFT))
             camera = found["camera"]
             moved = float(camera["rms_px"]) if camera["found"] else None
-            result.append(DriftCheck(run.name, began_s(run.name), str(found["advice"]), moved))
+            skew = read_json(path) if (path := json_path(run, StepKind.SKEW)).exists() else {}
+            apart = skew.get("apart_s"), skew.get("uncertain_s")
+            result.append(DriftCheck(run.name, began_s(run.name), str(found["advice"]), moved, *apart))
         except _UNREADABLE:
             continue
     return tuple(result)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from controller.core.arrays import ByteImage, FloatImage
+from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.core.channels import largest
 from controller.core.errors import CalibrationError
 from controller.optics.capture.linear_files import is_linear
@@ -86,8 +86,8 @@ def measure_latency(look: CaptureFlat) -> Latency:
 
     Raises CalibrationError("picture-not-seen") when white and black do not differ even after ``LONGEST_S``.
     """
-    black = _blocks(look(False, LONGEST_S, before_s=0.0))
-    white = _blocks(look(True, LONGEST_S, before_s=0.0))
+    black = blocks(look(False, LONGEST_S, before_s=0.0))
+    white = blocks(look(True, LONGEST_S, before_s=0.0))
     change = white - black
     lit = change > LIT_SHARE * np.nanmax(change, initial=0.0)
     if not np.any(lit) or float(np.nanmax(change)) < LEAST_CONTRAST:
@@ -101,7 +101,7 @@ def measure_latency(look: CaptureFlat) -> Latency:
 
     def whole(delay_s: float, before_s: float = LONGEST_S) -> bool:
         to_white = len(tries) % 2 == 1  # the references ended with white
-        seen_light = _blocks(look(to_white, delay_s, before_s=before_s))
+        seen_light = blocks(look(to_white, delay_s, before_s=before_s))
         share: npt.NDArray[np.float64] = (seen_light - black)[lit] / change[lit]
         finite = share[np.isfinite(share)]
         seen = finite if to_white else 1 - finite
@@ -138,7 +138,7 @@ def _confirmed(whole: Callable[[float], bool], delay_s: float) -> float:
     return delay_s
 
 
-def _blocks(image: FloatImage) -> npt.NDArray[np.float64]:
+def blocks(image: FloatImage) -> npt.NDArray[np.float64]:
     """Means of 16x16 blocks of the grey image; NaN where none of a block was measured."""
     grey = image.mean(axis=2) if image.ndim == 3 else image
     rows, columns = (max(side // BLOCK_PX, 1) for side in grey.shape)
@@ -148,6 +148,25 @@ def _blocks(image: FloatImage) -> npt.NDArray[np.float64]:
     count = cv2.resize(measured.astype(np.float64), size, interpolation=cv2.INTER_AREA)
     means = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0.5)
     return np.asarray(means, np.float64)
+
+
+def seen_change(seen: Float64, before: Float64, after: Float64, whites: Float64) -> Float64:
+    """When each output changed from what ``before`` shows to ``after`` during the exposure of ``seen``.
+
+    All are ``blocks`` of photographs with the same exposure; ``whites`` (outputs, rows, columns): of each output alone,
+    at any brightness.
+
+    Returns (outputs + 1,): the share of the exposure after the change of each output, in the middle row; and how much
+    larger it is in the last row than in the first, because shutters and panels may change line by line.
+    """
+    full, got = after - before, seen - before
+    used = np.isfinite(full + got + whites.sum(axis=0)) & (abs(full) > LIT_SHARE * np.nanmax(abs(full), initial=0.0))
+    full, got, whites = full[used], got[used], whites[:, used]
+    lamps = np.linalg.lstsq(whites.T, full, rcond=None)[0]
+    light = whites * lamps[:, None]
+    row = (np.nonzero(used)[0] + 0.5) / len(seen) - 0.5
+    parts = full * np.vstack([light / light.sum(axis=0), row])
+    return np.asarray(np.linalg.lstsq(parts.T, got, rcond=None)[0], np.float64)
 
 
 def changed_share(before: Mapping[str, ByteImage], after: Mapping[str, ByteImage]) -> float:

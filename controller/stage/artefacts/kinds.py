@@ -31,6 +31,7 @@ class StepKind(enum.StrEnum):
     MODE = "mode"
     DRIFT_PHOTOGRAPHS = "drift-photographs"
     DRIFT = "drift"
+    SKEW = "skew"
     PLAN = "plan"
     VERIFICATION_PHOTOGRAPHS = "verification-photographs"
     VERIFY = "verify"

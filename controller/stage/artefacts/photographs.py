@@ -129,6 +129,7 @@ BLACK: Final = PhotographSet(StepKind.BLACK)
 CAMERA_RESPONSE: Final = PhotographSet(StepKind.CAMERA_RESPONSE)
 DRIFT: Final = PhotographSet(StepKind.DRIFT_PHOTOGRAPHS)
 """One photograph of each projector's pattern, one of white and one of black."""
+SKEW: Final = PhotographSet("skew-photographs")
 VERIFICATION: Final = PhotographSet(StepKind.VERIFICATION_PHOTOGRAPHS)
 """One photograph of each projector's random pattern."""
 

@@ -20,7 +20,7 @@ from controller.stage.artefacts.calibrated import Calibrated
 from controller.stage.artefacts.drift import read_drift_figures
 from controller.stage.artefacts.grade import passes
 from controller.stage.artefacts.kinds import CALIBRATED, StepKind
-from controller.stage.artefacts.names import json_path
+from controller.stage.artefacts.names import json_path, read_json
 from controller.stage.artefacts.outline import keep_outline
 from controller.stage.artefacts.pattern_plans import PhotographOptions, photographs_named
 from controller.stage.artefacts.projectors import mode_of
@@ -32,7 +32,7 @@ from controller.stage.sessions.check import Checked, check_stage
 from controller.stage.sessions.run import marker
 from controller.stage.sessions.session import StageSession, StageWork
 from controller.stage.steps.calibrate.dots import dot_steps
-from controller.stage.steps.calibrate.drift import changed_lamps, drift_steps, swapped_views
+from controller.stage.steps.calibrate.drift import changed_lamps, drift_steps, skew_step, swapped_views
 from controller.stage.steps.calibrate.full import calibration_steps, join_geometry
 from controller.stage.steps.calibrate.gate import accept, below_grade, compare_with_last, grade_figures
 from controller.stage.steps.calibrate.quick import one_projector_steps, quick_steps
@@ -44,17 +44,29 @@ CHECKS = (StepKind.DRIFT_PHOTOGRAPHS, StepKind.VERIFICATION_PHOTOGRAPHS)
 
 
 def check_drift(
-    *, session: StageSession, details: bool, reporter: Reporter, cancel: threading.Event
+    *, session: StageSession, details: bool, reporter: Reporter, cancel: threading.Event, skew: bool | None = False
 ) -> Mapping[str, Any]:
     """Photograph the stage N + 2 times and find what has changed since its calibration; ``details``: all figures.
 
-    Raises UsageError("not-calibrated"), and what the devices raise.
+    ``skew``: also how far apart the outputs of several computers or screens change; None: if there are several.
+    Raises UsageError("not-calibrated", "skew-one-player"), and what the devices raise.
     """
     checked = check_stage(session.stage)
     last = finished_calibration(checked.stage.folder)
+    lit = {projector.output for projector in checked.stage.tables.projectors}
+    places = {one.name: one.elsewhere for one in checked.stage.tables.display.outputs if one.name in lit}
+    if skew and len(set(places.values())) < 2:
+        raise UsageError(
+            "skew-one-player", what="One player shows all of these outputs, so they change together.",
+            remedy="Leave out --skew: it is for outputs of several computers or X screens.",
+        )  # fmt: skip
+    skew = skew is not False and len(set(places.values())) > 1
 
     def steps(rig: Rig, _: Path) -> Sequence[Step]:
-        return drift_steps(rig, _calibrated(checked, last, rig), longest_exposure_s=_longest_s(checked))
+        calibrated, longest_s = _calibrated(checked, last, rig), checked.stage.tables.capture.longest_exposure_s
+        here = min(places, key=lambda name: places[name] != "")
+        also = [skew_step(rig, calibrated, here, longest_s)] if skew and rig.is_first else []
+        return [*drift_steps(rig, calibrated, longest_exposure_s=longest_s), *also]
 
     run = session.run(checked, StageWork("drift", steps, views=True), reporter=reporter, cancel=cancel)
     content = read_drift_figures(run)
@@ -66,6 +78,7 @@ def check_drift(
             reporter.say(sentence if len(folders) == 1 else f"View {name}: {sentence}", level)
     for sentence in swapped_views(folders, view_folders(last)):
         reporter.say(sentence, Level.WARNING)
+    content |= {"skew": read_json(json_path(run, StepKind.SKEW))} if skew else {}
     with Journal(run) as journal:
         content["seconds"] = journal.steps()[StepId(StepKind.DRIFT_PHOTOGRAPHS)]
     return {"run": str(run), **(content if details else {"advice": content["advice"]})}
@@ -94,7 +107,7 @@ def recalibrate(
     last = finished_calibration(checked.stage.folder)
 
     def steps(rig: Rig, run: Path) -> Sequence[Step]:
-        longest_s, calibrated = _longest_s(checked), _calibrated(checked, last, rig)
+        longest_s, calibrated = checked.stage.tables.capture.longest_exposure_s, _calibrated(checked, last, rig)
         if rig.is_first:
             keep_outline(run, checked.stage.tables.object.outline)
         mode: CalibrationMode = next((one for one in MODES if one == mode_of(calibrated.folder)), "fast")
@@ -180,7 +193,3 @@ def _take_over_step(worst: float, reporter: Reporter, *, accept_grade: bool) -> 
         return ()
 
     return Step(StepId("take-over"), run, title="Comparing the grade with the limit", weight=0.01, always=True)
-
-
-def _longest_s(checked: Checked) -> float:
-    return checked.stage.tables.capture.longest_exposure_s

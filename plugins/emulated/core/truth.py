@@ -245,7 +245,8 @@ class ProjectorTruth:
 
     ``board``: the family whose control board it has; ``tcp_port``: it is reached by its own LAN port on this computer,
     with the login of its family and ``password``, and not by a serial line. Boards other than the default, and LAN
-    ports, are in velatura-lab.
+    ports, are in velatura-lab. ``frames``: the memory output of its own player, if that is not the stage's; ``late_s``:
+    its light comes so much later than ``latency_s`` says (``lab.emulated.outputs``).
     """
 
     name: str
@@ -262,6 +263,8 @@ class ProjectorTruth:
     board: str = DEFAULT_BOARD
     tcp_port: Annotated[int, Between(0, 65_535)] = 0
     password: str = ""
+    frames: str = ""
+    late_s: Annotated[float, Between(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,6 +54,8 @@ class World:
         self._renderer = Renderer(truth, self._samples, transfer)
         self._bumps_seen: tuple[int, int] | None = None
         self._visible = VisibleFrames(stage / truth.frames, truth.latency_s)
+        if any(one.frames or one.late_s for one in truth.projectors):
+            self._visible = rare("A player or a delay of its own").SeparateOutputs(stage, truth)
         self._rng = np.random.default_rng([truth.seed, 2])
         self._flicker = np.random.default_rng([truth.seed, 5])
         self._moment = np.random.default_rng([truth.seed, 9])
@@ -111,8 +113,8 @@ class World:
         taken = time.strftime("%Y:%m:%d %H:%M:%S")
         before = [lamp.light_level() for lamp in self._lamps]
         start_s = time.monotonic()
-        time.sleep(settings.exposure_s * self._truth.time_scale)
-        end_s = time.monotonic()
+        end_s = start_s + settings.exposure_s * self._truth.time_scale
+        time.sleep(max(0.0, end_s - time.monotonic()))
         levels = [0.5 * (first + lamp.light_level()) for first, lamp in zip(before, self._lamps, strict=True)]
         for index, projector in enumerate(self._truth.projectors):
             levels[index] *= flickering(projector.lamp, settings.exposure_s, self._flicker)

@@ -150,3 +150,17 @@ def test_the_headline_counts_the_whole_object_and_not_only_what_was_in_reach(tmp
     assert newest.in_reach_share == pytest.approx(0.45)
     assert (newest.aimed, newest.held_back) == (0.4, 1.3), "beside what was aimed at, and why white is no brighter"
     assert [one.delta_e for one in runs.grades(tmp_path, 8.0)] == [8.5]
+
+
+def test_a_drift_check_measures_how_far_apart_several_computers_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[object] = []
+
+    def check(*, skew: bool | None, **_: object) -> Mapping[str, Any]:
+        calls.append(skew)
+        return {"run": "20260104-033000-drift", "advice": "nothing"}
+
+    monkeypatch.setattr(drift_services, "check_drift", check)
+    assert Stage(tmp_path).do(Request("drift", light=True)).outcome.code == "drift-none"
+    assert calls == [None], "where there are several"

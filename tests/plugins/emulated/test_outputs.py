@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import threading
 import time
@@ -13,6 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from lab.emulated.outputs import SeparateOutputs
+from plugins.emulated.core.truth import BenchTruth
 from plugins.emulated.optics.outputs import FrameReader, VisibleFrames
 
 WIDTH, HEIGHT = 40, 30
@@ -149,6 +152,26 @@ def test_frames_that_change_during_an_exposure_share_its_time(tmp_path: Path) ->
     parts = visible.during(100.75, 101.75)
     assert [levels(found) for _, found in parts] == [10, 20]
     assert [share for share, _ in parts] == pytest.approx([0.25, 0.75])
+
+
+def test_each_projector_shows_what_its_own_player_showed_so_much_earlier(
+    tmp_path: Path, tiny_truth: BenchTruth
+) -> None:
+    own = zip(("P1", "P2", "P3"), ("", "", "own.frame"), (0.0, 0.25, 0.0), strict=True)
+    projectors = tuple(
+        dataclasses.replace(projector, output=output, frames=frames, late_s=late_s)
+        for projector, (output, frames, late_s) in zip(tiny_truth.projectors, own, strict=True)
+    )
+    truth = dataclasses.replace(tiny_truth, projectors=projectors, frames="frame", latency_s=0.05)
+    visible = SeparateOutputs(tmp_path, truth)
+    for level, at_s in ((10, 100.0), (20, 102.0)):
+        both = {"P1": grey(level), "P2": grey(level)}
+        (tmp_path / "frame").write_bytes(memory_output(both, level, at_s))
+        (tmp_path / "own.frame").write_bytes(memory_output({"P3": grey(level + 5)}, level, at_s + 0.5))
+        found = visible.during(101.8, 102.8)
+    assert [share for share, _ in found] == pytest.approx([0.25, 0.25, 0.25, 0.25])
+    shown = [tuple(int(frame.max()) for frame in at.frames.values()) for _, at in found if at is not None]
+    assert shown == [(10, 10, 15), (20, 10, 15), (20, 20, 15), (20, 20, 25)]
 
 
 def levels(found: object) -> int:

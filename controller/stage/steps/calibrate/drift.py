@@ -1,24 +1,29 @@
-"""The steps of a drift check: N + 2 photographs, compared with the calibration's prediction."""
+"""The steps of a drift check: N + 2 photographs, compared with a prediction; and how far apart the outputs change."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 
 from controller.core import channels
-from controller.core.arrays import ByteImage, FloatImage
+from controller.core.arrays import ByteImage, Float64, FloatImage
 from controller.optics.calibrate.photometry.view_colours import LAMP_CHANGED
 from controller.optics.calibrate.verify.drift import DriftPhotographs, find_drift
+from controller.optics.capture.acquire import Shot
+from controller.optics.capture.latency import blocks, seen_change
 from controller.optics.capture.pattern_frames import device_frame, frame
 from controller.optics.capture.patterns import Pattern, PatternKind
-from controller.optics.capture.profile import CameraProfile, load_profile
+from controller.optics.capture.profile import CameraProfile, load_profile, true_exposure
 from controller.optics.solve.scaling.dither import to_light
 from controller.run.runner import Context, Step
 from controller.run.step_id import StepId
@@ -27,14 +32,17 @@ from controller.stage.artefacts.camera import inherit_camera
 from controller.stage.artefacts.drift import write_drift
 from controller.stage.artefacts.geometry import read_geometry_figures
 from controller.stage.artefacts.kinds import StepKind
+from controller.stage.artefacts.names import CAPTURES, json_path, write_json
 from controller.stage.artefacts.photographs import DRIFT as TAKEN
 from controller.stage.artefacts.photographs import PATTERN as PATTERN_NAME
+from controller.stage.artefacts.photographs import SKEW, TakenPhotograph
 from controller.stage.artefacts.projectors import IndirectFigures, Light
 from controller.stage.artefacts.views import newest_view
 from controller.stage.rig.rig import Rig
 from controller.stage.steps import costs
 from controller.stage.steps.capture.exposure import bracket
 from controller.stage.steps.capture.photographs import Planned, take_all
+from hal.notices import Level
 
 PATTERN = Pattern("drift", PatternKind.RANDOM, seed=17)
 """Not the pattern on which a calibration is graded."""
@@ -103,7 +111,7 @@ def _photograph(rig: Rig, calibrated: Calibrated, longest_s: float, context: Con
     plan = []
     for part in calibration.projectors:
         exposure_s = exposure_for(part.white + calibration.black, available, longest_s, profile)
-        shown = partial(_one, part.name, frames[part.name])
+        shown = partial(dict[str, ByteImage], {part.name: frames[part.name]})
         plan.append(Planned(PATTERN_NAME, shown, exposure_s, projector=part.name))
     lit = sum((part.white for part in calibration.projectors), start=calibration.black)
     white_s = exposure_for(lit, available, longest_s, profile)
@@ -112,10 +120,6 @@ def _photograph(rig: Rig, calibrated: Calibrated, longest_s: float, context: Con
     (black_s,) = bracket(white_s, (BLACK_TIMES,), available, longest_s)
     plan.append(Planned("black", dict, black_s))
     return take_all(rig, context, plan, into=TAKEN)
-
-
-def _one(name: str, image: ByteImage) -> dict[str, ByteImage]:
-    return {name: image}
 
 
 def _judge(calibrated: Calibrated, context: Context) -> Sequence[Path]:
@@ -213,3 +217,84 @@ def linear_frames(calibrated: Calibrated, pattern: Pattern) -> list[FloatImage]:
         drawn = part.radiometry.segment == 0
         found.append(frame(pattern, (columns, rows)) if drawn else to_light(shown, part.radiometry))
     return found
+
+
+CHANGES, MOST_CHANGES = 8, 32
+CHANGE_S: Final = 0.15
+"""Exposure: longer than outputs are apart, and than it is uncertain when a camera opens."""
+INSIDE: Final = 0.47
+"""Of the exposure: a change that is farther from its middle may be outside."""
+T95: Final = 2.365  # Student's t for CHANGES
+SURE_S: Final = 0.002  # a larger uncertainty is a warning
+
+
+def skew_step(rig: Rig, calibrated: Calibrated, first: str, longest_s: float) -> Step:
+    """``skew.json``: how much later than the output ``first`` each one changes, after a drift check in the same run."""
+    run = partial(_measure_skew, rig, calibrated, first, longest_s)
+    return Step(StepId(StepKind.SKEW), run, title="Measuring how far apart the outputs change", weight=20.0)
+
+
+def _measure_skew(rig: Rig, calibrated: Calibrated, first: str, longest_s: float, context: Context) -> Sequence[Path]:
+    acquirer, profile, deadline = rig.acquirer, load_profile(context.folder), context.deadline
+    lights = [Light.read(calibrated.folder, projector.name) for projector in rig.projectors]
+    short = [value for value in acquirer.exposures_s() if value <= longest_s] or acquirer.exposures_s()[:1]
+    exposure_s = min(short, key=lambda value: abs(value - CHANGE_S))
+    brightest = np.nanpercentile(channels.largest(sum((one.white for one in lights), start=lights[0].black)), 99.9)
+    level = min(1.0, FULL_SHARE / (float(brightest) * exposure_s))
+    lit = {
+        projector.name: projector.black() + np.array([np.argmin(abs(row - level)) for row in light.response], np.uint8)
+        for projector, light in zip(rig.projectors, lights, strict=True)
+    }
+    whites = np.stack([blocks(light.white) for light in lights])
+    caught: list[list[float]] = []
+    release_s = acquirer.wait_s
+    with contextlib.nullcontext() if rig.seat is None else rig.seat.only(deadline), ThreadPoolExecutor(1) as pool:
+        plan = [Planned("black", dict, exposure_s), Planned("lit", lambda: lit, exposure_s)]
+        paths = take_all(rig, context, plan, into=SKEW)
+        stills = [blocks(taken.measured()) for taken in SKEW.read(context.folder)]
+        for number in range(MOST_CHANGES):
+            context.advance(len(caught) / CHANGES, "display and camera")
+            deadline.sleep(acquirer.wait_s)  # until the picture before is whole
+            shot = Shot(f"change-{number}", rig.on_outputs(lit if number % 2 else {}), exposure_s)
+            shown_s = time.monotonic() + max(0.0, -release_s)
+            shown = pool.submit(_show_at, shown_s, rig, shot, context)
+            file, _ = acquirer.photograph(
+                shot.name, exposure_s, context.folder / CAPTURES, shown_at_s=shown_s, deadline=deadline,
+                wait_s=release_s,
+            )  # fmt: skip
+            shown.result()
+            seen = blocks(TakenPhotograph(shot.name, file.path, exposure_s, profile=profile).measured())
+            file.path.unlink()
+            before, after = stills if number % 2 else stills[::-1]
+            *shares, rise = seen_change(seen, before, after, whites)
+            if max(abs(share - 0.5) for share in shares) + abs(rise) / 2 < INSIDE:
+                caught.append(shares)
+            if len(caught) == CHANGES:
+                break
+            release_s += exposure_s * (0.5 - float(np.clip(np.mean(shares), 0, 1)))
+    rig.check_light(deadline=deadline)
+    names = [projector.output for projector in rig.projectors]
+    figures = _skew_figures(names, names.index(first), np.array(caught), true_exposure(profile, exposure_s))
+    context.reporter.say(figures["sentence"], Level.INFO if figures["uncertain_s"] <= SURE_S else Level.WARNING)
+    return [write_json(json_path(context.folder, StepKind.SKEW), figures), *paths]
+
+
+def _show_at(at_s: float, rig: Rig, shot: Shot, context: Context) -> None:
+    context.deadline.sleep(max(0.0, at_s - time.monotonic()))
+    rig.acquirer.present(shot.frames, deadline=context.deadline)
+
+
+def _skew_figures(names: Sequence[str], first: int, after: Float64, exposure_s: float) -> dict[str, Any]:
+    """Seconds, uncertainties for 95 %. ``after`` (changes, outputs): shares of the exposure after each change."""
+    if len(after) < CHANGES:
+        sentence = f"Only {len(after)} of {MOST_CHANGES} photographs of {exposure_s:.2g} s show each output change."
+        sentence += " Either the outputs are further apart, or it is too uncertain when the camera opens."
+        return {"outputs": {}, "apart_s": None, "uncertain_s": exposure_s, "sentence": sentence}
+    late_s = (after[:, [first]] - after) * exposure_s
+    mean_s, uncertain_s = late_s.mean(axis=0), T95 * late_s.std(axis=0, ddof=1) / math.sqrt(len(after))
+    rows = zip(names, mean_s.tolist(), uncertain_s.tolist(), strict=True)
+    outputs = {name: {"late_s": late, "uncertain_s": uncertain} for name, late, uncertain in rows}
+    apart_s, most_s = float(np.ptp(mean_s)), float(uncertain_s.max())
+    each = ", ".join(f"{name} {1e3 * row['late_s']:+.1f}" for name, row in outputs.items())
+    sentence = f"Seen by the camera, the outputs change {1e3 * apart_s:.1f} ± {1e3 * most_s:.1f} ms apart: {each} ms."
+    return {"outputs": outputs, "apart_s": apart_s, "uncertain_s": most_s, "sentence": sentence}

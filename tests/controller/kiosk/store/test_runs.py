@@ -42,6 +42,20 @@ def test_a_damaged_grade_hides_its_own_run_alone(tmp_path: Path, how: str) -> No
     assert runs.results(tmp_path, FIRST, 8.0).figures == (("Error of left", "1.00 %"), ("Error of right", "3.10 %"))
 
 
+def test_a_drift_check_says_how_far_apart_outputs_changed_where_that_was_measured(tmp_path: Path) -> None:
+    figures = {"advice": "nothing", "camera": {"found": True, "rms_px": 0.04}}
+    for day, skew in enumerate(
+        (None, {"apart_s": 0.0083, "uncertain_s": 0.0006}, {"apart_s": None, "uncertain_s": 0.16})
+    ):
+        run = tmp_path / "runs" / f"2026010{day + 1}-033000-drift"
+        run.mkdir(parents=True)
+        (run / "drift.json").write_text(json.dumps(figures))
+        if skew is not None:
+            (run / "skew.json").write_text(json.dumps(skew))
+    found = [(one.moved_px, one.apart_s, one.uncertain_s) for one in runs.drifts(tmp_path)]
+    assert found == [(0.04, None, 0.16), (0.04, 0.0083, 0.0006), (0.04, None, None)]
+
+
 def test_a_damaged_journal_costs_its_own_calibration_alone(tmp_path: Path) -> None:
     graded_run(tmp_path, FIRST, {"left": 0.01})
     graded_run(tmp_path, SECOND, {"left": 0.01}, finished=False)

@@ -13,9 +13,11 @@ from controller.optics.capture.latency import (
     CHANGED_FRAMES,
     RESOLUTION_S,
     Fingerprint,
+    blocks,
     changed_share,
     measure_latency,
     same_picture,
+    seen_change,
 )
 from controller.optics.capture.profile import CameraNoise
 
@@ -127,3 +129,36 @@ def test_two_dark_pictures_and_two_blown_ones_are_the_same() -> None:
         assert same_picture(print_of(flat, 0.1, 1), print_of(flat, 0.1, 2))
     assert not same_picture(print_of(gray(0, high=100), 0.1, 1), print_of(gray(1, high=100), 0.1, 2))
     assert not same_picture(Fingerprint(gray(0), 10.0), Fingerprint(gray(0)[:5], 10.0))
+
+
+@pytest.mark.parametrize("to_lit", [True, False])
+@pytest.mark.parametrize(
+    ("late_s", "readout_s"), [((0.0, 0.0), 0.0), ((0.008, 0.0), 0.02), ((0.0, 0.021), 0.03), ((0.0, -0.021), -0.01)]
+)
+def test_outputs_that_overlap_are_found_to_change_when_they_did(
+    late_s: tuple[float, float], readout_s: float, to_lit: bool
+) -> None:
+    """Two outputs on 160 columns each of 256, of which 64 have both; a shutter that opens row by row."""
+    rows, columns, exposure_s, random = np.arange(160)[:, None], np.arange(256), 0.15, np.random.default_rng(3)
+    parts = (60, columns < 160), (200, columns > 96)
+    whites = [(0.2 + 0.6 * np.exp(-(((columns - at) / 60) ** 2))) * lit + 0 * rows for at, lit in parts]
+    lamps = (0.9, 1.1)  # since the calibration
+    # The change comes in the middle of the exposure of the middle row.
+    ends_s = exposure_s / 2 + readout_s * (rows / 159 - 0.5)
+    shares = [np.clip((ends_s - late) / exposure_s, 0, 1) for late in late_s]
+    if not to_lit:
+        shares = [1 - share for share in shares]
+
+    def taken(*lit: float | np.ndarray) -> np.ndarray:
+        light = np.full((160, 256), 0.004)
+        for lamp, one, white in zip(lamps, lit, whites, strict=True):
+            light += lamp * one * white / 3
+        noise = np.sqrt(NOISE.shot * light + NOISE.read**2) * random.standard_normal(light.shape)
+        return blocks((light + noise).astype(np.float32))
+
+    black, full, seen = taken(0.0, 0.0), taken(1.0, 1.0), taken(*shares)
+    before, after = (black, full) if to_lit else (full, black)
+    each = np.stack([blocks(white.astype(np.float32)) for white in whites])
+    *found, rise = seen_change(seen, before, after, each)
+    np.testing.assert_allclose((0.5 - np.array(found)) * exposure_s, late_s, atol=2e-4)
+    assert rise * exposure_s == pytest.approx(readout_s, abs=6e-4)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from controller.kiosk.state import EventRow
+from controller.kiosk.state import DriftCheck, EventRow
 from controller.kiosk.store.accounts import Role
 from controller.kiosk.values import Aiming, ProjectorAim
 from controller.optics.calibrate.verify.error_causes import COLOURS, WORDS
@@ -43,6 +43,13 @@ def test_without_a_picture_the_aiming_page_has_words_and_no_broken_image(tmp_pat
     assert "no live picture now" in page
     assert "Nothing has been measured yet" in page
     assert "<meter" not in page
+
+
+def test_the_page_says_how_far_apart_outputs_change_where_that_was_measured(fresh: Served) -> None:
+    assert "ms apart" not in text_of(fresh, "/")
+    assert isinstance(fresh.kiosk, MemoryKiosk)
+    fresh.kiosk.change(drifts=(DriftCheck("night", time.time(), "nothing", 0.04, 0.0083, 0.0006),))
+    assert "Outputs change 8.3 ± 0.6 ms apart, seen by the camera" in text_of(fresh, "/")
 
 
 def test_the_results_page_has_small_pictures_that_lead_to_the_whole_ones(fresh: Served) -> None:
