@@ -1,8 +1,9 @@
 """Single changes of the product's lines, drawn by a seed: cosmic-ray's operators, and two of our own.
 
 A line is drawn first, then one kind of change that it allows, so that a line of many operators counts as one. Left out
-are annotations and the decorators of data classes, which change nothing that runs, and replacements that almost always
-end in a TypeError (``a + b`` to ``a << b``): a program that can't run is no test of the tests.
+are annotations and the decorators of data classes, which change nothing that runs, ``parallel`` and ``strict``, which
+change no result of a right program, and replacements that almost always end in a TypeError (``a + b`` to ``a << b``): a
+program that can't run is no test of the tests.
 """
 
 from __future__ import annotations
@@ -154,7 +155,7 @@ class Draw:
 
 
 def _without_effect(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(start, end) of annotations and of decorators of data classes, each (row, column)."""
+    """(start, end) of annotations, decorators of data classes, ``parallel`` and ``strict``, each (row, column)."""
     for node in ast.walk(ast.parse(source)):
         texts: list[ast.expr | None] = []
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -163,6 +164,8 @@ def _without_effect(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, i
             texts = [node.annotation]
         elif isinstance(node, ast.ClassDef):
             texts = [one for one in node.decorator_list if "dataclass" in ast.unparse(one)]
+        elif isinstance(node, ast.keyword) and node.arg in ("parallel", "strict"):
+            texts = [node.value]
         for text in texts:
             if text is not None:
                 yield (text.lineno, text.col_offset), (text.end_lineno or 0, text.end_col_offset or 0)

@@ -13,7 +13,7 @@ from cosmic_ray.mutating import mutate_code
 from tests.campaigns.mutant_draws import Draw, RemoveOperand, RemoveStatement
 from tests.campaigns.mutants import Campaign, Limits, Nearness, Result, summary
 
-WATCHED = "def larger(a: int | None, b: int) -> bool:\n    return a > b\n"
+WATCHED = "def larger(a: int | None, b: int) -> bool:\n    return a > b\n\n\nsame = dict(strict=True)\n"
 TESTED = (
     "from hal.watched import larger\n\n\n"
     "def test_larger() -> None:\n    assert larger(2, 1)\n    assert not larger(1, 1)\n"

@@ -18,19 +18,11 @@ from tests.controller.bundle.conftest import OUTPUTS
 
 TABLES_0_2_0 = {
     "index": {
-        "stage",
-        "calibration",
-        "created_unix_s",
-        "revision",
-        "outputs",
-        "appearances",
-        "codec",
-        "schedule",
-        "live",
+        "stage", "calibration", "created_unix_s", "revision", "outputs", "appearances", "codec", "schedule", "live",
     },
     "outputs": {"name", "width_px", "height_px", "tile_width_px", "tile_height_px"},
     "appearances": {"name", "bands", "thumbnail", "metadata"},
-}
+}  # fmt: skip
 """The keys of each table, exactly: a player of 0.2.0 refuses any other, but in ``metadata``."""
 RECORDED = (
     b'{"appearances":[{"bands":{"left":[[4096,60,"0123456789abcdef","' + b"0" * 64 + b'"]]},"metadata":'

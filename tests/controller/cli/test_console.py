@@ -86,6 +86,11 @@ def test_errors_are_two_sentences_on_stderr_or_one_object_on_stdout(capsys: pyte
     assert machines.err == ""
 
 
+def test_a_result_is_for_people_without_marks_of_a_language(capsys: pytest.CaptureFixture[str]) -> None:
+    console.show_result({"names": ["a", "b"], "rows": [{"lit": True, "error": 0.123456789}, {"lit": None}], "none": ()})
+    assert capsys.readouterr().out == "names: a, b\nrows: lit yes, error 0.123457; lit -\nnone: -\n"
+
+
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [(-1, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (3599, "59 min 59 s"), (4800, "1 h 20 min")],

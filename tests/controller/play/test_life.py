@@ -201,17 +201,7 @@ def test_starting_loads_neither_the_window_library_nor_the_rest_of_the_controlle
         subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     )
     heavy = {
-        "pyglet",
-        "scipy",
-        "numba",
-        "cv2",
-        "pydantic",
-        "typer",
-        "rich",
-        "controller.stage.sessions.run",
-        "controller.config",
-        "hal.deadline",
-        "hal.interfaces",
-        "hal.registry",
-    }
+        "pyglet", "scipy", "numba", "cv2", "pydantic", "typer", "rich", "controller.stage.sessions.run",
+        "controller.config", "hal.deadline", "hal.interfaces", "hal.registry",
+    }  # fmt: skip
     assert not heavy & modules
