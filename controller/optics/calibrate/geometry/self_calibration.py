@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from controller.core.arrays import Float64, Mask
 from controller.core.errors import CalibrationError, UsageError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
-from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
+from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points, pinhole
 from controller.optics.calibrate.geometry.values import (
     CameraPrior,
     Reconstruction,
@@ -24,7 +25,7 @@ from controller.optics.calibrate.geometry.values import (
     parameter_names,
     projector_lenses,
 )
-from controller.optics.calibrate.values import Correspondence
+from controller.optics.calibrate.values import Correspondence, Pinhole
 
 JUMP_PX = 2.0
 """Neighbouring camera pixels that see places this much farther apart on the projector's image than is usual."""
@@ -114,7 +115,7 @@ def no_position(
 _SAMPLES = 4000
 _TRIAL_POINTS = 600
 _FEWEST_POINTS = 200
-_LARGEST_SHAPE_SIGMA = 0.02
+LARGEST_SHAPE_SIGMA: Final = 0.02
 _LARGEST_PRIOR_SIGMAS = 5.0
 _CLEAR_MARGIN = 12.0  # of the halved chi-square between the best stage and any other, on _TRIAL_POINTS
 
@@ -143,15 +144,8 @@ def reconstruct(
         "distance-point-unknown", "distances-contradict" (see ``metres_per_unit``),
         "geometry-ambiguous" (two shapes explain the pictures equally well, e.g. one with its depth reversed)
     """
-    _check(correspondences, camera_size, projector_sizes, prior)
     report = progress or (lambda share: None)
-    problem = _problem(correspondences, camera_size, projector_sizes, prior)
-    problem, pairs = _solve_pairs(problem, correspondences, projector_sizes, lambda share: report(0.4 * share))
-    trial, margin = _best_stage(problem, pairs)
-    report(0.6)
-    problem, adjusted, kept_share = _refine(problem, correspondences, trial)
-    report(0.8)
-    _refuse_if_contradicted(problem, adjusted.state)
+    problem, adjusted, kept_share, margin, pairs = _placed(correspondences, camera_size, projector_sizes, prior, report)
     uncertainty = shape_sigma(problem, adjusted)
     _refuse_if_uncertain(uncertainty, margin, pairs)
     stage = AdjustedStage(adjusted.state, problem.noise_px, uncertainty, camera_size, projector_sizes)
@@ -168,6 +162,43 @@ def reconstruct(
         inlier_share=kept_share,
         sigma_m=points.sigma_m,
     )
+
+
+def first_poses(
+    correspondences: Sequence[Correspondence],
+    camera_size: tuple[int, int],
+    projector_sizes: Sequence[tuple[int, int]],
+    prior: CameraPrior,
+) -> list[Pinhole]:
+    """Where ``reconstruct`` puts the projectors, in any unit; also where it finds the shape too uncertain.
+
+    With what other views see, that may become certain (``view_poses``). Raises CalibrationError as ``reconstruct``.
+    """
+    seen = correspondences, camera_size, projector_sizes, prior
+    _, adjusted, _, margin, pairs = _placed(*seen, lambda share: None)
+    _refuse_if_uncertain(0.0, margin, pairs)
+    state = adjusted.state
+    places = zip(state.intrinsics, state.rotations, state.centres, projector_sizes, strict=True)
+    return [pinhole(*place) for place in places]
+
+
+def _placed(
+    correspondences: Sequence[Correspondence],
+    camera_size: tuple[int, int],
+    projector_sizes: Sequence[tuple[int, int]],
+    prior: CameraPrior,
+    report: Callable[[float], None],
+) -> tuple[ba.AdjustmentProblem, ba.Adjusted, float, float, list[pose_initialisation.Pair]]:
+    """The stage that fits best, the share of correspondences that were kept, and the margin over any other."""
+    _check(correspondences, camera_size, projector_sizes, prior)
+    problem = _problem(correspondences, camera_size, projector_sizes, prior)
+    problem, pairs = _solve_pairs(problem, correspondences, projector_sizes, lambda share: report(0.4 * share))
+    trial, margin = _best_stage(problem, pairs)
+    report(0.6)
+    problem, adjusted, kept_share = _refine(problem, correspondences, trial)
+    report(0.8)
+    _refuse_if_contradicted(problem, adjusted.state)
+    return problem, adjusted, kept_share, margin, pairs
 
 
 def _check(
@@ -357,7 +388,7 @@ def _refuse_if_contradicted(problem: ba.AdjustmentProblem, state: ba.AdjustmentS
 
 def _refuse_if_uncertain(uncertainty: float, margin: float, pairs: Sequence[pose_initialisation.Pair]) -> None:
     parallax = max(pair.parallax_px for pair in pairs)
-    if uncertainty > _LARGEST_SHAPE_SIGMA and all(pair.parallax_px < 20.0 * pair.noise_px for pair in pairs):
+    if uncertainty > LARGEST_SHAPE_SIGMA and all(pair.parallax_px < 20.0 * pair.noise_px for pair in pairs):
         raise _flat(parallax)
     if margin < _CLEAR_MARGIN:
         raise CalibrationError(
@@ -366,7 +397,7 @@ def _refuse_if_uncertain(uncertainty: float, margin: float, pairs: Sequence[pose
             remedy="Place the projectors farther apart, add one, or measure the camera's focal length with a "
             "ChArUco board.",
         )
-    if uncertainty > _LARGEST_SHAPE_SIGMA:
+    if uncertainty > LARGEST_SHAPE_SIGMA:
         raise CalibrationError(
             "geometry-uncertain",
             what=f"The object's shape is known only to {uncertainty:.1%} of its distance.",

@@ -24,7 +24,7 @@ from controller.core.errors import CalibrationError
 from controller.optics.calibrate.geometry import bundle_adjustment as ba
 from controller.optics.calibrate.geometry import pose_initialisation
 from controller.optics.calibrate.geometry.normal_equations import reduced, solve_positive
-from controller.optics.calibrate.geometry.self_calibration import noise_of, shape_sigma
+from controller.optics.calibrate.geometry.self_calibration import LARGEST_SHAPE_SIGMA, noise_of, shape_sigma
 from controller.optics.calibrate.geometry.surface_points import AdjustedStage, object_points
 from controller.optics.calibrate.geometry.values import (
     MOST_SIGMAS,
@@ -203,6 +203,13 @@ def join_views(
         stage = AdjustedStage(
             state, problem.noise_px, shape_sigma(problem, adjusted), view.camera_size, projector_sizes
         )
+        if stage.shape_rel_sigma > LARGEST_SHAPE_SIGMA:
+            raise CalibrationError(
+                "geometry-uncertain",
+                what=f"With all views, the shape in {view.name} is known only to {stage.shape_rel_sigma:.1%} of its "
+                "distance.",
+                remedy="Let it see more projectors that other views see, too, or move it nearer to them.",
+            )
         stages.append((stage, adjusted))
         points.append(object_points(stage, view.correspondences, view.prior))
     scales = {f"view {view.name}": (one.unit_m, one.unit_rel_sigma) for view, one in zip(views, points, strict=True)}

@@ -25,7 +25,7 @@ from controller.optics.calibrate.correspondence.colour_alignment import (
 )
 from controller.optics.calibrate.correspondence.decode import decode
 from controller.optics.calibrate.geometry.lenses import bent
-from controller.optics.calibrate.geometry.self_calibration import jumps, one_projector, reconstruct
+from controller.optics.calibrate.geometry.self_calibration import first_poses, jumps, one_projector
 from controller.optics.calibrate.geometry.shape import AskedShape, FoundShape, find_shape, shape_sentence
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.geometry.view_poses import FEWEST_POINTS, SeenStage, join_views
@@ -437,8 +437,7 @@ def _seen(
         found = [read_geometry(folder, projectors).projectors[n] for n in chosen]
     else:
         # a view may see too little of a projector for a geometry with all of them
-        own = reconstruct([seen[n] for n in chosen], size, [sizes[n] for n in chosen], prior)
-        found = own.geometry.projectors
+        found = first_poses([seen[n] for n in chosen], size, [sizes[n] for n in chosen], prior)
     kept = [own if n in chosen else _nothing(own) for n, own in enumerate(seen)]
     return SeenStage(name, kept, size, prior, dict(zip(chosen, found, strict=True)))
 

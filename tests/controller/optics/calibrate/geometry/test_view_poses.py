@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from controller.config.models import PoseTable
 from controller.core.arrays import Float64
 from controller.core.errors import CalibrationError
+from controller.optics.calibrate.geometry.self_calibration import first_poses, reconstruct
 from controller.optics.calibrate.geometry.values import CameraPrior
 from controller.optics.calibrate.geometry.view_poses import JoinedView, SeenStage, join_views
 from controller.optics.calibrate.metapixels.from_dots import project
@@ -151,6 +152,25 @@ def test_all_views_together_fit_as_well_as_scipys_least_squares() -> None:
     best = least_squares(off, np.zeros(6), loss="linear")
     assert np.sqrt(np.mean(off(np.zeros(6)) ** 2)) < 1.05 * np.sqrt(np.mean(best.fun**2))
     assert max(rms) < 0.45
+
+
+def test_a_view_whose_own_shape_is_uncertain_is_joined_by_what_others_know() -> None:
+    """One projector stands almost in its camera's place, and the other two light different sides of the object."""
+    cameras, projectors, _ = stage()
+    projectors.append(looking_at_the_middle(75, 1.612, -0.1, PROJECTOR, 520.0))
+    sees, sizes = (1, 4, 3), [PROJECTOR] * 5
+    right = replace(seen_stage("right", cameras[1], projectors, sees, 1.2), prior=CameraPrior(230.0, 1.0))
+    seen = [right.correspondences[n] for n in sees], CAMERA, sizes[:3], right.prior
+    with pytest.raises(CalibrationError) as alone:
+        reconstruct(*seen)
+    assert alone.value.code == "geometry-uncertain"
+    front = seen_stage("front", cameras[0], projectors, (1, 2, 3, 4), 0.05)
+    started = replace(right, poses=dict(zip(sees, first_poses(*seen), strict=True)))
+    left = seen_stage("left", cameras[2], projectors, (0, 1, 2), 0.05)
+    found = join_views([front, started, left], ["a", "b", "c", "d", "e"], sizes)
+    turn = cameras[1].rotation @ cameras[0].rotation.T
+    assert np.degrees(Rotation.from_matrix(found[1].pose.rotation @ turn.T).magnitude()) < 0.3
+    assert found[1].reconstruction.shape_rel_sigma < 0.001
 
 
 def test_a_view_that_shares_one_projector_is_named() -> None:
