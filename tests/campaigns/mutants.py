@@ -6,8 +6,7 @@ Works in a copy of the code in ``build/mutants/SEED``, where a session of cosmic
 it continues where it stopped, with the tests as they are then. ``--again`` tries the survivors once more. For each
 change the N test files that are nearest to it by their imports run, in at most so many seconds of a clock; the first
 failure ends it, and counts only if that test holds without the change. Prints the survivors with file and line, apart
-from those of ``equivalent_mutants.toml``, for which none is run, as none could notice; the exit code is 1 if
-there is one.
+from those of ``equivalent_mutants.toml``, for which none is run; the exit code is 1 if there is one.
 """
 
 from __future__ import annotations

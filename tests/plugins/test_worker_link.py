@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from hal.deadline import Deadline, in_seconds
+from hal.deadline import Cancelled, Deadline, in_seconds
 from hal.errors import DeviceGone, DeviceTimeout, ProtocolError
 from plugins.worker_link import NotOpened, WorkerLink
 
@@ -140,9 +140,10 @@ def test_a_call_after_the_closing_is_refused_at_once_though_another_hangs() -> N
     go.set()
 
 
-def test_a_call_that_comes_too_late_opens_nothing() -> None:
-    board = Board()
-    with pytest.raises(DeviceTimeout):
-        board.call(lambda opened: None, deadline=in_seconds(0))
+def test_a_call_that_was_cancelled_before_opens_nothing() -> None:
+    board, cancelled = Board(), threading.Event()
+    cancelled.set()
+    with pytest.raises(Cancelled):
+        board.call(lambda opened: None, deadline=in_seconds(30, cancelled))
     board.close()
     assert board.opened == 0

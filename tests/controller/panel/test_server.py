@@ -114,17 +114,8 @@ def test_a_stop_closes_connections_that_begin_at_that_moment(tmp_path: Path, aga
 def test_with_tls_nothing_crosses_in_the_clear_and_cookies_stay(tmp_path: Path) -> None:
     certificate, key = tmp_path / "c.pem", tmp_path / "k.pem"
     command = [
-        "openssl",
-        "req",
-        "-x509",
-        "-newkey",
-        "ec",
-        "-pkeyopt",
-        "ec_paramgen_curve:P-256",
-        "-nodes",
-        "-days",
-        "2",
-    ]
+        "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2",
+    ]  # fmt: skip
     command += ["-keyout", str(key), "-out", str(certificate), "-subj", "/CN=localhost"]
     subprocess.run([*command, "-addext", "subjectAltName=IP:127.0.0.1"], check=True, capture_output=True)
     options = PanelOptions(tmp_path / "p", port=0, tls_certificate=certificate, tls_key=key)

@@ -160,3 +160,4 @@ def test_quotas_of_control_groups_are_kept(
     (tmp_path / "membership").write_text(membership)
     unlimited = len(os.sched_getaffinity(0))
     assert usable_cpus(tmp_path, tmp_path / "membership") == min(cpus or unlimited, unlimited)
+    assert usable_cpus(tmp_path, tmp_path / "missing") == unlimited

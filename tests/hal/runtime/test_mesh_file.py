@@ -209,6 +209,8 @@ def test_strips_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "m.ply").write_text(text)
     with pytest.raises(MeshUnreadable, match="triangle strips"):
         read_mesh(tmp_path / "m.ply")
+    with pytest.raises(MeshUnreadable, match=r"^No such file or directory$"):
+        read_mesh(tmp_path / "missing.ply")
 
 
 @pytest.mark.parametrize("kind", ["stl", "glb", "off", "ply", "obj"])

@@ -134,17 +134,8 @@ def test_a_restore_syncs_each_file_and_each_new_name_before_it_goes_on(tmp_path:
     commit = next(n for n in renames if done[n][1].endswith(archive.RESTORING))
     synced = {what for name, what in done[:commit] if name == "fsync"}
     fresh = Path(done[commit][1].split()[0]) / "fresh"
-    for part in (
-        "stage.toml",
-        "appearances/glass.png",
-        "bundles/1.vel",
-        "bundles",
-        "deep/er",
-        "deep",
-        "runs",
-        "",
-        "..",
-    ):
+    parts = "stage.toml", "appearances/glass.png", "bundles/1.vel", "bundles", "deep/er", "deep", "runs", "", ".."
+    for part in parts:
         assert os.path.normpath(fresh / part) in synced, part
     for first, following in zip(renames, [*renames[1:], len(done)], strict=True):
         source, target = map(Path, done[first][1].split())
