@@ -44,7 +44,7 @@ FAILED: Final = re.compile(r"^(?:FAILED|ERROR) (\S+?\.py.*?)(?: - .*)?$", re.MUL
 
 
 class Nearness:
-    """Which test files of a tree are near to a module: by imports, and by the folder that mirrors its own."""
+    """Which test files of a tree are near to a module: by imports, its name, and the folder that mirrors its own."""
 
     def __init__(self, root: Path) -> None:
         self._importers: dict[str, set[str]] = defaultdict(set)
@@ -69,14 +69,15 @@ class Nearness:
             for importer in self._importers[file] - far.keys():
                 far[importer] = far[file] + 1
                 queue.append(importer)
-        folder, name = f"tests/{Path(path).parent.as_posix()}/", Path(path).name
+        folder, name = f"tests/{Path(path).parent.as_posix()}/", f"test_{Path(path).name}"
         for test in self._tests:
-            if test.startswith(folder):  # it may start the module in a process of its own
-                far.setdefault(test, 2)
+            if test.startswith(folder) or Path(test).name == name:  # it may start the module in a process of its own
+                far.setdefault(test, 3)
 
         def key(test: str) -> tuple[object, ...]:
-            own = test == f"{folder}test_{name}"
-            return test.startswith(LONG), not own, far[test] - test.startswith(folder), far[test], test
+            beside = f"{Path(test).parent.as_posix()}/" == folder
+            named = Path(test).name == name
+            return test.startswith(LONG), not (beside and named), far[test] - beside - 2 * named, far[test], test
 
         return sorted(far.keys() & self._tests, key=key)
 

@@ -108,8 +108,11 @@ def test_the_nearest_tests_come_first(tree: Path) -> None:
     (tree / "hal/above.py").write_text("def late() -> None:\n    from hal import watched\n")
     (tree / "tests/hal/test_above.py").write_text("import hal.above\n")
     (tree / "tests/hal/test_process.py").write_text("import subprocess\n")
+    (tree / "tests/plugins").mkdir()
+    (tree / "tests/plugins/test_watched.py").write_text("import subprocess\n")
     assert Nearness(tree).tests_of("hal/watched.py") == [
-        f"tests/hal/test_{name}.py" for name in ("watched", "above", "process")
+        f"tests/{name}.py"
+        for name in ("hal/test_watched", "hal/test_above", "plugins/test_watched", "hal/test_process")
     ]
 
 
