@@ -279,9 +279,17 @@ def test_a_driver_that_raises_anything_is_named_and_everything_else_is_still_tol
     seen = hall.examine()
     assert "driver-fault" in codes(seen)
     fault = next(finding for finding in seen.findings if finding.code == "driver-fault")
-    for word in ("'model'", "camera", call, "ZeroDivisionError"):
+    for word in ("'model' of the camera", call, "ZeroDivisionError"):
         assert word in fault.what
     assert "1200 lamp hours" in str(seen.tried[0].answer), "the projector was tried too"
+
+
+def test_a_device_is_named_where_a_stage_may_have_several(hall: Hall) -> None:
+    bad = Driver("projector", "serial", "A projector.", boom, {"profile": "", "port": ""})
+    hall.plug("left")
+    hall.drivers = Drivers((*(one for one in hall.drivers.list if one.name != "serial"), bad))
+    fault = next(finding for finding in hall.examine().findings if finding.code == "driver-fault")
+    assert "'serial' of projector left" in fault.what
 
 
 def test_two_drivers_of_one_name_are_a_problem_and_nothing_else_is_lost(hall: Hall) -> None:
