@@ -12,6 +12,7 @@ import subprocess
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from typing import Any
 
 import aiomqtt
 import anyio
@@ -32,6 +33,8 @@ from tests.ports import kept_port
 MOSQUITTO = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
 pytestmark = pytest.mark.skipif(not Path(MOSQUITTO).exists(), reason="needs mosquitto (a package of the test set-up)")
 CONNECT, PUBLISH, SUBSCRIBE = 1, 3, 8
+ONCE_KEPT = 0b0011
+"""Flags of a message that is confirmed, perhaps comes twice, and is kept for who comes later."""
 USER, SECRET = "kiosk", "word for the broker"
 
 
@@ -166,18 +169,19 @@ def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path, port: int) 
 
 
 @contextlib.asynccontextmanager
-async def forgetful_broker(asked: asyncio.Event | None = None) -> AsyncIterator[tuple[int, asyncio.Queue[int]]]:
+async def forgetful_broker(asked: asyncio.Event | None = None) -> AsyncIterator[tuple[int, asyncio.Queue[Any]]]:
     """Speaks as much of MQTT 3.1.1 as a publisher needs, but does not confirm a state on its first connection. Yields
-    its port, and for every state the number of its connection. ``asked`` is set with the answer to a subscription.
+    its port, and for every state the number of its connection and its flags. ``asked`` is set with the answer to a
+    subscription.
     """
-    states: asyncio.Queue[int] = asyncio.Queue()
+    states: asyncio.Queue[tuple[int, int]] = asyncio.Queue()
     connections = itertools.count()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         connection = next(connections)
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError), contextlib.closing(writer):
             while True:
-                kind = (await reader.readexactly(1))[0] >> 4
+                kind, flags = divmod((await reader.readexactly(1))[0], 16)
                 length, shift, more = 0, 0, 0x80
                 while more & 0x80:
                     more = (await reader.readexactly(1))[0]
@@ -193,7 +197,7 @@ async def forgetful_broker(asked: asyncio.Event | None = None) -> AsyncIterator[
                     topic_end = 2 + int.from_bytes(body[:2], "big")
                     state = body[2:topic_end].endswith(b"/state")
                     if state:
-                        states.put_nowait(connection)
+                        states.put_nowait((connection, flags))
                     if connection or not state:
                         writer.write(bytes((0x40, 2, *body[topic_end : topic_end + 2])))
 
@@ -208,7 +212,7 @@ def test_a_broker_that_does_not_confirm_a_state_is_told_it_again_on_a_new_connec
     async def story() -> None:
         async with forgetful_broker() as (port, states), controlled(kiosk, options(tmp_path, port), patience_s=0.5):
             async with asyncio.timeout(30):
-                assert [await states.get(), await states.get()] == [0, 1]
+                assert [await states.get(), await states.get()] == [(0, ONCE_KEPT), (1, ONCE_KEPT)]
 
     asyncio.run(story())
 
