@@ -10,6 +10,7 @@ from controller.optics.capture.linearity import (
     camera_faults,
     check_series,
     common_limit,
+    exposure_ratio,
     find_hot,
     true_exposures,
 )
@@ -26,6 +27,14 @@ def test_exposures_that_the_camera_tells_wrongly_are_measured() -> None:
     assert found.nominal[1] == pytest.approx(30 / 8)
     assert found.ratios[1] == pytest.approx(4.0, rel=0.003)
     assert found.worst < 0.01
+
+
+def test_a_highlight_that_moved_between_two_exposures_does_not_change_their_ratio() -> None:
+    model = SensorModel()
+    moved = LIGHT.copy()
+    moved[: len(moved) // 5] = np.minimum(1.5 * moved[: len(moved) // 5], LIGHT.max())
+    shorter, longer = model.expose(LIGHT, 0.01, 1), model.expose(moved, 0.04, 2)
+    assert exposure_ratio(shorter, longer, model.levels) == pytest.approx(4.0, rel=0.003)
 
 
 def test_the_ceiling_is_found_where_the_sensor_has_it_and_not_where_the_file_says() -> None:
