@@ -2,46 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import subprocess
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from nacl.signing import SigningKey
-
-from controller.bundle.signing import write_public_key
-from controller.kiosk.install.update import MARK, OTHER, PACKAGE, PROGRAM, RESULT, STARTS, TRIAL, WITHIN_S, sign_package
+from controller.kiosk.install.update import OTHER, PACKAGE, STARTS, TRIAL
 from tests.booted.kiosk import SERVICES, Kiosk
+from tests.booted.updates import a_day_later, offer, program, told
 from tests.campaigns.power_cuts import kept, lost
 
-KEY: Final = SigningKey(bytes([1] * 32))
-PUBLIC: Final = Path("/opt/updates.pub")
 BENCH: Final = f'[ "$1" != emulate ] || exec {OTHER}/bin/python -m controller "$@"'
 """The devices stand outside of the kiosk: they use the version that works."""
-
-
-def told(kiosk: Kiosk) -> dict[str, Any]:
-    """The outcome of the last update."""
-    file = kiosk.machine.at(RESULT)
-    return dict(json.loads(file.read_text())) if file.exists() else {}
-
-
-def offer(kiosk: Kiosk, package: Path) -> str:
-    """Sign this package, and update the kiosk by it; its SHA-256."""
-    machine, place = kiosk.machine, Path("/opt/update.deb")
-    sign_package(package, KEY, machine.at(place))
-    if not machine.at(PUBLIC).exists():
-        write_public_key(machine.at(PUBLIC), bytes(KEY.verify_key))
-        refused = machine.called("velatura", "kiosk", "update", place)
-        assert "No key that this computer trusts" in refused.stdout + refused.stderr
-        machine.call("velatura", "kiosk", "install", "--trust", PUBLIC)
-    machine.call("velatura", "kiosk", "update", place)
-    with machine.at(place).open("rb") as file:
-        name = hashlib.file_digest(file, "sha256").hexdigest()
-    machine.at(place).unlink()
-    machine.wait_for(lambda: told(kiosk).get("name") == name)
-    return name
 
 
 def broken(folder: Path, install: str) -> Path:
@@ -57,12 +28,6 @@ def broken(folder: Path, install: str) -> Path:
     made = folder.with_suffix(".deb")
     subprocess.run(["dpkg-deb", "-Znone", "--build", folder, made], check=True, stdout=subprocess.DEVNULL)
     return made
-
-
-def program(kiosk: Kiosk) -> str:
-    """Which update the program there is of; empty for one that `dpkg` has installed."""
-    mark = kiosk.machine.at(PROGRAM / MARK)
-    return mark.read_text() if mark.exists() else ""
 
 
 def running(kiosk: Kiosk) -> list[str]:
@@ -106,9 +71,7 @@ def test_an_update_proves_itself_and_the_picture_stays(playing: Kiosk) -> None:
     assert [line for line in running(playing) if "--carry-out" in line] == judges
     # The power fails, and is back a day later.
     machine.cut_off()
-    changed = told(playing)
-    changed["began_unix_s"] -= WITHIN_S
-    machine.at(RESULT).write_text(json.dumps(changed))
+    a_day_later(playing)
     machine.switch_on()
     machine.wait_for(playing.shows)
     machine.wait_for(lambda: told(playing)["state"] != "trial")

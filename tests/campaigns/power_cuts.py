@@ -1,6 +1,6 @@
 """Power cuts at random moments of a booted kiosk: its picture is back every time, and nothing is lost.
 
-    python -m tests.campaigns.power_cuts [CUTS] [SEED] [SUITE] [SECONDS] [--part starting|work]
+    python -m tests.campaigns.power_cuts [CUTS] [SEED] [SUITE] [SECONDS] [--part starting|work|update]
 
 A kiosk on a bare Debian (bookworm) that plays. It is switched on, and all its processes are ended at once up to 20 s
 later: while it boots, starts its services, opens its devices, or plays. So go three of four cuts. Then it calibrates,
@@ -8,6 +8,9 @@ and is cut off while it calibrates, and while it computes and publishes an appea
 each part ends at its next cut. ``--part``: all CUTS are of this part. Hundred can be made in pieces of some minutes,
 each with a SEED of its own. Ends with 0 where the picture came back every time, settings, key, bundle and every
 event were there after each cut, and a calibration at the end ran through and its bundle plays.
+
+``--part update``: it is updated again and again, and cut off meanwhile. After each cut one of the two versions plays,
+with every file of its package; the next cut comes while the same update continues, until it has ended.
 
 The devices are emulated on the same machine, and start again, too. So some boots beside devices that are on follow, for
 the kiosk's own time.
@@ -21,12 +24,16 @@ import random
 import statistics
 import sys
 import tempfile
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from controller.kiosk.install.steps import DEBIAN
+from controller.kiosk.install.update import PROGRAM
+from tests.booted import updates
 from tests.booted.kiosk import Kiosk, installed, prepared_stage
 from tests.booted.machine import STAGE
 
@@ -37,6 +44,8 @@ AT_WORK: Final = 0.25
 CALIBRATING_S: Final = 120.0
 PUBLISHING_S: Final = 30.0
 """From the command to a moment after its end, on a computer that does much else."""
+UPDATING_S: Final = 60.0
+"""From the command, or from a boot, to a moment after the new version has been found to be well."""
 KEPT: Final = ("stage.toml", "keys/stage.key")
 
 
@@ -115,6 +124,39 @@ class Cuts:
             lost_of_it += [one for one in self.kiosk.status()["warnings"] if "settings" in one]
             self._note(f"while {_step(job)}", took_s, lost_of_it)
 
+    def updating(self, cuts: int) -> None:
+        """While it is updated to the other version, and to this one again; a trial is over after half of its cuts."""
+        machine, ends_s = self.kiosk.machine, time.monotonic() + self.seconds
+        packages = self.kiosk.packages
+        with tempfile.TemporaryDirectory() as folder:
+            whole = [updates.contents_of(package, Path(folder, str(n))) for n, package in enumerate(packages)]
+        names, before, now, ended = {"": 0}, kept(self.kiosk), 0, Counter[str]()
+        for _ in range(cuts):
+            if time.monotonic() > ends_s:
+                break
+            if not updates.stage_of_update(self.kiosk):
+                ended[updates.outcome_of(self.kiosk)] += 1
+                now = names[updates.program(self.kiosk)]
+                names[updates.put(self.kiosk, packages[1 - now])] = 1 - now
+                # The command takes some seconds, and ends with the machine.
+                threading.Thread(target=updates.ask, args=(self.kiosk,)).start()
+            time.sleep(self._chance.uniform(0.0, UPDATING_S))
+            machine.cut_off()
+            stage = updates.stage_of_update(self.kiosk) or "begins, or has ended"
+            if updates.told(self.kiosk).get("state") == "trial" and self._chance.random() < 0.5:
+                updates.a_day_later(self.kiosk)
+            began_s = time.monotonic()
+            machine.switch_on()
+            machine.wait_for(self.kiosk.shows)
+            took_s = time.monotonic() - began_s
+            machine.wait_for(lambda: self.kiosk.state == "playing")
+            plays = names.get(updates.program(self.kiosk))
+            gone = lost(self.kiosk, before)
+            if plays is None or updates.contents(machine.at(PROGRAM)) != whole[plays]:
+                gone.append("program")
+            self._note(f"while the update {stage}, version {plays} plays", took_s, gone)
+        print("updates ended:", ", ".join(f"{count} {text}" for text, count in ended.items()))
+
     def _note(self, when: str, back_s: float, gone: list[str]) -> None:
         self.back_s.append(back_s)
         self.gone += gone
@@ -129,22 +171,24 @@ def _step(job: dict[str, Any]) -> str:
 
 
 def main(cuts: int, seed: int, suite: str, seconds: float, part: str) -> int:
-    at_work = {"both": round(AT_WORK * cuts), "starting": 0, "work": cuts}[part]
+    at_work = {"both": round(AT_WORK * cuts), "work": cuts}.get(part, 0)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         stage = prepared_stage(folder)
         (folder / "machine").mkdir()
-        with installed(suite, folder / "machine") as kiosk:
+        with installed(suite, folder / "machine", versions=("1", "2")[: 1 + (part == "update")]) as kiosk:
             kiosk.put_stage(stage)
             made = Cuts(kiosk, seed, seconds)
-            if part != "work":
+            if part == "update":
+                made.updating(cuts)
+            if part in ("both", "starting"):
                 made.starting(cuts - at_work)
                 shown_s = [kiosk.boot_beside_devices() for _ in range(BOOTS)]
                 print(
                     f"{BOOTS} boots beside devices that are on: from X to the appearance {_spread(shown_s)}; {_load()}"
                 )
                 kiosk.machine.wait_for(lambda: kiosk.state == "playing")
-            if part != "starting":
+            if part in ("both", "work"):
                 kiosk.let_the_camera_see()
                 kiosk.calibrate()
                 made.at_work(at_work)
@@ -176,6 +220,6 @@ if __name__ == "__main__":
     parser.add_argument("seed", type=int, nargs="?", default=1)
     parser.add_argument("suite", choices=DEBIAN, nargs="?", default="bookworm")
     parser.add_argument("seconds", type=float, nargs="?", default=float("inf"))
-    parser.add_argument("--part", choices=("both", "starting", "work"), default="both")
+    parser.add_argument("--part", choices=("both", "starting", "work", "update"), default="both")
     options = parser.parse_args()
     sys.exit(main(options.cuts, options.seed, options.suite, options.seconds, options.part))
