@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from controller.bundle.install import (
+    CURRENT,
     NAME,
     CountedStart,
     Starts,
@@ -152,3 +153,12 @@ def test_a_damaged_file_has_no_other_format(folder: Path) -> None:
     for n, data in enumerate((b"", b"VELBUNDL", b"nothing" * 100)):
         (folder / f"{'8' * 63}{n}.vel").write_bytes(data)
     assert of_other_format(folder) == []
+
+
+def test_a_player_without_a_bundle_waits_for_the_first_one_and_counts_nothing(tmp_path: Path) -> None:
+    folder, told = tmp_path / "bundles", list[str]()
+    folder.mkdir()
+    start = CountedStart(folder, told.append)
+    assert (start.file, list(folder.iterdir()), told) == (folder / CURRENT, [], [])
+    installed = install(made(tmp_path / "b.vel", 1, 1), folder, allow_unsigned=True)
+    assert start.file.resolve() == installed.resolve()
