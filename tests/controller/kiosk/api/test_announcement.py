@@ -1,0 +1,64 @@
+"""The text on the projectors of a stage that somebody sets up: how long it stays, and when it does not come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from controller.kiosk.api.attached import LIT_FOR_NOTICE_S
+from controller.kiosk.api.kiosk import StageKiosk
+from controller.kiosk.service import Service
+from controller.kiosk.store.event_log import EventLog
+from controller.kiosk.world import World
+from controller.stage.sessions.check import check_stage
+from tests.controller.kiosk.vase import vase
+
+TEXT = ("velatura.local", "code 1234")
+
+
+class Hands(World):
+    """A clock that is moved by hand."""
+
+    now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def hands() -> Hands:
+    return Hands()
+
+
+@pytest.fixture
+def kiosk(tmp_path: Path, hands: Hands) -> Iterator[StageKiosk]:
+    stage = vase(tmp_path)
+    log = EventLog(stage / EventLog.FILE, durable=False)
+    found = StageKiosk(stage, hands)
+    found.attach(Service(check_stage(stage), log, world=hands))
+    yield found
+    log.close()
+
+
+def test_it_stays_for_its_time_and_lamps_no_longer(kiosk: StageKiosk, hands: Hands) -> None:
+    kiosk.announce(TEXT, lambda: False)
+    service = kiosk.service
+    for passed_s in (0.0, 1.0, LIT_FOR_NOTICE_S - 1):
+        hands.now_s = 1000.0 + passed_s
+        service.changed()
+        assert service.player.notice == TEXT
+    hands.now_s += 2.0
+    service.changed()
+    assert service.player.notice == ()
+
+
+def test_it_ends_once_somebody_has_entered(kiosk: StageKiosk) -> None:
+    entered = False
+    kiosk.announce(TEXT, lambda: entered)
+    kiosk.service.changed()
+    assert kiosk.service.player.notice == TEXT
+    entered = True
+    kiosk.service.changed()
+    assert kiosk.service.player.notice == ()
