@@ -11,15 +11,18 @@ import pytest
 
 from controller.core.errors import UsageError
 from controller.kiosk.jobs.failover import Survivors
+from controller.optics.calibrate.geometry.shape import FoundShape
+from controller.optics.calibrate.geometry.values import Reconstruction
 from controller.optics.calibrate.mesh_alignment import Pose
 from controller.optics.calibrate.photometry.view_colours import in_common_units, view_gains
-from controller.optics.calibrate.values import Calibration
+from controller.optics.calibrate.values import Calibration, Geometry, Pinhole
 from controller.optics.solve.request import SolveOptions
 from controller.optics.solve.targets.values import Target, connected
 from controller.run.journal import Journal
 from controller.run.progress import Silent
 from controller.run.runner import Runner
 from controller.stage.artefacts.calibrated import AllViews, Calibrated, all_views, share_above
+from controller.stage.artefacts.geometry import write_geometry, write_view_pose
 from controller.stage.artefacts.projectors import Light, Pixels
 from controller.stage.artefacts.solved import SolvedBase, is_solved, read_solved
 from controller.stage.artefacts.views import view_folder, write_view
@@ -278,6 +281,27 @@ def test_views_without_a_common_place_are_refused_where_the_shape_counts(tmp_pat
     with pytest.raises(UsageError) as refused:
         _ = calibrated.geometry
     assert refused.value.code == "shape-unknown"
+
+
+def test_all_views_stand_in_the_frame_of_the_first_camera(tmp_path: Path) -> None:
+    names, calibrated = two_views(tmp_path)
+    turn, shift_m = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), np.array([0.1, 0.2, 1.5])
+    point_m = np.array([0.3, -0.1, 2.0])
+    for n, folder in enumerate(calibrated.folders):
+        rows, columns = CAMERAS[list(CAMERAS)[n]]
+        own = turn @ point_m + shift_m if n else point_m
+        points, sigma_m = np.full((rows, columns, 3), own, np.float32), np.ones((rows, columns), np.float32)
+        poses = tuple(Pinhole(np.eye(3), np.zeros(2), np.eye(3), np.full(3, 10.0 * n + k), (30, 20)) for k in range(3))
+        camera = Pinhole(np.eye(3), np.zeros(2), np.eye(3), np.zeros(3), (columns, rows))
+        geometry = Geometry(camera, poses[: len(names)], points, points, 0.1, True)
+        sure = Reconstruction(geometry, np.eye(1), ("x",), 0.1, 0.1, 0.1, 1.0, 0.9, sigma_m)
+        write_geometry(folder, names, FoundShape("surface", (columns, rows), sure))
+        write_view_pose(folder, Pose(1.0, turn, shift_m) if n else Pose(1.0, np.eye(3), np.zeros(3)))
+    first, second = calibrated.geometries()
+    np.testing.assert_allclose(second.points_m, np.full_like(second.points_m, point_m), atol=1e-6)
+    assert [one.translation_m[0] for one in second.projectors] == [one.translation_m[0] for one in first.projectors]
+    assert [one.translation_m[0] for one in first.projectors] == [0.0, 1.0, 2.0][: len(names)]
+    np.testing.assert_allclose(second.camera.rotation @ point_m + second.camera.translation_m, turn @ point_m + shift_m)
 
 
 def test_parts_of_two_views_are_one_object_where_they_meet_in_space() -> None:
