@@ -131,6 +131,7 @@ def driver_captures(flavour: Flavour, count: int) -> float:
         camera = open_camera(settings, OpenContext(peer.folder), in_seconds(_PATIENCE_S))
         overheads = []
         try:
+            assert camera.capabilities.jpeg, "the body says that it makes JPEG files"
             camera.configure(ExposureSettings(0.5, 200, None, raw=False), deadline=in_seconds(_PATIENCE_S))
             for number in range(1, count + 1):
                 began_s = time.monotonic()
