@@ -25,4 +25,4 @@ def test_a_service_to_which_nothing_happens_rests_between_two_decisions(tmp_path
     service.alive = alive
     service.run(cancel)
     log.close()
-    assert times[4] - times[0] > 3 * STEP_S
+    assert times[4] - times[0] > 2 * STEP_S
