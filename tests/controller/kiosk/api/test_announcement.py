@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,10 +22,10 @@ TEXT = ("velatura.local", "code 1234")
 class Hands(World):
     """A clock that is moved by hand."""
 
-    now_s = 1000.0
+    at_s = 1000.0
 
     def monotonic(self) -> float:
-        return self.now_s
+        return self.at_s
 
 
 @pytest.fixture
@@ -46,19 +47,19 @@ def test_it_stays_for_its_time_and_lamps_no_longer(kiosk: StageKiosk, hands: Han
     kiosk.announce(TEXT, lambda: False)
     service = kiosk.service
     for passed_s in (0.0, 1.0, LIT_FOR_NOTICE_S - 1):
-        hands.now_s = 1000.0 + passed_s
+        hands.at_s = 1000.0 + passed_s
         service.changed()
         assert service.player.notice == TEXT
-    hands.now_s += 2.0
+    hands.at_s += 2.0
     service.changed()
     assert service.player.notice == ()
 
 
 def test_it_ends_once_somebody_has_entered(kiosk: StageKiosk) -> None:
-    entered = False
-    kiosk.announce(TEXT, lambda: entered)
-    kiosk.service.changed()
-    assert kiosk.service.player.notice == TEXT
-    entered = True
-    kiosk.service.changed()
-    assert kiosk.service.player.notice == ()
+    entered, shown = threading.Event(), list[tuple[str, ...]]()
+    kiosk.announce(TEXT, entered.is_set)
+    for _ in range(2):
+        kiosk.service.changed()
+        shown.append(tuple(kiosk.service.player.notice))
+        entered.set()
+    assert shown == [TEXT, ()]
