@@ -12,45 +12,39 @@ from controller.kiosk.api.attached import LIT_FOR_NOTICE_S
 from controller.kiosk.api.kiosk import StageKiosk
 from controller.kiosk.service import Service
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.world import World
 from controller.stage.sessions.check import check_stage
+from tests.controller.kiosk.supervisors.test_mains_supervisor import KioskWorld
 from tests.controller.kiosk.vase import vase
+from tests.controller.stage.rig.lamp_model import World
 
 TEXT = ("velatura.local", "code 1234")
 
 
-class Hands(World):
-    """A clock that is moved by hand."""
-
-    at_s = 1000.0
-
-    def monotonic(self) -> float:
-        return self.at_s
+@pytest.fixture
+def hands() -> World:
+    """Time that is moved by hand."""
+    return World()
 
 
 @pytest.fixture
-def hands() -> Hands:
-    return Hands()
-
-
-@pytest.fixture
-def kiosk(tmp_path: Path, hands: Hands) -> Iterator[StageKiosk]:
+def kiosk(tmp_path: Path, hands: World) -> Iterator[StageKiosk]:
     stage = vase(tmp_path)
     log = EventLog(stage / EventLog.FILE, durable=False)
-    found = StageKiosk(stage, hands)
-    found.attach(Service(check_stage(stage), log, world=hands))
+    world = KioskWorld(hands)
+    found = StageKiosk(stage, world)
+    found.attach(Service(check_stage(stage), log, world=world))
     yield found
     log.close()
 
 
-def test_it_stays_for_its_time_and_lamps_no_longer(kiosk: StageKiosk, hands: Hands) -> None:
+def test_it_stays_for_its_time(kiosk: StageKiosk, hands: World) -> None:
     kiosk.announce(TEXT, lambda: False)
     service = kiosk.service
     for passed_s in (0.0, 1.0, LIT_FOR_NOTICE_S - 1):
-        hands.at_s = 1000.0 + passed_s
+        hands.time_s = 1000.0 + passed_s
         service.changed()
         assert service.player.notice == TEXT
-    hands.at_s += 2.0
+    hands.time_s += 2.0
     service.changed()
     assert service.player.notice == ()
 

@@ -12,7 +12,6 @@ import subprocess
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
 
 import aiomqtt
 import anyio
@@ -169,7 +168,9 @@ def test_a_broker_that_goes_and_comes_is_found_again(tmp_path: Path, port: int) 
 
 
 @contextlib.asynccontextmanager
-async def forgetful_broker(asked: asyncio.Event | None = None) -> AsyncIterator[tuple[int, asyncio.Queue[Any]]]:
+async def forgetful_broker(
+    asked: asyncio.Event | None = None,
+) -> AsyncIterator[tuple[int, asyncio.Queue[tuple[int, int]]]]:
     """Speaks as much of MQTT 3.1.1 as a publisher needs, but does not confirm a state on its first connection. Yields
     its port, and for every state the number of its connection and its flags. ``asked`` is set with the answer to a
     subscription.
