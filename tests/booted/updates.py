@@ -80,7 +80,7 @@ def a_day_later(kiosk: Kiosk) -> None:
 
 
 def contents(program: Path) -> dict[str, str]:
-    """SHA-256 of each file in the folder of a program, but of what follows from the others or tells of an update."""
+    """SHA-256 of each file in the folder of a program, but of what follows from the others or states an update."""
     return {
         str(path.relative_to(program)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in program.rglob("*")

@@ -58,8 +58,7 @@
   }
   // One picture over another.
   function blinking(place) {
-    const over = place.querySelector(".over"), through = place.querySelector("#through"), blink = place.querySelector("#blink");
-    blink.addEventListener("click", () => blink.setAttribute("aria-pressed", String(over.classList.toggle("blinks"))));
+    const over = place.querySelector(".over"), through = place.querySelector("#through");
     const fade = () => over.style.setProperty("opacity", String(through.value / 100));
     through.addEventListener("input", fade);
     fade();

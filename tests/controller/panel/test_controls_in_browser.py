@@ -139,7 +139,7 @@ def test_points_in_the_picture_and_on_the_object_lay_it(fresh: Served, browser: 
             place.press("ArrowLeft")
             place.press("Shift+ArrowDown")
         assert not violations(page)
-        page.get_by_role("button", name="Blink").click()
+        page.get_by_label("Blink").check()
         lay.click()
         expect(page.get_by_text("The picture is fitted again.")).to_be_visible()
     ((_, sent),) = [one for one in kiosk_of(fresh).asked if one[0] == "points"]
@@ -225,8 +225,10 @@ def test_a_mesh_is_laid_by_places_on_both_and_blinks(fresh: Served, browser: Bro
         lay.click()
         expect(page.get_by_text("The mesh lies on the object.")).to_be_visible()
         expect(page.get_by_text("They differ by 0.12 mm")).to_be_visible()
-        page.get_by_role("button", name="Blink").click()
-        expect(page.locator("#laid .over")).to_have_class("over blinks")
+        over = page.locator("#laid .over")
+        expect(over).to_have_css("animation-name", "none")
+        page.get_by_label("Blink").check()
+        expect(over).to_have_css("animation-name", "blink")
         sent = kiosk_of(fresh).asked[-1][1]
         assert isinstance(sent, tuple)
         assert (*sent[:2], len(json.loads(sent[2]))) == ("bust.glb", 1, 4)
