@@ -22,7 +22,8 @@ VARIABLE: Final = "VELATURA_BLENDER"
 ENVIRONMENT: Final = ".venv-blender"
 """Beside the environment in which Velatura runs; ``make blender`` creates it."""
 _WORKER: Final = Path(__file__).with_name("worker.py")
-_SAMPLE: Final = re.compile(r"Sample (\d+)/(\d+)")
+_SAMPLE: Final = re.compile(r"(?:Rendered (\d+)/(\d+) Tiles, )?Sample (\d+)/(\d+)")
+"""Large pictures are rendered in tiles, one after another, each with all its samples."""
 _TOLD_LINES: Final = 6
 _POLL_S: Final = 0.2
 
@@ -117,7 +118,7 @@ class _Watch:
     """Reads what Blender says in a thread, so that a stop is followed while Blender says nothing."""
 
     def __init__(self, stream: IO[bytes], log: IO[bytes]) -> None:
-        self.share, self.note, self._left_out = 0.0, "starting Blender", ""
+        self.share, self.note, self._left_out, self._tile = 0.0, "starting Blender", "", 0
         self._lines: list[str] = []
         self._stream, self._log = stream, log
         self._thread = threading.Thread(target=self._read, name="blender-output", daemon=True)
@@ -133,8 +134,13 @@ class _Watch:
     def _note(self, line: str) -> None:
         found = _SAMPLE.search(line)
         if found is not None:
-            done, of = int(found[1]), max(int(found[2]), 1)
-            self.share, self.note = min(0.05 + 0.95 * done / of, 1.0), f"sample {done} of {of}{self._left_out}"
+            tile, tiles, done, of = (int(number) for number in found.groups(default="0"))
+            tiles, of = max(tiles, 1), max(of, 1)
+            if tile > self._tile:  # the line that ends a tile still has that tile's samples
+                self._tile, done = tile, 0
+            self.share = max(self.share, min(0.05 + 0.95 * (tile + done / of) / tiles, 1.0))
+            part = f"part {min(tile + 1, tiles)} of {tiles}, " if tiles > 1 else ""
+            self.note = f"{part}sample {done} of {of}{self._left_out}"
         elif line.startswith("Omitted: "):
             self._left_out = f" ({line.lower()})"
             self.note += self._left_out

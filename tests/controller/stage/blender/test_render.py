@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 from functools import partial
@@ -219,6 +220,20 @@ def test_a_stop_ends_blender_at_once(tmp_path: Path, blender: Blender) -> None:
     running = [p for p in Path("/proc").glob("[0-9]*/cmdline") if os.fsencode(tmp_path) in _read(p)]
     assert not running
     assert not (tmp_path / "picture.exr").exists()
+
+
+def test_progress_of_a_large_picture_counts_all_its_parts(tmp_path: Path, blender: Blender, paint_scene: Path) -> None:
+    geometry, light = ball()
+    settings = dataclasses.replace(QUICK, samples=2)
+    write_job(tmp_path, geometry, known(geometry), own_paint(geometry, light), scene=paint_scene, settings=settings)
+    job = json.loads((tmp_path / "job.json").read_text())
+    job["camera"]["resolution"] = [4096, 1100]  # more than one of Blender's tiles holds
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    seen: list[tuple[float, str]] = []
+    render(blender, tmp_path, lambda share, note: seen.append((share, note)))
+    assert [share for share, _ in seen] == sorted(share for share, _ in seen)
+    second = [share for share, note in seen if note.startswith("part 2 of 2, sample ")]
+    assert 0.5 <= min(second) < 0.6
 
 
 def _read(path: Path) -> bytes:
