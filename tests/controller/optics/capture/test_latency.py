@@ -72,9 +72,10 @@ def test_a_quick_stage_costs_four_photographs() -> None:
     assert len(stage.looks) <= 5
 
 
-def test_a_panel_that_falls_later_than_it_rises_is_waited_for() -> None:
-    found = measure_latency(Stage((0.1, 0.1), falls_later_s=0.04).look)
-    assert found.wait_s >= 0.14
+@pytest.mark.parametrize(("rises_s", "falls_s"), [(0.1, 0.14), (0.5, 0.3)])
+def test_a_panel_that_falls_later_or_earlier_than_it_rises_is_waited_for(rises_s: float, falls_s: float) -> None:
+    found = measure_latency(Stage((rises_s, rises_s), falls_later_s=falls_s - rises_s).look)
+    assert found.wait_s >= max(rises_s, falls_s)
 
 
 def test_white_that_never_comes_is_explained() -> None:

@@ -138,6 +138,20 @@ def test_captures_in_the_wrong_order_are_refused(lag: list[str]) -> None:
     assert caught.value.code == "captures-inconsistent"
 
 
+@pytest.mark.parametrize("again", [("gray-x-3", "gray-x-2"), ("gray-y-3", "gray-y-1"), ("gray-y-0", "gray-y-3")])
+def test_one_picture_photographed_in_place_of_another_is_refused_also_by_a_coarse_camera(
+    again: tuple[str, str],
+) -> None:
+    """One camera pixel on 1.4 projector pixels: without the refusal, two thirds of the pixels would be lost."""
+    stage = Stage(Scene((132, 100), (160, 120), 0.7))
+    captures = stage.captures()
+    decode(captures, stage.plan())
+    captures[again[0]] = captures[again[1]]
+    with pytest.raises(CalibrationError) as caught:
+        decode(captures, stage.plan())
+    assert caught.value.code == "captures-inconsistent"
+
+
 @pytest.mark.parametrize("value", [0.0, 1.0, np.nan])
 def test_black_saturated_and_unmeasured_photographs_give_nothing(value: float) -> None:
     captures = {pattern.name: np.full((40, 50, 3), value, np.float32) for pattern in PLAN}
