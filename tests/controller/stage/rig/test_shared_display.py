@@ -12,6 +12,7 @@ import pytest
 
 from controller.stage.rig.shared_display import Seat, SharedDisplay
 from hal.deadline import Cancelled, Deadline, in_seconds
+from hal.errors import DeviceTimeout
 from tests.controller.stage.rig.rig_model import ModelDisplay
 
 Frames = dict[str, npt.NDArray[np.uint8]]
@@ -131,6 +132,24 @@ def test_a_view_that_waits_can_be_stopped() -> None:
     stop.set()
     with pytest.raises(Cancelled):
         views.seats[0].show(picture(1), deadline=Deadline(time.monotonic() + 20, stop))
+
+
+def test_a_view_waits_no_longer_than_it_may_for_one_that_photographs_or_measures() -> None:
+    views = Views(2)
+    slow, other = views.seats
+    for seat in views.seats:
+        seat.join()
+    with slow.only(in_seconds(20)):
+        with pytest.raises(DeviceTimeout) as alone, other.only(in_seconds(0.1)):
+            pass
+        slow.show(picture(1), deadline=in_seconds(20))
+    with pytest.raises(DeviceTimeout) as photographing:
+        other.show(picture(2), deadline=in_seconds(0.1))
+    assert [alone.value.code, photographing.value.code] == ["views-too-slow"] * 2
+    assert values(views.display) == [1]
+    slow.leave()
+    other.show(picture(2), deadline=in_seconds(20))
+    assert values(views.display) == [1, 2], "a view that gave up keeps no picture"
 
 
 def test_before_it_joins_a_seat_is_the_display_itself() -> None:
