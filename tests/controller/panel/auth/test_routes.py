@@ -7,12 +7,14 @@ import stat
 from pathlib import Path
 from typing import Literal
 
+import httpx
 import pytest
 from argon2 import PasswordHasher, extract_parameters
 
 from controller.core.errors import UsageError
 from controller.kiosk.store.accounts import Account, Accounts, Role
 from controller.panel.auth.sessions import IDLE_S, LONGEST_S, MOST_SESSIONS, LoginLimit, Sessions
+from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import PASSWORD, QUICK_HASH, Served, csrf, log_in
 from tests.full_disk import full_disk
 
@@ -228,6 +230,36 @@ def test_a_removed_account_and_a_changed_password_end_their_sessions(fresh: Serv
         assert vera.get("/").status_code == 200
         tina.post("/logout", data={"csrf": token})
         assert tina.get("/").status_code == 303
+
+
+def change_password(client: httpx.Client, old: str, new: str, again: str) -> str:
+    """What the panel says to it."""
+    client.post("/password", data={"csrf": csrf(client.get("/password").text), "old": old, "new": new, "again": again})
+    return client.get("/password").text
+
+
+def test_who_finds_an_open_panel_cannot_change_its_password(fresh: Served) -> None:
+    new = "another long one"
+    with fresh.entered("vera") as vera:
+        assert "The old password is wrong." in change_password(vera, "a wrong guess", new, new)
+        assert "The two new passwords differ." in change_password(vera, PASSWORD, new, "another long two")
+        assert "The new password is the old one." in change_password(vera, PASSWORD, PASSWORD, PASSWORD)
+        assert "This password is too easy to guess." in change_password(vera, PASSWORD, "short", "short")
+    with fresh.client() as client:
+        assert log_in(client, "vera", new).status_code == 403
+    with fresh.entered("vera"):
+        pass
+
+
+def test_guessing_the_old_password_is_stopped_and_even_the_right_one_waits(fresh: Served) -> None:
+    new = "another long one"
+    with fresh.entered("vera") as vera:
+        said = [change_password(vera, f"wrong guess {number}", new, new) for number in range(8)]
+        assert all("The old password is wrong." in what for what in said[:5])
+        assert all("Too many wrong passwords." in what for what in said[5:])
+        assert "Too many wrong passwords." in change_password(vera, PASSWORD, new, new)
+    assert isinstance(fresh.kiosk, MemoryKiosk)
+    assert any("A change of the password of vera" in what for _, what in fresh.kiosk.recorded)
 
 
 def test_no_secret_is_shown_by_the_api(fresh: Served) -> None:
