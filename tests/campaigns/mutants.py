@@ -40,6 +40,7 @@ ROOT: Final = Path(__file__).parents[2]
 EQUIVALENT: Final = Path(__file__).with_name("equivalent_mutants.toml")
 BATCHES: Final = (4, 8, 16)
 """Test files of one start of pytest: the nearest alone, so that most changes are noticed within seconds."""
+ON_USB_BUS: Final = "tests/plugins/on_usb_bus/"
 FAILED: Final = re.compile(r"^(?:FAILED|ERROR) (\S+?\.py.*?)(?: - .*)?$", re.MULTILINE)
 
 
@@ -168,7 +169,7 @@ class Trial:
         options = [f"--timeout={self.limits.seconds / 3}", *(f"--deselect={one}" for one in sorted(self.broken))]
         command = [
             "env", "-C", str(self.tree), f"PYTHONPATH={self.tree}", sys.executable, "-m", "pytest", "-q", "-x",
-            "-n", "0", "-m", "not long", "-p", "no:cacheprovider", *options, *tests,
+            "-n", "0", "-m", "not long", "-p", "no:cacheprovider", *options, *map(_runnable, tests),
         ]  # fmt: skip
         outcome, output = run_tests(shlex.join(command), max(1.0, seconds))
         if outcome == TestOutcome.SURVIVED or output == "timeout":
@@ -176,6 +177,13 @@ class Trial:
         if found := FAILED.findall(output):
             return found[:1], True
         return ([], True) if re.search(r"no tests ran|^\d+ deselected", output, re.MULTILINE) else (tests, True)
+
+
+def _runnable(test: str) -> str:
+    """A file under the preload library of a USB bus is run by a test of its own."""
+    if not test.startswith(ON_USB_BUS):
+        return test
+    return f"tests/plugins/test_on_usb_bus.py::test_under_the_preload_library[{test.removeprefix(ON_USB_BUS)}]"
 
 
 def _changed(before: str, after: str) -> Iterator[str]:
