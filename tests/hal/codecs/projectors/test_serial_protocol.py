@@ -81,6 +81,12 @@ def test_hours_are_one_to_five_digits(value: str) -> None:
     assert parse_hours("01200") == 1200
 
 
+def test_a_value_has_at_most_64_characters() -> None:
+    assert parse_line(TABLE, b"OK" + b"7" * 64 + b"\r", HOURS) == Answer("7" * 64)
+    with pytest.raises(ProtocolError):
+        parse_line(TABLE, b"OK" + b"7" * 65 + b"\r", HOURS)
+
+
 def test_a_power_word_outside_the_enum_is_refused() -> None:
     assert parse_power("cooling") is Power.COOLING
     with pytest.raises(ProtocolError):
