@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
+
+import pytest
 
 from controller.bundle.signing import Trust
 from controller.config.models import DiskTable
@@ -10,7 +14,7 @@ from controller.kiosk.store import archive
 from controller.kiosk.store.bundle_store import BundleStore
 from controller.kiosk.store.disk_space import GOING, make_room
 from controller.kiosk.store.event_log import EventLog
-from controller.kiosk.supervisors.disk_supervisor import GB, DiskSupervisor
+from controller.kiosk.supervisors.disk_supervisor import DiskSupervisor
 from controller.stage.artefacts.names import CAPTURES
 from tests.controller.kiosk.store.test_photo_retention import run_of
 
@@ -71,5 +75,8 @@ def test_below_its_level_it_makes_room_warns_once_and_says_when_there_is_space_a
     disk.step()
     assert log.after(0)[-1].code == "disk-well"
     assert disk.row.problem is None
-    assert disk.free_bytes / GB > 0
+    free, total = re.findall(r"[0-9,]+\.[0-9] GB", disk.row.values[0].text)
+    usage = shutil.disk_usage(tmp_path)
+    assert total == f"{usage.total / 1e9:,.1f} GB"
+    assert float(free.removesuffix(" GB").replace(",", "")) == pytest.approx(usage.free / 1e9, abs=1.0)
     log.close()
