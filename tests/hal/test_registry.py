@@ -10,7 +10,7 @@ import pytest
 
 from hal.deadline import in_seconds
 from hal.errors import PluginError
-from hal.registry import GROUP, Driver, OpenContext, check_settings, load_drivers, open_device
+from hal.registry import GROUP, Driver, OpenContext, check_settings, load_drivers, open_device, setting
 
 Install = Callable[[str, dict[str, str], str], None]
 
@@ -132,3 +132,14 @@ def test_a_missing_setting_is_named() -> None:
         check_settings(DRIVER, {"baud": 9600})
     assert caught.value.code == "setting-missing"
     assert "'port'" in caught.value.what
+
+
+def test_a_setting_of_another_type_is_refused_with_those_that_are_allowed() -> None:
+    assert setting({"wait_s": 2}, "wait_s", (int, float)) == 2
+    assert setting({}, "wait_s", (int, float), 0.5) == 0.5
+    for wrong in ("2", True, [2]):
+        with pytest.raises(PluginError, match="not a whole number or a number") as refused:
+            setting({"wait_s": wrong}, "wait_s", (int, float))
+        assert refused.value.code == "setting-wrong"
+    with pytest.raises(PluginError, match="not text in quotes"):
+        setting({"port": 5}, "port", str)

@@ -103,6 +103,22 @@ def test_opencv_finds_the_same_projector_pixels(tmp_path: Path, suffix: str) -> 
     assert not found.valid[(truth() < -1.5).any(axis=2)].any()
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_where_one_of_the_two_codes_does_not_reach_nothing_is_valid(tmp_path: Path, axis: str) -> None:
+    """A visitor stands in a part of the picture while one of the codes is photographed."""
+    _, pictures = gray_code()
+    text, columns = write_gray(tmp_path, "png", pictures), 2 * int(np.ceil(np.log2(PROJECTOR[0])))
+    hidden = np.s_[60:100, 70:130]
+    for number in range(columns) if axis == "x" else range(columns, len(pictures)):
+        light = photographed(pictures[number])
+        light[hidden] = 0.2 + np.random.default_rng(number).normal(0, 0.002, light[hidden].shape)
+        WRITERS["png"](tmp_path / f"DSC_{number:03}.png", light)
+    (tmp_path / "captures.toml").write_text(text)
+    found = api.decode_folder(tmp_path)
+    assert not found.valid[hidden].any()
+    assert found.valid[110:150, 70:130].mean() > 0.7
+
+
 def test_bits_without_opposites_are_told_by_black_and_white(tmp_path: Path) -> None:
     _, pictures = gray_code()
     text = write_gray(tmp_path, "png", pictures, pairs=False)

@@ -195,3 +195,13 @@ def test_too_many_panels_are_refused_and_come_back_later(tmp_path: Path) -> None
         lines = stream.iter_lines()
         next(lines)
         assert "event: full" in otto.get("/live").text
+        stream.close()
+        until_s = time.monotonic() + 30
+        while not _has_a_place(otto):
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+
+
+def _has_a_place(client: httpx.Client) -> bool:
+    with client.stream("GET", "/live") as stream:
+        return next(line for line in stream.iter_lines() if line.startswith("event: ")) == "event: parts"
