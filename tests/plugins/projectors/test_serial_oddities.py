@@ -19,6 +19,7 @@ from plugins.emulated.projectors.lamp import EmulatedLamp, LampPhase
 from tests.plugins.conftest import each
 from tests.plugins.projectors.odd_board import OddBoard
 from tests.plugins.projectors.switching import SOON, status, switches_without_hours
+from tests.waiting import wait_for
 
 LAMP_QUESTION = {
     "optoma-later": b"~00108 1\r",
@@ -96,6 +97,9 @@ def test_a_silent_lamp_question_is_noted_once_and_not_asked_again_and_again(open
     (notice,) = pair.driver.notices()
     assert notice.code == "projector-answer-odd"
     assert "lamp hours" in notice.what
+    pair.driver.switch_off(deadline=in_seconds(SOON))
+    wait_for(lambda: status(pair).power is Power.OFF)
+    assert len(boards[0].heard) == asked, "another state of the lamp is no reason to wait for it again"
 
 
 def test_lamp_hours_are_asked_once_and_not_with_each_status(open_serial: Any) -> None:
