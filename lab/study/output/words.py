@@ -59,9 +59,11 @@ target's wave, in the photograph's green channel, over the target's own as the c
 another phase or frequency counts as lost. F is the frequency where it first falls below a half. The paper says
 neither which contrast nor which criterion it used. The bases, for the faint waves, contain the target's detail above
 a frequency, or only the detail below it, and are multiplied by the remaining scale (eqs 4-6). *As the plan calculates
-it*: as `velatura plan` does, from the measured blur, pitch and light. Superposition adds positions of light, not
-contrast, so the blur of the optics limits how much finer three are than one: the ratio is asked for only where the
-optics are sharp enough, as on [another page](frequency-sharp.md).""",
+it*: as `velatura plan` does, from the measured blur, pitch and light. *By stripes*, as in the paper's figure, target
+and photograph are white where they are above their mean along the row, else black. Stripes are right while 80 % of the
+pixels agree with the target's, and the number of stripes does within a tenth. Superposition adds positions of light,
+not contrast, so the blur of the optics limits how much finer three are than one; [another page](frequency-sharp.md)
+has sharper ones.""",
     "earlier": """\
 The same target at an exposure that the best projector can reach alone, so that brightness makes no difference.
 *One projector* divides at each pixel (Nayar 2003, Grossberg 2004). *Feathered* lights each point with its brightest
@@ -141,6 +143,19 @@ changes, because most pixels are not covered.""",
     ("frequency", "F_3 / F_1 at least 1.4, at 50% contrast"): """\
 To make a wave finer than one projector's pixels, three have to sharpen it against their blur, up to full light and
 down to none, and a bold wave leaves less room for that than a faint one.""",
+    ("frequency", "F_3 / F_1 at least 1.4, by stripes"): """\
+A bold wave leaves three projectors less room than a faint one to sharpen it against their blur, up to full light and
+down to none. The stripes of the faint wave are that much finer on all three stages.""",
+    ("frequency", "F_3 / F_1 at least 1.4, by contrast"): """\
+Half of the contrast is kept only where three projectors sharpen the wave against the blur of their optics, and a bold
+wave leaves little room for that. Stripes need no contrast, and sharper optics keep more of it.""",
+    ("frequency", "a base low-passed at F_1 falls"): """\
+The filter halves what lies at F_1, and lets some finer detail into the base; a threshold shows stripes however faint
+they are. By contrast it falls to F_1, within 7 %.""",
+    ("frequency", "F_3 as the plan"): """\
+The plan draws at random how the pixels of three projectors lie beside each other, and a stage has one of these places:
+two stages are 5 and 7 % finer than calculated, the third 11 %. How much of that is due to the places was not
+measured.""",
     ("frequency", "a base high-passed at F_1 keeps"): """\
 The scale is a mean over each metapixel (eq. 6), and the projector's pixel blurs it once more: it loses contrast
 well below F_1, so the detail that the base leaves to it there is partly lost. Narrower means (decision 10) lose less;

@@ -95,8 +95,8 @@ def _amplitude(values: FloatImage, waves: Waves, inside: Mask) -> float:
 class Stripes:
     """A photograph beside its target, both black and white after a threshold at their local mean, by band.
 
-    ``agree`` (bands,) share of pixels that agree: by chance a half; ``count`` (bands,) edges of stripes along the rows,
-    over the target's; NaN where too little is seen. Of what is thresholded (rows, columns): ``picture``
+    ``agree`` (bands,) share of pixels that agree: by chance a half; ``count`` (bands,) edges of stripes, of whole
+    columns, over the target's; NaN where too little is seen. Of what is thresholded (rows, columns): ``picture``
     """
 
     agree: Float64
@@ -119,10 +119,16 @@ def stripes(picture: FloatImage, wanted: ReachableTarget, waves: Waves) -> Strip
         if inside.sum() < 200:
             continue
         agree[number] = np.mean(ours[inside] == theirs[inside])
-        beside = inside[:, 1:] & inside[:, :-1]
-        edges, expected = (np.sum((one[:, 1:] != one[:, :-1]) & beside) for one in (ours, theirs))
-        count[number] = edges / max(int(expected), 1)
+        edges, expected = (_edges(one, inside) for one in (ours, theirs))
+        count[number] = edges / max(expected, 1)
     return Stripes(agree, count, np.asarray(ours & seen))
+
+
+def _edges(above: Mask, inside: Mask) -> int:
+    """Edges of upright stripes: each column is white or black as most of its pixels are, so that noise is no stripe."""
+    seen = inside.any(axis=0)
+    white = (above & inside).sum(axis=0)[seen] > 0.5 * inside.sum(axis=0)[seen]
+    return int(np.count_nonzero(white[1:] != white[:-1]))
 
 
 def _above_mean(values: FloatImage, mask: Mask, waves: Waves) -> Mask:

@@ -8,7 +8,7 @@ import pytest
 from controller.optics.plan.figures import last_kept
 from controller.optics.solve.result.metrics import sharpness
 from lab.study.experiments.frequency.experiment import bases
-from lab.study.experiments.frequency.waves import kept_contrast, make_waves, stripes
+from lab.study.experiments.frequency.waves import COUNTS, kept_contrast, make_waves, stripes
 from lab.study.subject.measuring import normalised_residual, quality, region_means, sharpness_map, unbounded_inverse
 from lab.study.subject.subject import ReachableTarget
 from tests.lab.study.array_stage import CAMERA, array_subject
@@ -96,6 +96,11 @@ def test_stripes_are_right_without_contrast_and_wrong_where_they_alias_or_are_lo
     faint = stripes((np.float32(0.5) + 0.1 * detail) * slope, wanted, waves)
     assert np.nanmin(faint.agree) > 0.9
     assert faint.limit(waves.frequency) == waves.frequency[-1], "a tenth of the contrast, and uneven light"
+
+    noise = np.random.default_rng(3).normal(0, 0.02, waves.phase.shape).astype(np.float32)[..., None]
+    noisy = stripes(waves.target.image + noise, wanted, waves)
+    slow = noisy.count[: len(waves.frequency) // 2]
+    assert np.nanmax(np.abs(slow - 1)) <= COUNTS, "noise where a wave crosses its mean is no stripe"
 
     finer = waves.band >= len(waves.frequency) // 2
     aliased = np.repeat((0.5 + 0.1 * np.cos(0.6 * waves.phase))[..., None], 3, axis=2).astype(np.float32)
