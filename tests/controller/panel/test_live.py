@@ -19,6 +19,7 @@ from controller.panel.context import PanelOptions
 from controller.panel.live import Hub
 from tests.controller.panel.memory_kiosk import MemoryKiosk
 from tests.controller.panel.served import Served, served
+from tests.waiting import wait_for
 
 
 def test_a_change_is_on_every_one_of_fifty_open_panels(tmp_path: Path) -> None:
@@ -196,10 +197,7 @@ def test_too_many_panels_are_refused_and_come_back_later(tmp_path: Path) -> None
         next(lines)
         assert "event: full" in otto.get("/live").text
         stream.close()
-        until_s = time.monotonic() + 30
-        while not _has_a_place(otto):
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        wait_for(lambda: _has_a_place(otto))
 
 
 def _has_a_place(client: httpx.Client) -> bool:
